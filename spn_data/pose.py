@@ -1,0 +1,228 @@
+"""Camera poses, similarities and their errors: the only place where quaternions and inversions are written.
+
+World axes are East, North, Up once a model is georeferenced; camera axes are x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.errors import GeometryError
+
+
+def rotations_from_quats(quats_wxyz: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3) from unit quaternions (N, 4), scalar first."""
+    w, x, y, z = np.moveaxis(np.asarray(quats_wxyz, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quats_from_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions (N, 4), scalar first and w >= 0, from rotation matrices (N, 3, 3).
+
+    Takes the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000), which is the nearest
+    rotation also where the matrix is orthogonal only to rounding, and has no special case at 180 degrees.
+    """
+    m = np.asarray(rotations, dtype=np.float64)
+    k = np.empty((*m.shape[:-2], 4, 4))
+    k[..., 0, 0] = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    k[..., 1, 1] = m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2]
+    k[..., 2, 2] = m[..., 1, 1] - m[..., 0, 0] - m[..., 2, 2]
+    k[..., 3, 3] = m[..., 2, 2] - m[..., 0, 0] - m[..., 1, 1]
+    k[..., 0, 1] = k[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
+    k[..., 0, 2] = k[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
+    k[..., 0, 3] = k[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
+    k[..., 1, 2] = k[..., 2, 1] = m[..., 0, 1] + m[..., 1, 0]
+    k[..., 1, 3] = k[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
+    k[..., 2, 3] = k[..., 3, 2] = m[..., 1, 2] + m[..., 2, 1]
+    return canonical_quats(np.linalg.eigh(k)[1][..., -1])
+
+
+def canonical_quats(quats_wxyz: np.ndarray) -> np.ndarray:
+    """The same rotations as unit quaternions with w >= 0 (w = 0: first non-zero component positive)."""
+    quats = np.asarray(quats_wxyz, dtype=np.float64)
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    if not np.all(norms > 0):
+        raise ValueError("a quaternion of length zero is no rotation")
+    quats = quats / norms
+    first = np.argmax(np.abs(quats) > 1e-15, axis=-1)
+    sign = np.sign(np.take_along_axis(quats, first[..., None], axis=-1))
+    return quats * sign
+
+
+def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
+    """Rotation vectors (N, 3) in radians, of length at most pi, from rotation matrices (N, 3, 3)."""
+    quats = quats_from_rotations(rotations)
+    vector = quats[..., 1:]
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quats[..., :1])
+    # For tiny angles angle/sine tends to 2.
+    return vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)
+
+
+def rotations_from_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3) from rotation vectors (N, 3) in radians."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    half = angle / 2
+    # sin(a/2)/a tends to 1/2 at zero: np.sinc(x) is sin(pi x)/(pi x).
+    quats = np.concatenate([np.cos(half), vectors * 0.5 * np.sinc(half / np.pi)], axis=-1)
+    return rotations_from_quats(quats)
+
+
+def rotations_from_angles(heading_pitch_roll_deg: np.ndarray) -> np.ndarray:
+    """cam_from_world rotations (N, 3, 3) in an ENU world from (heading, pitch, roll) (N, 3) in degrees.
+
+    heading : of the optical axis, clockwise from north; pitch : of the optical axis above the horizon
+    (-90 looks straight down, and heading is then the direction of the image's top); roll : clockwise
+    rotation of the camera about its axis as seen from behind it (its right side goes down).
+    These are the conventions of DJI's gimbal angles.
+    """
+    heading, pitch, roll = np.moveaxis(
+        np.deg2rad(np.asarray(heading_pitch_roll_deg, dtype=np.float64)), -1, 0
+    )
+    zero = np.zeros_like(heading)
+    forward = np.stack(
+        [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)], axis=-1
+    )
+    level_right = np.stack([np.cos(heading), -np.sin(heading), zero], axis=-1)
+    level_down = np.cross(forward, level_right)
+    c, s = np.cos(roll)[..., None], np.sin(roll)[..., None]
+    right = c * level_right + s * level_down
+    down = c * level_down - s * level_right
+    return np.stack([right, down, forward], axis=-2)
+
+
+def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
+    """(heading, pitch, roll) (N, 3) in degrees of cam_from_world rotations (N, 3, 3) in an ENU world.
+
+    heading lies in [0, 360). Straight up or down, heading and roll are one: roll is then given as 0.
+    """
+    m = np.asarray(rotations, dtype=np.float64)
+    right, down, forward = m[..., 0, :], m[..., 1, :], m[..., 2, :]
+    pitch = np.arctan2(forward[..., 2], np.hypot(forward[..., 0], forward[..., 1]))
+    vertical = np.hypot(forward[..., 0], forward[..., 1]) < 1e-9
+    # At the poles the image's top (downward view) or bottom (upward view) points along the heading.
+    top = -down * np.where(forward[..., 2:3] < 0, 1.0, -1.0)
+    heading = np.where(
+        vertical, np.arctan2(top[..., 0], top[..., 1]), np.arctan2(forward[..., 0], forward[..., 1])
+    )
+    roll = np.where(vertical, 0.0, np.arctan2(-right[..., 2], -down[..., 2]))
+    return np.stack([np.rad2deg(heading) % 360.0, np.rad2deg(pitch), np.rad2deg(roll)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Camera poses of N frames, in the Cambridge convention.
+
+    centers : (N, 3) float64, camera centres in the world frame, metres once georegistered.
+    quats_wxyz : (N, 4) float64, unit, w >= 0, rotating world axes into camera axes
+        (x right, y down, z forward), so ``x_cam = R(q) @ (x_world - center)``.
+    """
+
+    centers: np.ndarray
+    quats_wxyz: np.ndarray
+
+    @classmethod
+    def from_rotations(cls, centers: np.ndarray, cam_from_world: np.ndarray) -> Poses:
+        """From centres (N, 3) and cam_from_world rotations (N, 3, 3)."""
+        return cls(np.asarray(centers, dtype=np.float64), quats_from_rotations(cam_from_world))
+
+    @classmethod
+    def from_cam_from_world(cls, quats_xyzw: np.ndarray, translations: np.ndarray) -> Poses:
+        """From COLMAP's ``x_cam = R @ x_world + t``: (N, 4) scalar-last quaternions, (N, 3) t."""
+        quats = canonical_quats(np.roll(np.asarray(quats_xyzw, dtype=np.float64), 1, axis=-1))
+        centers = -np.einsum("nji,nj->ni", rotations_from_quats(quats), translations)
+        return cls(centers, quats)
+
+    def to_cam_from_world(self) -> tuple[np.ndarray, np.ndarray]:
+        """COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""
+        translations = -np.einsum("nij,nj->ni", self.rotations, self.centers)
+        return np.roll(self.quats_wxyz, -1, axis=-1), translations
+
+    @property
+    def rotations(self) -> np.ndarray:
+        """cam_from_world rotations (N, 3, 3)."""
+        return rotations_from_quats(self.quats_wxyz)
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def __getitem__(self, index: np.ndarray | slice) -> Poses:
+        return Poses(self.centers[index], self.quats_wxyz[index])
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        return iter(zip(self.centers, self.quats_wxyz, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """``y = scale * rotation @ x + translation``; a variable that holds one is named ``b_from_a``."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    @classmethod
+    def fit(cls, source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
+        """Least-squares target_from_source over corresponding points (N, 3), N >= 3, weights (N,) >= 0.
+
+        Raises GeometryError where the points lie on one line or coincide (nothing fixes the rotation).
+        Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
+        """
+        source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+        w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
+        if np.count_nonzero(w) < 3:
+            raise GeometryError(f"a similarity needs 3 points, {np.count_nonzero(w)} given")
+        w = w / w.sum()
+        source_mean, target_mean = w @ source, w @ target
+        source_0, target_0 = source - source_mean, target - target_mean
+        u, singular, vt = np.linalg.svd((target_0 * w[:, None]).T @ source_0)  # eq. 38
+        if singular[1] <= 1e-9 * singular[0] or singular[0] == 0:
+            raise GeometryError("the points lie on one line: they fix no rotation about it")
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+        rotation = (u * sign) @ vt  # eq. 40
+        scale = float((singular * sign).sum() / (w @ (source_0**2).sum(axis=1)))  # eq. 42
+        return cls(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in the target frame."""
+        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
+
+    def apply_to_poses(self, poses: Poses) -> Poses:
+        """The same cameras seen in the target frame."""
+        return Poses.from_rotations(self.apply(poses.centers), poses.rotations @ self.rotation.T)
+
+    def inverse(self) -> Similarity:
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
+
+    def __matmul__(self, other: Similarity) -> Similarity:
+        """``c_from_b @ b_from_a`` is c_from_a."""
+        return Similarity(
+            self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation)
+        )
+
+
+def rotation_errors_deg(quats_wxyz: np.ndarray, true_quats_wxyz: np.ndarray) -> np.ndarray:
+    """Angles (N,) in degrees between rotations (N, 4): 4 arcsin(min |q -+ r| / 2), exact also near zero."""
+    q, r = np.asarray(quats_wxyz), np.asarray(true_quats_wxyz)
+    chord = np.minimum(np.linalg.norm(q - r, axis=-1), np.linalg.norm(q + r, axis=-1))
+    return np.rad2deg(4 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
+
+
+def pose_errors(estimated: Poses, true: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Position errors (N,) in the world's unit and rotation errors (N,) in degrees. Nothing is aligned."""
+    error_m = np.linalg.norm(estimated.centers - true.centers, axis=-1)
+    return error_m, rotation_errors_deg(estimated.quats_wxyz, true.quats_wxyz)
