@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from spn_data.geodesy import HeightReference
 class Telemetry:
     """Records of one source, in the order of time. What a record does not say is NaN, never zero.
 
-    time_s : (N,) on the video's own clock (0 at its first frame), increasing; for photos, seconds after
-        the first photo, non-decreasing.
+    time_s : (N,) on the video's own clock (0 at its first frame), increasing; for photos, seconds
+        after the first photo, non-decreasing.
     lat_lon_deg : (N, 2) WGS84; NaN where the record has no fix.
     rel_alt_m : (N,) height above the point of take-off.
     abs_alt_m : (N,) height above what `abs_reference` says.
@@ -92,7 +93,8 @@ class Telemetry:
 
     def select(self, index: np.ndarray) -> Telemetry:
         """The records of an index or mask (N,)."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
+        columns: dict[str, Any] = {name: getattr(self, name)[index] for name in _COLUMNS}
+        return replace(self, **columns)
 
     def shifted(self, offset_s: float) -> Telemetry:
         """The same records with `offset_s` added to their times."""
@@ -101,33 +103,50 @@ class Telemetry:
     def at(self, time_s: np.ndarray, *, max_gap_s: float = 2.5) -> Telemetry:
         """Interpolated to times (M,): linear in position, along the shorter arc in angle.
 
-        Each column is interpolated between its own neighbouring known values; where these lie further
-        apart than `max_gap_s`, or a time lies outside them by more than half the median interval, it is NaN.
-        A source of one record a second whose value stands for the whole second is thus used at its stamp.
+        Each column is interpolated between its own neighbouring known values; where these lie
+        further apart than `max_gap_s`, or a time lies outside them by more than half the median
+        interval, it is NaN. A source of one record a second whose value stands for the whole second
+        is thus used at its stamp.
         """
         time_s = np.asarray(time_s, dtype=np.float64)
-        tables = {
+        tables: dict[str, Any] = {
             name: _interpolate(self.time_s, getattr(self, name), time_s, max_gap_s)
             for name in _COLUMNS
-            if name not in ("time_s", "gimbal_deg")
+            if name not in ("time_s", "gimbal_deg", "lat_lon_deg")
         }
-        # Angles go through unit vectors so that 359 and 1 degrees have 0 between them.
-        radians = np.deg2rad(self.gimbal_deg)
-        cosine = _interpolate(self.time_s, np.cos(radians), time_s, max_gap_s)
-        sine = _interpolate(self.time_s, np.sin(radians), time_s, max_gap_s)
-        gimbal = np.rad2deg(np.arctan2(sine, cosine))
+        gimbal = _interpolate(self.time_s, _unwrapped(self.gimbal_deg), time_s, max_gap_s)
         gimbal[:, 0] %= 360.0
-        return replace(self, time_s=time_s, gimbal_deg=gimbal, **tables)
+        gimbal[:, 1:] = _signed(gimbal[:, 1:])
+        lat_lon = self.lat_lon_deg.copy()
+        lat_lon[:, 1:] = _unwrapped(lat_lon[:, 1:])
+        lat_lon = _interpolate(self.time_s, lat_lon, time_s, max_gap_s)
+        lat_lon[:, 1] = _signed(lat_lon[:, 1])
+        return replace(self, time_s=time_s, gimbal_deg=gimbal, lat_lon_deg=lat_lon, **tables)
 
 
+METRES_PER_DEGREE = 111_195.0  # of latitude, on a sphere of 6371 km
 _COLUMNS = ("time_s", "lat_lon_deg", "rel_alt_m", "abs_alt_m", "sigma_m", "gimbal_deg", "utc_s")
+
+
+def _unwrapped(angles_deg: np.ndarray) -> np.ndarray:
+    """Columns of angles (N, K) without jumps of 360 degrees between successive known ones."""
+    result = angles_deg.copy()
+    for column in result.T:
+        known = np.isfinite(column)
+        column[known] = np.unwrap(column[known], period=360.0)
+    return result
+
+
+def _signed(angles_deg: np.ndarray) -> np.ndarray:
+    """Angles in (-180, 180]."""
+    return 180.0 - (180.0 - angles_deg) % 360.0
 
 
 def _interpolate(
     known_s: np.ndarray, values: np.ndarray, wanted_s: np.ndarray, max_gap_s: float
 ) -> np.ndarray:
     """values (N, ...) at known_s (N,), linearly at wanted_s (M,); NaN across gaps and outside."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     result = np.full((len(wanted_s), flat.shape[1]), np.nan)
     margin = 0.5 * float(np.median(np.diff(known_s))) if len(known_s) > 1 else 0.0
     margin = min(margin, max_gap_s / 2)
@@ -140,12 +159,26 @@ def _interpolate(
         right = np.minimum(right, len(t) - 1)
         left = np.maximum(right - 1, 0)
         inside = (wanted_s >= t[0] - margin) & (wanted_s <= t[-1] + margin)
-        exact = np.isclose(wanted_s, t[left], atol=1e-6) | np.isclose(wanted_s, t[right], atol=1e-6)
+        exact = np.minimum(np.abs(wanted_s - t[left]), np.abs(wanted_s - t[right])) <= 1e-6
         # Beyond an end the nearest end's value holds for the margin.
         beyond = (wanted_s < t[0]) | (wanted_s > t[-1])
         good = inside & ((t[right] - t[left] <= max_gap_s) | exact | beyond)
         result[good, column] = np.interp(wanted_s[good], t, v)
     return result.reshape(len(wanted_s), *values.shape[1:])
+
+
+def coordinate_step_m(lat_lon_deg: np.ndarray) -> float:
+    """The step in metres of latitude to which coordinates (N, 2) in degrees are rounded; or NaN.
+
+    Some drones write 4 decimals, steps of 11 m: an error of step / sqrt(12) that no source states.
+    """
+    known = lat_lon_deg[np.isfinite(lat_lon_deg).all(axis=1)]
+    if len(known) == 0:
+        return float("nan")
+    for decimals in range(9):
+        if np.abs(known - np.round(known, decimals)).max() < 1e-10:
+            break
+    return float(10.0**-decimals * METRES_PER_DEGREE)
 
 
 @dataclass(frozen=True)
@@ -157,7 +190,7 @@ class TelemetrySummary:
     with_fix: int
     rate_hz: float  # of records with a fix; NaN for fewer than two
     duration_s: float
-    gaps: tuple[tuple[float, float], ...]  # (from_s, to_s) without a fix for longer than `max_gap_s`
+    gaps: tuple[tuple[float, float], ...]  # (from_s, to_s) longer than `max_gap_s` without a fix
     has_rel_alt: bool
     has_abs_alt: bool
     abs_reference: HeightReference
@@ -171,7 +204,12 @@ def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySumma
     fixed_s = telemetry.time_s[telemetry.has_fix]
     steps = np.diff(fixed_s)
     rate = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else float("nan")
-    gaps = tuple((float(fixed_s[i]), float(fixed_s[i + 1])) for i in np.flatnonzero(steps > max_gap_s))
+    # The first and the last record bound the gaps before the first and after the last fix.
+    bounded_s = np.concatenate([telemetry.time_s[:1], fixed_s, telemetry.time_s[-1:]])
+    gaps = tuple(
+        (float(bounded_s[i]), float(bounded_s[i + 1]))
+        for i in np.flatnonzero(np.diff(bounded_s) > max_gap_s)
+    )
     duration = float(telemetry.time_s[-1] - telemetry.time_s[0]) if len(telemetry) else 0.0
     return TelemetrySummary(
         telemetry.kind,

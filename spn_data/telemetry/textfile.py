@@ -1,0 +1,40 @@
+"""Bounded reading of text files that a user gave."""
+
+from __future__ import annotations
+
+import codecs
+from pathlib import Path
+
+from spn_data.errors import InputError
+
+# A 60 Hz subtitle file takes 1 MB a minute: an hour of flight is far below this.
+MAX_TEXT_BYTES = 200_000_000
+
+
+def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of a file, with "\\n" line ends and no byte-order mark; InputError if it is no text.
+
+    UTF-8, or UTF-16 with a byte-order mark. Bytes that are not UTF-8 become U+FFFD: they stand in
+    free text or degree signs, and where one stands in a number the parser reports it.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise InputError("not a file", path=path)
+        if size > max_bytes:
+            raise InputError(
+                f"has {size / 1e6:.0f} MB, more than the {max_bytes / 1e6:.0f} MB of any telemetry",
+                path=path,
+            )
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        if b"\0" in data:
+            raise InputError("is binary, not text", path=path)
+        text = data.decode("utf-8-sig", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
