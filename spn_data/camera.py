@@ -42,7 +42,10 @@ class Camera:
     def from_horizontal_fov(
         cls, width: int, height: int, fov_deg: float, distortion: tuple[float, ...] = ()
     ) -> Camera:
-        """Centred camera of a horizontal field of view (of the undistorted image); 0, 1, 2 or 4 distortion terms."""
+        """Centred camera of a horizontal field of view (of the undistorted image).
+
+        distortion : 0, 1, 2 or 4 terms, which choose the model.
+        """
         f = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
         center = (width / 2, height / 2)
         model = {0: "SIMPLE_PINHOLE", 1: "SIMPLE_RADIAL", 2: "RADIAL", 4: "OPENCV"}[len(distortion)]
@@ -105,8 +108,8 @@ class Camera:
         """Undistorted normalised image coordinates (N, 2) of pixels (N, 2): x/z and y/z of their rays."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-        return cv2.undistortPointsIter(
-            pixels, self.matrix, self.opencv_distortion, np.eye(3), np.eye(3), criteria
+        return cv2.undistortPoints(
+            pixels, self.matrix, self.opencv_distortion, criteria=criteria
         ).reshape(-1, 2)
 
     def scaled(self, width: int, height: int) -> Camera:

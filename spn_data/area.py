@@ -1,0 +1,365 @@
+"""The user's area on disk: its names, stages that appear whole or not at all, and what is stale."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import platform
+import shutil
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from spn_data.errors import FormatError, StageError
+
+VERSION = 1  # of the area's layout and of stage.json
+FRAMES, MODEL, GEO = "1-frames", "2-model", "3-geo"
+STAGES = (FRAMES, MODEL, GEO)
+UPSTREAM: dict[str, tuple[str, ...]] = {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL)}
+
+_FACTS = "area.toml"
+_RECORD = "stage.json"
+_LOCK = ".lock"
+_NEXT = ".next"
+_READY = "ready"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What the user says of the area: facts, not tuning.
+
+    sources : folders and files that were reconstructed, in the order in which they were given.
+    """
+
+    sources: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageRecord:
+    """What a stage was made of, with what, and what it cost; stage.json.
+
+    options : of the stage; inputs : content fingerprint by file name; upstream : fingerprint of each
+    stage it was made from; counts : what it holds; seconds, cpu_seconds : by step, child processes
+    included; notes : what the user should know.
+    """
+
+    stage: str
+    options: dict[str, Any]
+    inputs: dict[str, str]
+    upstream: dict[str, str]
+    counts: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    versions: dict[str, str] = field(default_factory=dict)
+    finished: str = ""
+
+    @property
+    def made_of(self) -> dict[str, Any]:
+        """What decides whether a stage would come out the same."""
+        made_of = {"options": self.options, "inputs": self.inputs, "upstream": self.upstream}
+        return dict(json.loads(json.dumps(made_of)))
+
+    def fingerprint(self) -> str:
+        """Changes whenever the stage is made anew from something else."""
+        content = json.dumps({"of": self.made_of, "counts": self.counts}, sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+class StageWork:
+    """A stage being made, in a folder of its own that survives an interruption."""
+
+    def __init__(self, area: Area, record: StageRecord, path: Path, *, resumed: bool):
+        self._area = area
+        self.record = record
+        self.path = path
+        self.resumed = resumed
+
+    def finish(
+        self,
+        *,
+        counts: dict[str, Any],
+        seconds: dict[str, float],
+        cpu_seconds: dict[str, float],
+        notes: tuple[str, ...] = (),
+    ) -> StageRecord:
+        """Make the stage appear under its name, in place of the one that it replaces."""
+        record = replace(
+            self.record,
+            counts=counts,
+            seconds={k: round(v, 3) for k, v in seconds.items()},
+            cpu_seconds={k: round(v, 3) for k, v in cpu_seconds.items()},
+            notes=notes,
+            versions=versions(),
+            finished=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+        write_json(self.path / _RECORD, {"version": VERSION, **asdict(record)})
+        self._area.put_in_place(record.stage, self.path)
+        return record
+
+
+class Area:
+    """A folder that `reconstruct` fills stage by stage."""
+
+    def __init__(self, root: Path):
+        self.root = root
+        if (root / _NEXT / _READY).exists():
+            self._take_next()
+        for stage in STAGES:  # a kill between two renames
+            if self._old(stage).exists() and not self.folder(stage).exists():
+                self._old(stage).rename(self.folder(stage))
+        self.facts = self._read_facts()
+
+    def folder(self, stage: str) -> Path:
+        return self.root / stage
+
+    def has(self, stage: str) -> bool:
+        """A stage folder that exists is complete."""
+        return self.folder(stage).is_dir()
+
+    def _old(self, stage: str) -> Path:
+        return self.root / f".old-{stage}"
+
+    def partial(self, stage: str) -> Path:
+        return self.root / f".{stage}.partial"
+
+    def record(self, stage: str) -> StageRecord:
+        """Raises StageError where the stage is missing, FormatError where a newer version made it."""
+        path = self.folder(stage) / _RECORD
+        if not path.exists():
+            raise StageError(f"{self.folder(stage)} is missing; run spn-data reconstruct first")
+        return _read_record(path)
+
+    def stale_because(self, stage: str) -> str | None:
+        """Why a stage no longer fits what it was made from, or None."""
+        record = self.record(stage)
+        for name in UPSTREAM[stage]:
+            if not self.has(name):
+                return f"{name} is missing"
+            if self.record(name).fingerprint() != record.upstream[name]:
+                return f"{name} was made anew since"
+        return None
+
+    def upstream_of(self, stage: str) -> dict[str, str]:
+        """Fingerprints of the stages that `stage` is made from. Raises StageError for a stale one."""
+        for name in UPSTREAM[stage]:
+            reason = self.stale_because(name)
+            if reason:
+                raise StageError(f"{self.folder(name)} is stale: {reason}; run reconstruct again")
+        return {name: self.record(name).fingerprint() for name in UPSTREAM[stage]}
+
+    def begin(
+        self,
+        stage: str,
+        options: Mapping[str, Any],
+        inputs: Mapping[str, str],
+        *,
+        overwrite: bool,
+    ) -> StageWork | StageRecord:
+        """The record where the stage stands already, made of the same; else the work to do.
+
+        Unfinished work made of the same goes on. Raises StageError where finished or unfinished work
+        made of something else would be lost and `overwrite` is false.
+        """
+        record = StageRecord(
+            stage=stage,
+            options=json.loads(json.dumps(options)),
+            inputs=dict(inputs),
+            upstream=self.upstream_of(stage),
+        )
+        if self.has(stage):
+            found = self.record(stage)
+            if found.made_of == record.made_of:
+                return found
+            if not overwrite:
+                change = _difference(found, record)
+                raise StageError(
+                    f"{self.folder(stage)} stands already and {change}; "
+                    "--overwrite makes it anew, another --area leaves it"
+                )
+        path = self.partial(stage)
+        started = path / "started.json"
+        resumed = started.exists()
+        if resumed:
+            found = _read_record(started)
+            if found.made_of != record.made_of:
+                if not overwrite:
+                    raise StageError(
+                        f"{path} holds unfinished work and {_difference(found, record)}; "
+                        "give the same options to go on, or --overwrite to start anew"
+                    )
+                shutil.rmtree(path)
+                resumed = False
+        if not resumed:
+            shutil.rmtree(path, ignore_errors=True)
+            _make_folder(path)
+            write_json(started, {"version": VERSION, **asdict(record)})
+        return StageWork(self, record, path, resumed=resumed)
+
+    def put_in_place(self, stage: str, path: Path) -> None:
+        """Rename a complete folder to the stage's name; a kill at any moment loses neither version."""
+        (path / "started.json").unlink(missing_ok=True)
+        shutil.rmtree(self._old(stage), ignore_errors=True)
+        if self.has(stage):
+            self.folder(stage).rename(self._old(stage))
+        path.rename(self.folder(stage))
+        shutil.rmtree(self._old(stage), ignore_errors=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Only one process at a time changes an area. Creates the area's folder."""
+        _make_folder(self.root)
+        try:
+            handle = (self.root / _LOCK).open("w")
+        except OSError as error:
+            raise StageError(f"{self.root} cannot be written to: {error.strerror}") from error
+        with handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise StageError(f"{self.root} is in use by another spn-data") from error
+            yield
+
+    def write_facts(self, facts: Facts) -> None:
+        text = tomli_w.dumps({"version": VERSION, "sources": list(facts.sources)})
+        _write_atomically(self.root / _FACTS, text)
+        self.facts = facts
+
+    def _read_facts(self) -> Facts:
+        path = self.root / _FACTS
+        if not path.exists():
+            return Facts()
+        try:
+            table = tomllib.loads(path.read_text())
+            _check_version(path, table["version"])
+            return Facts(sources=tuple(str(s) for s in table["sources"]))
+        except (tomllib.TOMLDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
+            raise FormatError(f"{path}: not an area file of this program ({error!r})") from error
+
+    def next_area(self) -> Area:
+        """An area inside this one in which its next version is made, whole, before it replaces this."""
+        return Area(self.root / _NEXT)
+
+    def take_next(self) -> None:
+        """Replace the stages by those of the next version, all or none."""
+        (self.root / _NEXT / _READY).touch()
+        self._take_next()
+        self.facts = self._read_facts()
+
+    def _take_next(self) -> None:
+        following = self.root / _NEXT
+        for stage in STAGES:
+            new, now, old = following / stage, self.folder(stage), self._old(stage)
+            if new.exists():
+                if now.exists():
+                    shutil.rmtree(old, ignore_errors=True)
+                    now.rename(old)
+                new.rename(now)
+            shutil.rmtree(old, ignore_errors=True)
+        if (following / _FACTS).exists():
+            (following / _FACTS).replace(self.root / _FACTS)
+        shutil.rmtree(following)
+
+
+def content_fingerprint(path: Path) -> str:
+    """Of a file's size and of its first, middle and last megabyte: quick also for hours of video."""
+    size = path.stat().st_size
+    digest = hashlib.sha256(str(size).encode())
+    with path.open("rb") as handle:
+        for start in (0, max(0, size // 2 - 2**19), max(0, size - 2**20)):
+            handle.seek(start)
+            digest.update(handle.read(2**20))
+    return digest.hexdigest()[:16]
+
+
+def write_json(path: Path, value: Any) -> None:
+    _write_atomically(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Raises FormatError where the file is missing, damaged, or of a newer version."""
+    try:
+        value = json.loads(path.read_text())
+        _check_version(path, value["version"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: cannot be read ({error!r})") from error
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Of what computed something."""
+    found = {"python": platform.python_version()}
+    for package in ("squeezeposenet-toolkit", "pycolmap", "opencv-python-headless", "numpy", "av"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed as a package"
+    return found
+
+
+def _read_record(path: Path) -> StageRecord:
+    table = read_json(path)
+    del table["version"]
+    try:
+        return StageRecord(**{**table, "notes": tuple(table["notes"])})
+    except (TypeError, KeyError) as error:
+        raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
+
+
+def _check_version(path: Path, found: int) -> None:
+    if found > VERSION:
+        raise FormatError(
+            f"{path}: made by a newer version of this program (format {found}, this reads {VERSION}); "
+            "update the program"
+        )
+
+
+def _difference(found: StageRecord, wanted: StageRecord) -> str:
+    """In words, what two records are made of that differs."""
+    for name, value in wanted.options.items():
+        if name not in found.options or found.options[name] != value:
+            return f"was made with {name} = {found.options.get(name)!r}, now {value!r}"
+    new = sorted(set(wanted.inputs) - set(found.inputs))
+    gone = sorted(set(found.inputs) - set(wanted.inputs))
+    changed = sorted(
+        k for k in set(wanted.inputs) & set(found.inputs) if wanted.inputs[k] != found.inputs[k]
+    )
+    for what, names in (
+        ("does not hold", new),
+        ("holds the missing", gone),
+        ("saw another", changed),
+    ):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            return f"{what} {names[0]}{more}"
+    return "was made from an earlier " + " and ".join(
+        name for name in wanted.upstream if wanted.upstream[name] != found.upstream.get(name)
+    )
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StageError(f"{path} cannot be made: {error.strerror}") from error
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("w") as handle:
+            handle.write(text)
+            handle.flush()
+            os.fsync(handle.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise StageError(f"{path} cannot be written: {error.strerror}") from error

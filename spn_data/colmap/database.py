@@ -1,0 +1,139 @@
+"""COLMAP's database: cameras and images up front, then features and verified pairs as they come.
+
+Each write is committed at once, so that a killed run keeps all that it had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.colmap import pycolmap
+from spn_data.colmap.verify import VerifiedPair, native_camera
+from spn_data.errors import FormatError
+from spn_data.features import Features
+
+
+@dataclass(frozen=True)
+class DatabaseImage:
+    """An image row: its COLMAP name, and the key of its camera."""
+
+    name: str
+    camera: str
+
+
+class MapDatabase:
+    """An open COLMAP database whose image ids are fixed by the order of the images given first."""
+
+    def __init__(self, native: pycolmap.Database):
+        self._native = native
+        self.ids = {image.name: image.image_id for image in native.read_all_images()}
+
+    @classmethod
+    @contextmanager
+    def open(cls, path: Path) -> Iterator[Self]:
+        """Open or create."""
+        try:
+            native = pycolmap.Database.open(path)
+        except (RuntimeError, ValueError) as error:
+            raise FormatError(f"{path}: not a COLMAP database ({error})") from error
+        try:
+            yield cls(native)
+        finally:
+            native.close()
+
+    def add_images(
+        self,
+        images: Sequence[DatabaseImage],
+        cameras: dict[str, tuple[Camera, bool]],
+    ) -> None:
+        """Insert the images that are not there yet, one camera a key: (start intrinsics, focal known)."""
+        camera_ids = {
+            image.camera: self._native.read_image_with_name(image.name).camera_id
+            for image in images
+            if image.name in self.ids
+        }
+        with pycolmap.DatabaseTransaction(self._native):
+            for image in images:
+                if image.name in self.ids:
+                    continue
+                if image.camera not in camera_ids:
+                    camera_ids[image.camera] = self._add_camera(*cameras[image.camera])
+                self.ids[image.name] = self._add_image(image.name, camera_ids[image.camera])
+
+    def _add_camera(self, camera: Camera, focal_is_known: bool) -> int:
+        camera_id = self._native.num_cameras() + 1
+        native = native_camera(camera, camera_id=camera_id, focal_is_known=focal_is_known)
+        self._native.write_camera(native, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=camera_id)
+        rig.add_ref_sensor(native.sensor_id)
+        self._native.write_rig(rig, use_rig_id=True)
+        return camera_id
+
+    def _add_image(self, name: str, camera_id: int) -> int:
+        image_id = self._native.num_images() + 1
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+        self._native.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+        frame.add_data_id(image.data_id)
+        self._native.write_frame(frame, use_frame_id=True)
+        return image_id
+
+    def has_features(self, name: str) -> bool:
+        # Descriptors are written last.
+        return bool(self._native.exists_descriptors(self.ids[name]))
+
+    def write_features(self, name: str, features: Features) -> None:
+        image_id = self.ids[name]
+        if self._native.exists_keypoints(image_id):
+            raise ValueError(f"{name} has features already")
+        descriptors = pycolmap.FeatureDescriptors(
+            type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
+        )
+        with pycolmap.DatabaseTransaction(self._native):
+            self._native.write_keypoints(image_id, features.keypoints)
+            self._native.write_descriptors(image_id, descriptors)
+
+    def read_features(self, name: str) -> Features:
+        image_id = self.ids[name]
+        return Features(
+            np.asarray(self._native.read_keypoints(image_id), np.float32).reshape(-1, 4),
+            np.asarray(self._native.read_descriptors(image_id).data, np.uint8).reshape(-1, 128),
+        )
+
+    def num_keypoints(self, name: str) -> int:
+        return int(self._native.num_keypoints_for_image(self.ids[name]))
+
+    def has_pair(self, pair: tuple[int, int]) -> bool:
+        return bool(self._native.exists_two_view_geometry(*pair))
+
+    def write_pair(self, pair: VerifiedPair) -> None:
+        """Putative matches and verified geometry; a pair that failed has a row too, so it is not redone."""
+        geometry = pycolmap.TwoViewGeometry(
+            config=pycolmap.TwoViewGeometryConfiguration(pair.config),
+            E=pair.e,
+            F=pair.f,
+            H=pair.h,
+            inlier_matches=pair.inliers,
+        )
+        with pycolmap.DatabaseTransaction(self._native):
+            self._native.write_matches(*pair.image_ids, pair.matches)
+            self._native.write_two_view_geometry(*pair.image_ids, geometry)
+
+    def verified_pairs(self) -> dict[tuple[str, str], int]:
+        """Number of inlier matches of each verified pair of names."""
+        names = {image_id: name for name, image_id in self.ids.items()}
+        counts: dict[tuple[str, str], int] = {}
+        for pair_id, inliers in zip(
+            *self._native.read_two_view_geometry_num_inliers(), strict=True
+        ):
+            if inliers > 0:
+                first, second = pycolmap.pair_id_to_image_pair(pair_id)
+                counts[names[first], names[second]] = int(inliers)
+        return counts

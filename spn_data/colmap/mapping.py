@@ -1,0 +1,166 @@
+"""Mapping, joining and refining models, as a child process (`python -m spn_data.colmap.mapping`).
+
+The functions above `main` run in the parent and know no pycolmap objects, those below in the child.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from spn_data import child
+from spn_data.errors import FormatError
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappingJob:
+    """One run of COLMAP's mapper over a database."""
+
+    database: str
+    images: str  # folder, for the points' colours
+    output: str  # an existing folder; sub-models are written to 0, 1, ... in it
+    snapshots: str  # an existing folder
+    engine: str = "incremental"  # or "global"
+    threads: int = -1
+    seed: int = 0
+    snapshot_every: int = 20  # registered images
+    start_from: str = ""  # folder of a model to go on from
+
+
+def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) -> list[Path]:
+    """Folders of the sub-models, most images first; empty where nothing could be mapped.
+
+    progress is told the number of registered images. Snapshots stay where the child dies.
+    """
+    models: list[Path] = []
+
+    def on_event(event: child.Event) -> None:
+        if "registered" in event:
+            progress(event["registered"])
+        if "models" in event:
+            models.extend(Path(folder) for folder in event["models"])
+
+    child.run_child(__name__, {"task": "map", **asdict(job)}, log=log, on_event=on_event)
+    return models
+
+
+def latest_snapshot(snapshots: Path) -> Path | None:
+    """The newest snapshot that is complete; an interrupted write is passed over."""
+    from spn_data.colmap.model import count_registered
+
+    folders = [f for f in snapshots.iterdir() if f.is_dir()] if snapshots.is_dir() else []
+    for folder in sorted(folders, key=lambda f: f.name, reverse=True):
+        try:
+            if count_registered(folder) > 0:
+                return folder
+        except FormatError:
+            continue
+    return None
+
+
+def refine(
+    source: Path,
+    target: Path,
+    *,
+    camera_model: str,
+    refine_principal_point: bool,
+    threads: int,
+    log: Path,
+) -> dict[str, Any]:
+    """Last bundle adjustments over a whole model, with a fuller camera; returns what it did."""
+    result: dict[str, Any] = {}
+    job = {
+        "task": "refine",
+        "source": str(source),
+        "target": str(target),
+        "camera_model": camera_model,
+        "refine_principal_point": refine_principal_point,
+        "threads": threads,
+    }
+    child.run_child(__name__, job, log=log, on_event=result.update)
+    return result
+
+
+def main() -> None:
+    job = child.read_job()
+    task = job.pop("task")
+    if task == "map":
+        _map(MappingJob(**job))
+    elif task == "refine":
+        _refine(**job)
+    else:
+        raise ValueError(f"no task {task!r}")
+
+
+def _map(job: MappingJob) -> None:
+    from spn_data.colmap import pycolmap
+
+    pycolmap.set_random_seed(job.seed)
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.INFO.value
+    if job.engine == "global":
+        options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=job.seed)
+        models = pycolmap.global_mapping(job.database, job.images, job.output, options)
+    else:
+        models = _map_incrementally(job)
+    largest_first = sorted(models, key=lambda i: (-models[i].num_reg_images(), i))
+    child.send({"models": [f"{job.output}/{i}" for i in largest_first]})
+
+
+def _map_incrementally(job: MappingJob) -> dict[int, Any]:
+    from spn_data.colmap import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads,
+        random_seed=job.seed,
+        snapshot_path=job.snapshots,
+        snapshot_frames_freq=job.snapshot_every,
+    )
+    # A model of few images is a failure to report, not a result to keep.
+    options.min_model_size = 3
+    registered = 0
+    if job.start_from:
+        registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
+
+    def count(new: int) -> None:
+        nonlocal registered
+        registered += new
+        child.send({"registered": registered})
+
+    token = pycolmap.CancellationToken()
+    with child.interrupts(token.cancel):
+        models: dict[int, Any] = pycolmap.incremental_mapping(
+            job.database,
+            job.images,
+            job.output,
+            options,
+            input_path=job.start_from,
+            initial_image_pair_callback=lambda: count(2),
+            next_image_callback=lambda: count(1),
+            cancellation_token=token,
+        )
+    return models
+
+
+def _refine(
+    source: str, target: str, camera_model: str, refine_principal_point: bool, threads: int
+) -> None:
+    from spn_data.colmap import pycolmap
+    from spn_data.colmap.model import upgrade_camera
+
+    model = pycolmap.Reconstruction(source)
+    for camera in model.cameras.values():
+        upgrade_camera(camera, camera_model)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=refine_principal_point)
+    options.ceres.solver_options.num_threads = threads
+    before = model.compute_mean_reprojection_error()
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    Path(target).mkdir(parents=True, exist_ok=True)
+    model.write(target)
+    child.send({"error_before_px": before, "error_px": model.compute_mean_reprojection_error()})
+
+
+if __name__ == "__main__":
+    main()
