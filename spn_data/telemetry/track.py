@@ -190,7 +190,7 @@ class TelemetrySummary:
     with_fix: int
     rate_hz: float  # of records with a fix; NaN for fewer than two
     duration_s: float
-    gaps: tuple[tuple[float, float], ...]  # (from_s, to_s) longer than `max_gap_s` without a fix
+    gaps: tuple[tuple[float, float], ...]  # (from_s, to_s) without a fix
     has_rel_alt: bool
     has_abs_alt: bool
     abs_reference: HeightReference
@@ -200,15 +200,19 @@ class TelemetrySummary:
 
 
 def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySummary:
-    """Counts, rate and gaps of a source."""
+    """Counts, rate and gaps of a source.
+
+    A gap is longer than `max_gap_s` and than 2.5 usual intervals: photos are seconds apart.
+    """
     fixed_s = telemetry.time_s[telemetry.has_fix]
     steps = np.diff(fixed_s)
     rate = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else float("nan")
     # The first and the last record bound the gaps before the first and after the last fix.
     bounded_s = np.concatenate([telemetry.time_s[:1], fixed_s, telemetry.time_s[-1:]])
+    usual_s = 2.5 * float(np.median(steps)) if len(steps) else 0.0
     gaps = tuple(
         (float(bounded_s[i]), float(bounded_s[i + 1]))
-        for i in np.flatnonzero(np.diff(bounded_s) > max_gap_s)
+        for i in np.flatnonzero(np.diff(bounded_s) > max(max_gap_s, usual_s))
     )
     duration = float(telemetry.time_s[-1] - telemetry.time_s[0]) if len(telemetry) else 0.0
     return TelemetrySummary(
