@@ -126,6 +126,10 @@ class MapDatabase:
             self._native.write_matches(*pair.image_ids, pair.matches)
             self._native.write_two_view_geometry(*pair.image_ids, geometry)
 
+    def num_pairs(self) -> int:
+        """Pairs tried, verified or not."""
+        return int(self._native.num_matched_image_pairs())
+
     def verified_pairs(self) -> dict[tuple[str, str], int]:
         """Number of inlier matches of each verified pair of names."""
         names = {image_id: name for name, image_id in self.ids.items()}
