@@ -1,0 +1,35 @@
+# Two commands set everything up on a machine with Python >= 3.11 and make: make demo, make test.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := demo
+
+.PHONY: demo test test-slow lint clean
+
+$(VENV)/installed: pyproject.toml requirements.lock
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
+	touch $@
+
+# Simulated flights with exact truth, from video to a georeferenced model.
+demo: $(VENV)/installed
+	rm -rf $(DEMO)
+	$(BIN)/spn-data simulate $(DEMO)/flights --preset demo --seed 1
+	$(BIN)/spn-data reconstruct $(DEMO)/flights/mapping --area $(DEMO)/area --fov 72
+	$(BIN)/spn-data status --area $(DEMO)/area
+	$(BIN)/python benchmarks/truth.py $(DEMO)/area $(DEMO)/flights
+
+test: $(VENV)/installed
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: $(VENV)/installed
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist *.egg-info
