@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from spn_data.camera import Camera
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping
 from spn_data.colmap.model import count_registered, read_scene
-from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
-from spn_data.errors import InputError, StageError
-from spn_data.features import FeatureOptions, Features, extract
+from spn_data.correspondences import FramesToMap, extract_missing, match_missing, pairs_of
+from spn_data.diagnosis import FrameRegistration, diagnose
+from spn_data.errors import StageError
+from spn_data.features import FeatureOptions
 from spn_data.matching import MatchOptions
-from spn_data.pairs import PairOptions, appearance_vocabulary, choose_pairs, describe_appearance
-from spn_data.parallel import run_batches
+from spn_data.pairs import PairOptions
 from spn_data.timing import Progress, Stopwatch
 
 
@@ -37,36 +32,6 @@ class ReconstructOptions:
     seed: int = 0
     enough_share: float = 0.9  # registered, below which all is matched again, more widely
     usable_share: float = 0.1  # registered, below which there is no model
-
-
-@dataclass(frozen=True, eq=False)
-class FramesToMap:
-    """What reconstruction knows of N frames.
-
-    names : relative to `folder`; sequences, cameras : (N,) keys; positions_m : (N, 3) ENU, NaN where
-    unknown; start_cameras : by key, with whether the focal length is known; masks : file by sequence.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
-    sequences: np.ndarray
-    cameras: np.ndarray
-    positions_m: np.ndarray
-    start_cameras: dict[str, tuple[Camera, bool]]
-    masks: dict[str, Path]
-
-
-@dataclass(frozen=True)
-class FrameRegistration:
-    """What became of one frame."""
-
-    name: str
-    registered: bool
-    reason: str  # empty where it is registered
-    keypoints: int
-    verified_pairs: int
-    observations: int  # of points of the model
-    error_px: float  # mean; NaN where it is not registered
 
 
 @dataclass(frozen=True)
@@ -138,7 +103,7 @@ def reconstruct(
             with stopwatch.step("pairs"):
                 pairs = pairs_of(database, frames, attempt.pairs)
             with stopwatch.step("matching"):
-                match_missing(database, frames, pairs, options, progress)
+                match_missing(database, frames, pairs, options.matching, options.threads, progress)
         with stopwatch.step("mapping"):
             models = _map(work, attempt, frames, options, progress, start_from=None)
         submodels = tuple(count_registered(model) for model in models)
@@ -166,104 +131,6 @@ def reconstruct(
     return ReconstructResult(
         refined, work / attempt.database, registrations, submodels, tuple(story), tried, verified
     )
-
-
-def extract_missing(
-    database: MapDatabase,
-    frames: FramesToMap,
-    options: FeatureOptions,
-    workers: int,
-    progress: Progress,
-) -> None:
-    """Features of the frames that have none in the database yet."""
-    missing = [
-        (name, str(sequence))
-        for name, sequence in zip(frames.names, frames.sequences, strict=True)
-        if not database.has_features(name)
-    ]
-    done = len(frames.names) - len(missing)
-
-    def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
-        for name, sequence in missing:
-            mask = frames.masks.get(sequence)
-            encoded_mask = None if mask is None else mask.read_bytes()
-            yield name, (name, (frames.folder / name).read_bytes(), encoded_mask, options)
-
-    def store(result: tuple[str, Features]) -> None:
-        nonlocal done
-        database.write_features(*result)
-        done += 1
-        progress("features", done, len(frames.names))
-
-    run_batches(extract_from_bytes, batches(), workers=workers, on_result=store)
-
-
-def extract_from_bytes(
-    name: str, image: bytes, mask: bytes | None, options: FeatureOptions
-) -> tuple[str, Features]:
-    """Features of an encoded image. Pure: the same bytes give the same features anywhere."""
-    gray = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
-        raise InputError("is no image that can be decoded", path=name)
-    use = None
-    if mask is not None:
-        decoded = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if decoded is None:
-            raise InputError("its mask is no image that can be decoded", path=name)
-        use = decoded > 127
-    return name, extract(gray, use, options)
-
-
-def pairs_of(
-    database: MapDatabase, frames: FramesToMap, options: PairOptions
-) -> list[tuple[int, int]]:
-    """Pairs of positions in `frames` to match."""
-    described = [database.read_features(name).descriptors for name in frames.names]
-    vocabulary = appearance_vocabulary(described, options)
-    appearance = np.stack([describe_appearance(d, vocabulary) for d in described])
-    return choose_pairs(frames.sequences, frames.positions_m, appearance, options)
-
-
-_PAIRS_A_BATCH = 16
-
-
-def match_missing(
-    database: MapDatabase,
-    frames: FramesToMap,
-    pairs: list[tuple[int, int]],
-    options: ReconstructOptions,
-    progress: Progress,
-) -> None:
-    """Match and verify the pairs that the database does not hold yet."""
-    ids = [database.ids[name] for name in frames.names]
-    missing = [(i, j) for i, j in pairs if not database.has_pair((ids[i], ids[j]))]
-    done = len(pairs) - len(missing)
-    cache: dict[int, Features] = {}
-
-    def image(i: int) -> ImageForMatching:
-        camera, focal_is_known = frames.start_cameras[str(frames.cameras[i])]
-        return ImageForMatching(cache[i], camera, focal_is_known)
-
-    def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
-        for start in range(0, len(missing), _PAIRS_A_BATCH):
-            batch = missing[start : start + _PAIRS_A_BATCH]
-            needed = {i for pair in batch for i in pair}
-            for i in set(cache) - needed:
-                del cache[i]
-            for i in needed - set(cache):
-                cache[i] = database.read_features(frames.names[i])
-            images = {ids[i]: image(i) for i in sorted(needed)}
-            label = f"matching {frames.names[batch[0][0]]} and {len(batch)} others"
-            yield label, (images, [(ids[i], ids[j]) for i, j in batch], options.matching)
-
-    def store(result: list[VerifiedPair]) -> None:
-        nonlocal done
-        for pair in result:
-            database.write_pair(pair)
-        done += len(result)
-        progress("matching", done, len(pairs))
-
-    run_batches(match_pairs, batches(), workers=options.threads, on_result=store)
 
 
 def _map(
@@ -326,7 +193,9 @@ def _second_chance(
             if frames.names[i] not in registered or frames.names[j] not in registered
         ]
         with stopwatch.step("matching"):
-            match_missing(database, frames, for_missing, options, progress)
+            match_missing(
+                database, frames, for_missing, options.matching, options.threads, progress
+            )
     with stopwatch.step("mapping"):
         models = _map(work, attempt, frames, options, progress, start_from=model, suffix="-second")
     return max([model, *models], key=count_registered)
@@ -345,55 +214,6 @@ def _refine(work: Path, model: Path, options: ReconstructOptions, progress: Prog
     )
     progress("refinement", 1, 1)
     return target
-
-
-def diagnose(
-    database: MapDatabase, frames: FramesToMap, model: Path
-) -> tuple[FrameRegistration, ...]:
-    """What became of each frame, and for the missing ones why."""
-    from spn_data.colmap.model import read_observations
-
-    scene, seen = read_observations(model)
-    position = {name: k for k, name in enumerate(scene.names)}
-    partners: dict[str, dict[str, int]] = {name: {} for name in frames.names}
-    for (a, b), inliers in database.verified_pairs().items():
-        partners[a][b] = inliers
-        partners[b][a] = inliers
-    errors = np.linalg.norm(seen.residuals_px, axis=1)
-    counts = np.bincount(seen.image_idx, minlength=len(scene.names))
-    sums = np.bincount(seen.image_idx, errors, minlength=len(scene.names))
-    rows = []
-    for name in frames.names:
-        keypoints = database.num_keypoints(name)
-        k = position.get(name)
-        reason = "" if k is not None else _why_missing(keypoints, partners[name], position)
-        observations = 0 if k is None else int(counts[k])
-        error = float("nan") if k is None or counts[k] == 0 else float(sums[k] / counts[k])
-        rows.append(
-            FrameRegistration(
-                name, k is not None, reason, keypoints, len(partners[name]), observations, error
-            )
-        )
-    return tuple(rows)
-
-
-def _why_missing(keypoints: int, partners: dict[str, int], registered: dict[str, int]) -> str:
-    if keypoints < 100:
-        return f"only {keypoints} features: too blurred, dark or bare"
-    if not partners:
-        return f"{keypoints} features, but no verified match with any frame"
-    inside = {name: inliers for name, inliers in partners.items() if name in registered}
-    if not inside:
-        best = max(partners, key=lambda name: partners[name])
-        return (
-            f"matches {len(partners)} frames (best {best}, {partners[best]} inliers), "
-            "all of them missing too"
-        )
-    best = max(inside, key=lambda name: inside[name])
-    return (
-        f"matches {len(inside)} registered frames (best {best}, {inside[best]} inliers), "
-        "but no pose agrees with the model's points"
-    )
 
 
 def _tell(attempt: Attempt, submodels: tuple[int, ...], n: int) -> str:

@@ -1,0 +1,136 @@
+"""Features and verified matches of frames, computed in worker processes into one database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
+from spn_data.errors import InputError
+from spn_data.features import FeatureOptions, Features, extract
+from spn_data.matching import MatchOptions
+from spn_data.pairs import PairOptions, appearance_vocabulary, choose_pairs, describe_appearance
+from spn_data.parallel import run_batches
+from spn_data.timing import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class FramesToMap:
+    """What reconstruction knows of N frames.
+
+    names : relative to `folder`; sequences, cameras : (N,) keys; positions_m : (N, 3) ENU, NaN where
+    unknown; start_cameras : by key, with whether the focal length is known; masks : file by sequence.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    sequences: np.ndarray
+    cameras: np.ndarray
+    positions_m: np.ndarray
+    start_cameras: dict[str, tuple[Camera, bool]]
+    masks: dict[str, Path]
+
+
+def extract_missing(
+    database: MapDatabase,
+    frames: FramesToMap,
+    options: FeatureOptions,
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Features of the frames that have none in the database yet."""
+    missing = [
+        (name, str(sequence))
+        for name, sequence in zip(frames.names, frames.sequences, strict=True)
+        if not database.has_features(name)
+    ]
+    done = len(frames.names) - len(missing)
+
+    def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
+        for name, sequence in missing:
+            mask = frames.masks.get(sequence)
+            encoded_mask = None if mask is None else mask.read_bytes()
+            yield name, (name, (frames.folder / name).read_bytes(), encoded_mask, options)
+
+    def store(result: tuple[str, Features]) -> None:
+        nonlocal done
+        database.write_features(*result)
+        done += 1
+        progress("features", done, len(frames.names))
+
+    run_batches(extract_from_bytes, batches(), workers=workers, on_result=store)
+
+
+def extract_from_bytes(
+    name: str, image: bytes, mask: bytes | None, options: FeatureOptions
+) -> tuple[str, Features]:
+    """Features of an encoded image. Pure: the same bytes give the same features anywhere."""
+    gray = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if gray is None:
+        raise InputError("is no image that can be decoded", path=name)
+    use = None
+    if mask is not None:
+        decoded = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if decoded is None:
+            raise InputError("its mask is no image that can be decoded", path=name)
+        use = decoded > 127
+    return name, extract(gray, use, options)
+
+
+def pairs_of(
+    database: MapDatabase, frames: FramesToMap, options: PairOptions
+) -> list[tuple[int, int]]:
+    """Pairs of positions in `frames` to match."""
+    described = [database.read_features(name).descriptors for name in frames.names]
+    vocabulary = appearance_vocabulary(described, options)
+    appearance = np.stack([describe_appearance(d, vocabulary) for d in described])
+    return choose_pairs(frames.sequences, frames.positions_m, appearance, options)
+
+
+_PAIRS_A_BATCH = 16
+
+
+def match_missing(
+    database: MapDatabase,
+    frames: FramesToMap,
+    pairs: list[tuple[int, int]],
+    options: MatchOptions,
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Match and verify the pairs that the database does not hold yet."""
+    ids = [database.ids[name] for name in frames.names]
+    missing = [(i, j) for i, j in pairs if not database.has_pair((ids[i], ids[j]))]
+    done = len(pairs) - len(missing)
+    cache: dict[int, Features] = {}
+
+    def image(i: int) -> ImageForMatching:
+        camera, focal_is_known = frames.start_cameras[str(frames.cameras[i])]
+        return ImageForMatching(cache[i], camera, focal_is_known)
+
+    def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
+        for start in range(0, len(missing), _PAIRS_A_BATCH):
+            batch = missing[start : start + _PAIRS_A_BATCH]
+            needed = {i for pair in batch for i in pair}
+            for i in set(cache) - needed:
+                del cache[i]
+            for i in needed - set(cache):
+                cache[i] = database.read_features(frames.names[i])
+            images = {ids[i]: image(i) for i in sorted(needed)}
+            label = f"matching {frames.names[batch[0][0]]} and {len(batch)} others"
+            yield label, (images, [(ids[i], ids[j]) for i, j in batch], options)
+
+    def store(result: list[VerifiedPair]) -> None:
+        nonlocal done
+        for pair in result:
+            database.write_pair(pair)
+        done += len(result)
+        progress("matching", done, len(pairs))
+
+    run_batches(match_pairs, batches(), workers=workers, on_result=store)

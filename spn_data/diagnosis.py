@@ -1,0 +1,72 @@
+"""What became of each frame in a reconstruction, and which passages are missing and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.model import read_observations
+from spn_data.correspondences import FramesToMap
+
+
+@dataclass(frozen=True)
+class FrameRegistration:
+    """What became of one frame."""
+
+    name: str
+    registered: bool
+    reason: str  # empty where it is registered
+    keypoints: int
+    verified_pairs: int
+    observations: int  # of points of the model
+    error_px: float  # mean; NaN where it is not registered
+
+
+def diagnose(
+    database: MapDatabase, frames: FramesToMap, model: Path
+) -> tuple[FrameRegistration, ...]:
+    """What became of each frame, and for the missing ones why."""
+    scene, seen = read_observations(model)
+    position = {name: k for k, name in enumerate(scene.names)}
+    partners: dict[str, dict[str, int]] = {name: {} for name in frames.names}
+    for (a, b), inliers in database.verified_pairs().items():
+        partners[a][b] = inliers
+        partners[b][a] = inliers
+    errors = np.linalg.norm(seen.residuals_px, axis=1)
+    counts = np.bincount(seen.image_idx, minlength=len(scene.names))
+    sums = np.bincount(seen.image_idx, errors, minlength=len(scene.names))
+    rows = []
+    for name in frames.names:
+        keypoints = database.num_keypoints(name)
+        k = position.get(name)
+        reason = "" if k is not None else _why_missing(keypoints, partners[name], position)
+        observations = 0 if k is None else int(counts[k])
+        error = float("nan") if k is None or counts[k] == 0 else float(sums[k] / counts[k])
+        rows.append(
+            FrameRegistration(
+                name, k is not None, reason, keypoints, len(partners[name]), observations, error
+            )
+        )
+    return tuple(rows)
+
+
+def _why_missing(keypoints: int, partners: dict[str, int], registered: dict[str, int]) -> str:
+    if keypoints < 100:
+        return f"only {keypoints} features: too blurred, dark or bare"
+    if not partners:
+        return f"{keypoints} features, but no verified match with any frame"
+    inside = {name: inliers for name, inliers in partners.items() if name in registered}
+    if not inside:
+        best = max(partners, key=lambda name: partners[name])
+        return (
+            f"matches {len(partners)} frames (best {best}, {partners[best]} inliers), "
+            "all of them missing too"
+        )
+    best = max(inside, key=lambda name: inside[name])
+    return (
+        f"matches {len(inside)} registered frames (best {best}, {inside[best]} inliers), "
+        "but no pose agrees with the model's points"
+    )
