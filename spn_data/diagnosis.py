@@ -70,3 +70,23 @@ def _why_missing(keypoints: int, partners: dict[str, int], registered: dict[str,
         f"matches {len(inside)} registered frames (best {best}, {inside[best]} inliers), "
         "but no pose agrees with the model's points"
     )
+
+
+def missing_passages(
+    registrations: tuple[FrameRegistration, ...], sequences: np.ndarray, time_s: np.ndarray
+) -> tuple[str, ...]:
+    """A sentence for each run of missing frames in a sequence: when, how many, and the commonest reason."""
+    sentences = []
+    for sequence in dict.fromkeys(sequences.tolist()):
+        rows = np.flatnonzero(sequences == sequence)
+        missing = np.array([not registrations[i].registered for i in rows])
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+        for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
+            run = rows[first : last + 1]
+            reasons = [registrations[i].reason for i in run]
+            common = max(set(reasons), key=reasons.count)
+            sentences.append(
+                f"{sequence}, {time_s[run[0]]:.1f} to {time_s[run[-1]]:.1f} s: {len(run)} of "
+                f"{len(rows)} frames are missing; {common}"
+            )
+    return tuple(sentences)

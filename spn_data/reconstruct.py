@@ -76,6 +76,7 @@ class ReconstructResult:
     attempts: tuple[str, ...]  # sentences: what was tried and what it gave
     pairs_tried: int
     pairs_verified: int
+    points: int
 
 
 def reconstruct(
@@ -129,7 +130,14 @@ def reconstruct(
         verified = len(database.verified_pairs())
         tried = database.num_pairs()
     return ReconstructResult(
-        refined, work / attempt.database, registrations, submodels, tuple(story), tried, verified
+        refined,
+        work / attempt.database,
+        registrations,
+        submodels,
+        tuple(story),
+        tried,
+        verified,
+        len(read_scene(refined).points),
     )
 
 

@@ -1,0 +1,112 @@
+"""What the user sees: progress with time left, tables, one line an error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import click
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as RichProgress
+from rich.table import Table
+
+from spn_data.errors import SpnError
+from spn_data.timing import Progress
+
+out = Console(highlight=False)
+_PLAIN_EVERY_S = 20.0
+
+
+class Group(click.Group):
+    """Commands in the order in which they are defined; errors of the user's data are one line, exit 1."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except SpnError as error:
+            if ctx.params.get("verbose"):
+                raise
+            raise click.ClickException(str(error)) from error
+        except KeyboardInterrupt:
+            click.echo(
+                "\nStopped. What is done is kept: the same command goes on from here.", err=True
+            )
+            ctx.exit(130)
+        except OSError as error:
+            if ctx.params.get("verbose") or error.filename is None:
+                raise
+            raise click.ClickException(f"{error.filename}: {error.strerror}") from error
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """A bar for each step with the time left on a terminal, a line now and then elsewhere."""
+    if not out.is_terminal:
+        yield _PlainProgress()
+        return
+    columns = (
+        TextColumn("{task.description:<12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with RichProgress(*columns, console=out, transient=False) as bars:
+        tasks: dict[str, object] = {}
+
+        def update(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=total or None)
+            bars.update(tasks[step], completed=done, total=total or None)  # type: ignore[arg-type]
+
+        yield update
+
+
+class _PlainProgress:
+    """For logs: the start and end of each step, and a line every so often between."""
+
+    def __init__(self) -> None:
+        self._step = ""
+        self._started = self._last = 0.0
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if step != self._step:
+            self._step, self._started, self._last = step, now, now
+        elif not (0 < total <= done) and now - self._last < _PLAIN_EVERY_S:
+            return
+        self._last = now
+        left = ""
+        if 0 < done < total and now > self._started:
+            left = f", about {(now - self._started) / done * (total - done):.0f} s left"
+        out.print(f"{step}: {done}{f' of {total}' if total else ''}{left}")
+
+
+def table(title: str, rows: list[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
+    """Rows of text; the first column is the name of what stands beside it."""
+    shown = Table(title=title, title_justify="left", show_header=bool(header), box=None)
+    width = len(header or rows[0])
+    for k in range(width):
+        shown.add_column(
+            header[k] if header else "", overflow="fold", style="bold" if k == 0 else ""
+        )
+    for row in rows:
+        shown.add_row(*row)
+    out.print(shown)
+    out.print()
+
+
+def note(text: str) -> None:
+    out.print(f"[yellow]Note:[/yellow] {text}", soft_wrap=False)

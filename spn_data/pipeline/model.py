@@ -1,0 +1,135 @@
+"""Stage 2-model: chosen frames to one COLMAP model in its own gauge."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.area import FRAMES, MODEL, Area, StageRecord, read_json
+from spn_data.camera import Camera
+from spn_data.correspondences import FramesToMap
+from spn_data.diagnosis import FrameRegistration, missing_passages
+from spn_data.errors import InputError
+from spn_data.frames import Frames, read_frames
+from spn_data.geodesy import GeoOrigin
+from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
+from spn_data.timing import Progress, Stopwatch
+
+DATABASE = "database.db"
+REGISTRATION = "registration.csv"
+
+
+def build_model(
+    area: Area, options: ReconstructOptions, progress: Progress, *, overwrite: bool = False
+) -> StageRecord:
+    """Reconstruct the area's frames into one model."""
+    made_of = {k: v for k, v in asdict(options).items() if k != "threads"}
+    work = area.begin(MODEL, made_of, {}, overwrite=overwrite)
+    if isinstance(work, StageRecord):
+        return work
+    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    chosen = frames.select(frames.chosen)
+    stopwatch = Stopwatch()
+    result = reconstruct(frames_to_map(area, chosen), work.path, options, progress, stopwatch)
+    passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
+    write_registration(work.path / REGISTRATION, result.registrations)
+    _keep_only_results(work.path, result)
+    return work.finish(
+        counts=_counts(result),
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+        notes=(*result.attempts, *passages),
+    )
+
+
+def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
+    """What reconstruction needs of the chosen frames, from stage 1."""
+    folder = area.folder(FRAMES)
+    start = read_json(folder / "cameras.json")["cameras"]
+    masks = {p.stem: p for p in sorted((folder / "masks").glob("*.png"))}
+    return FramesToMap(
+        folder=folder,
+        names=tuple(chosen.names.tolist()),
+        sequences=chosen.sequences,
+        cameras=chosen.cameras,
+        positions_m=rough_positions(chosen),
+        start_cameras={
+            key: _start_camera(key, start) for key in np.unique(chosen.cameras).tolist()
+        },
+        masks=masks,
+    )
+
+
+def _start_camera(key: str, start: Mapping[str, dict[str, object]]) -> tuple[Camera, bool]:
+    if key not in start:
+        raise InputError(f"camera {key!r} of frames.csv is missing", path="cameras.json")
+    camera = start[key]
+    return (
+        Camera(
+            str(camera["model"]),
+            int(str(camera["width"])),
+            int(str(camera["height"])),
+            np.array(camera["params"], dtype=np.float64),
+        ),
+        bool(camera["focal_is_known"]),
+    )
+
+
+def rough_positions(frames: Frames) -> np.ndarray:
+    """(N, 3) ENU metres by telemetry as it is, to find neighbours; NaN where there is no fix."""
+    known = frames.has_fix
+    positions = np.full((len(frames), 3), np.nan)
+    if known.any():
+        lat_lon = frames.lat_lon_deg[known]
+        height = np.nan_to_num(frames.rel_alt_m[known])
+        middle = np.median(lat_lon, axis=0)
+        origin = GeoOrigin(float(middle[0]), float(middle[1]), 0.0)
+        positions[known] = origin.enu_from_wgs84(np.column_stack([lat_lon, height]))
+    return positions
+
+
+def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([f.name for f in fields(FrameRegistration)])
+        for row in rows:
+            error = "" if math.isnan(row.error_px) else f"{row.error_px:.4f}"
+            status = "registered" if row.registered else "missing"
+            cells = [row.name, status, row.reason, row.keypoints, row.verified_pairs]
+            writer.writerow([*cells, row.observations, error])
+
+
+def _keep_only_results(work: Path, result: ReconstructResult) -> None:
+    """What an interrupted run would have gone on from has done its duty."""
+    if result.database != work / DATABASE:
+        (work / DATABASE).unlink()
+        result.database.rename(work / DATABASE)
+    for path in result.model.iterdir():
+        path.rename(work / path.name)
+    result.model.rmdir()
+    for pattern in ("mapping-*", "database-*"):
+        for path in work.glob(pattern):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _counts(result: ReconstructResult) -> dict[str, object]:
+    registered = [r for r in result.registrations if r.registered]
+    observations = sum(r.observations for r in registered)
+    return {
+        "frames": len(result.registrations),
+        "registered": len(registered),
+        "submodels": list(result.submodels),
+        "pairs_tried": result.pairs_tried,
+        "pairs_verified": result.pairs_verified,
+        "points": result.points,
+        "observations": observations,
+        "mean_error_px": round(
+            sum(r.error_px * r.observations for r in registered) / observations, 4
+        ),
+    }

@@ -1,0 +1,80 @@
+"""Our own file of a telemetry track: one CSV row a record, and a JSON object of what holds for all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.errors import FormatError
+from spn_data.geodesy import HeightReference
+from spn_data.telemetry.track import Telemetry
+
+_COLUMNS = (
+    "time_s,lat_deg,lon_deg,rel_alt_m,abs_alt_m,sigma_e_m,sigma_n_m,sigma_u_m,"
+    "heading_deg,pitch_deg,roll_deg,utc_s"
+)
+_MAX_BYTES = 2**30
+
+
+def write_track(path: Path, telemetry: Telemetry) -> None:
+    """First line: what holds for all records, as JSON behind `# `; then a header and the records."""
+    about = {
+        "version": 1,
+        "kind": telemetry.kind,
+        "source": telemetry.source,
+        "abs_reference": telemetry.abs_reference.value,
+        "utc_is_local": telemetry.utc_is_local,
+        "notes": list(telemetry.notes),
+    }
+    rows = np.column_stack(
+        [
+            telemetry.time_s,
+            telemetry.lat_lon_deg,
+            telemetry.rel_alt_m,
+            telemetry.abs_alt_m,
+            telemetry.sigma_m,
+            telemetry.gimbal_deg,
+            telemetry.utc_s,
+        ]
+    )
+    lines = [f"# {json.dumps(about)}", _COLUMNS]
+    lines += [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows]
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    temporary.replace(path)
+
+
+def read_track(path: Path) -> Telemetry:
+    """Raises FormatError where the file is not what `write_track` writes."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise FormatError(f"{path}: larger than any track of telemetry")
+        first, header, *lines = path.read_text(encoding="utf-8").splitlines()
+        about = json.loads(first.removeprefix("# "))
+        if about["version"] != 1 or header != _COLUMNS:
+            raise FormatError(f"{path}: not a track of telemetry of this version")
+        rows = np.array(
+            [[float(cell) if cell else np.nan for cell in line.split(",")] for line in lines]
+        ).reshape(len(lines), len(_COLUMNS.split(",")))
+        track = Telemetry.from_columns(
+            rows[:, 0],
+            lat_lon_deg=rows[:, 1:3],
+            rel_alt_m=rows[:, 3],
+            abs_alt_m=rows[:, 4],
+            sigma_m=rows[:, 5:8],
+            gimbal_deg=rows[:, 8:11],
+            utc_s=rows[:, 11],
+        )
+        return replace(
+            track,
+            kind=about["kind"],
+            source=about["source"],
+            abs_reference=HeightReference(about["abs_reference"]),
+            utc_is_local=about["utc_is_local"],
+            notes=tuple(about["notes"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: not a track of telemetry ({error})") from error
