@@ -1,0 +1,174 @@
+"""The area's stages appear whole or not at all, and nothing of the user's is lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from spn_data.area import (
+    FRAMES,
+    GEO,
+    MODEL,
+    VERSION,
+    Area,
+    Facts,
+    StageRecord,
+    StageWork,
+    content_fingerprint,
+)
+from spn_data.errors import FormatError, StageError
+
+
+def make(
+    area: Area, stage: str, content: str, *, overwrite: bool = False, **options: int
+) -> StageRecord:
+    work = area.begin(stage, options, {}, overwrite=overwrite)
+    assert isinstance(work, StageWork)
+    (work.path / "content").write_text(content)
+    return work.finish(counts={"content": content}, seconds={"all": 1.0}, cpu_seconds={})
+
+
+def content(area: Area, stage: str) -> str:
+    return (area.folder(stage) / "content").read_text()
+
+
+def test_a_stage_appears_only_when_it_is_finished(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    work = area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
+    assert isinstance(work, StageWork)
+    assert not area.has(FRAMES)
+    work.finish(counts={}, seconds={}, cpu_seconds={})
+    assert area.has(FRAMES)
+    assert not area.partial(FRAMES).exists()
+
+
+def test_interrupted_work_made_of_the_same_goes_on(tmp_path: Path) -> None:
+    work = Area(tmp_path).begin(FRAMES, {"n": 1}, {"a": "1"}, overwrite=False)
+    assert isinstance(work, StageWork)
+    assert not work.resumed
+    (work.path / "half").write_text("done")
+    again = Area(tmp_path).begin(FRAMES, {"n": 1}, {"a": "1"}, overwrite=False)
+    assert isinstance(again, StageWork)
+    assert again.resumed
+    assert (again.path / "half").read_text() == "done"
+
+
+def test_interrupted_work_of_other_options_is_not_thrown_away(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
+    with pytest.raises(StageError, match=r"unfinished work and was made with n = 1, now 2"):
+        area.begin(FRAMES, {"n": 2}, {}, overwrite=False)
+    work = area.begin(FRAMES, {"n": 2}, {}, overwrite=True)
+    assert isinstance(work, StageWork)
+    assert not work.resumed
+
+
+def test_an_unchanged_stage_is_not_made_again(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    made = make(area, FRAMES, "first", n=1)
+    assert area.begin(FRAMES, {"n": 1}, {}, overwrite=False) == made
+
+
+def test_a_finished_stage_is_overwritten_only_on_demand(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    make(area, FRAMES, "first", n=1)
+    with pytest.raises(StageError, match="n = 1, now 2; --overwrite"):
+        area.begin(FRAMES, {"n": 2}, {}, overwrite=False)
+    assert content(area, FRAMES) == "first"
+    make(area, FRAMES, "second", n=2, overwrite=True)
+    assert content(area, FRAMES) == "second"
+
+
+def test_changed_input_is_named(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    work = area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "2"}, overwrite=False)
+    assert isinstance(work, StageWork)
+    work.finish(counts={}, seconds={}, cpu_seconds={})
+    with pytest.raises(StageError, match=r"saw another b\.mp4"):
+        area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "3"}, overwrite=False)
+    with pytest.raises(StageError, match=r"does not hold c\.mp4"):
+        area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "2", "c.mp4": "3"}, overwrite=False)
+
+
+def test_a_stage_made_from_an_earlier_one_is_stale(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    make(area, FRAMES, "frames")
+    make(area, MODEL, "model")
+    assert area.stale_because(MODEL) is None
+    make(area, FRAMES, "other frames", overwrite=True, n=2)
+    assert area.stale_because(MODEL) == "1-frames was made anew since"
+    with pytest.raises(StageError, match="2-model is stale: 1-frames was made anew"):
+        area.begin(GEO, {}, {}, overwrite=True)
+
+
+def test_a_kill_between_the_two_renames_loses_neither_version(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    make(area, FRAMES, "first")
+    area.folder(FRAMES).rename(tmp_path / f".old-{FRAMES}")
+    assert content(Area(tmp_path), FRAMES) == "first"
+
+
+@pytest.mark.parametrize("killed_after", [0, 1, 2, 3])
+def test_the_next_version_replaces_all_stages_or_none(tmp_path: Path, killed_after: int) -> None:
+    """A kill at any rename of the exchange leaves an area that the next start completes."""
+    area = Area(tmp_path)
+    for stage in (FRAMES, MODEL, GEO):
+        make(area, stage, "old")
+    following = area.next_area()
+    for stage in (FRAMES, MODEL, GEO):
+        make(following, stage, "new")
+    assert content(Area(tmp_path), FRAMES) == "old"
+    (tmp_path / ".next" / "ready").touch()
+    for stage in (FRAMES, MODEL, GEO)[:killed_after]:
+        area.folder(stage).rename(tmp_path / f".old-{stage}")
+        following.folder(stage).rename(area.folder(stage))
+    reopened = Area(tmp_path)
+    assert [content(reopened, stage) for stage in (FRAMES, MODEL, GEO)] == ["new"] * 3
+    assert sorted(p.name for p in tmp_path.iterdir()) == [FRAMES, MODEL, GEO]
+
+
+def test_an_area_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "area.toml").write_text(f"version = {VERSION + 1}\nsources = []\n")
+    with pytest.raises(FormatError, match=r"area\.toml: made by a newer version"):
+        Area(tmp_path)
+
+
+def test_a_stage_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    area = Area(tmp_path)
+    make(area, FRAMES, "frames")
+    path = area.folder(FRAMES) / "stage.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": VERSION + 1}))
+    with pytest.raises(FormatError, match=r"stage\.json: made by a newer version"):
+        Area(tmp_path).record(FRAMES)
+
+
+def test_facts_come_back_as_they_were_written(tmp_path: Path) -> None:
+    Area(tmp_path).write_facts(Facts(sources=('a "quoted" folder', "b\\c")))
+    assert Area(tmp_path).facts.sources == ('a "quoted" folder', "b\\c")
+
+
+def test_two_processes_do_not_change_one_area(tmp_path: Path) -> None:
+    with (
+        Area(tmp_path).locked(),
+        pytest.raises(StageError, match="in use by another"),
+        Area(tmp_path).locked(),
+    ):
+        pass
+
+
+def test_an_area_where_a_file_stands_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StageError, match="cannot be made"), Area(tmp_path / "file").locked():
+        pass
+
+
+def test_a_fingerprint_sees_a_change_in_the_middle_of_a_long_file(tmp_path: Path) -> None:
+    path = tmp_path / "video"
+    data = bytearray(5_000_000)
+    path.write_bytes(data)
+    before = content_fingerprint(path)
+    data[2_500_000] = 1
+    path.write_bytes(data)
+    assert content_fingerprint(path) != before

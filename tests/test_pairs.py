@@ -1,0 +1,66 @@
+"""Which pairs are chosen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spn_data.pairs import (
+    PairOptions,
+    appearance_pairs,
+    appearance_vocabulary,
+    choose_pairs,
+    describe_appearance,
+    sequence_pairs,
+    spatial_pairs,
+)
+
+
+def test_frames_pair_with_the_next_ones_of_their_own_sequence_only() -> None:
+    sequences = np.array(["a", "a", "a", "b", "b"])
+    assert sequence_pairs(sequences, PairOptions(overlap=1, far_steps=0)) == {
+        (0, 1),
+        (1, 2),
+        (3, 4),
+    }
+
+
+def test_further_steps_double() -> None:
+    pairs = sequence_pairs(np.array(["a"] * 10), PairOptions(overlap=1, far_steps=3))
+    assert {j for i, j in pairs if i == 0} == {1, 2, 4, 8}
+
+
+def test_neighbours_in_space_are_found_across_sequences_and_unknown_positions_pair_with_none() -> (
+    None
+):
+    positions = np.array([[0.0, 0, 0], [100, 0, 0], [1, 0, 0], [np.nan, 0, 0]])
+    pairs = spatial_pairs(positions, PairOptions(spatial_neighbors=3, spatial_max_m=60.0))
+    assert pairs == {(0, 2)}
+
+
+def test_pairs_are_sorted_unique_and_ordered() -> None:
+    rng = np.random.default_rng(0)
+    pairs = choose_pairs(
+        np.array(["a"] * 12 + ["b"] * 12), rng.normal(size=(24, 3)), None, PairOptions()
+    )
+    assert pairs == sorted(set(pairs))
+    assert all(i < j for i, j in pairs)
+
+
+def test_a_place_seen_again_is_found_by_appearance() -> None:
+    """Frame k + 20 holds noisy copies of the descriptors of frame k, and time does not pair the two."""
+    rng = np.random.default_rng(1)
+    first = [rng.gamma(0.5, 40, size=(300, 128)).clip(0, 255) for _ in range(20)]
+    again = [np.clip(d[:200] + rng.normal(0, 4, size=(200, 128)), 0, 255) for d in first]
+    descriptors = [d.astype(np.uint8) for d in [*first, *again]]
+    options = PairOptions(overlap=3, appearance_neighbors=1, words=16)
+    vocabulary = appearance_vocabulary(descriptors, options)
+    appearance = np.stack([describe_appearance(d, vocabulary) for d in descriptors])
+    pairs = appearance_pairs(np.array(["a"] * 40), appearance, options)
+    assert {(k, k + 20) for k in range(20)} <= pairs
+    assert len(pairs) < 30
+
+
+def test_an_image_without_features_does_not_stop_the_others() -> None:
+    none = np.zeros((0, 128), np.uint8)
+    vocabulary = appearance_vocabulary([none, none], PairOptions())
+    assert describe_appearance(none, vocabulary).shape == (0,)

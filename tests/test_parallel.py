@@ -1,0 +1,104 @@
+"""Batches in worker processes: nothing lost, nothing done twice, and a crash named."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from spn_data.parallel import WorkerDiedError, run_batches
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def die_once(marker: str, x: int) -> int:
+    """Kills its process the first time that any batch comes here with x = 3."""
+    if x == 3 and not Path(marker).exists():
+        Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def die(x: int) -> int:
+    if x == 2:
+        os.abort()
+    return x
+
+
+def fail(x: int) -> int:
+    raise ValueError(f"no {x}")
+
+
+def blas_threads() -> str:
+    return os.environ["OPENBLAS_NUM_THREADS"]
+
+
+def test_every_result_arrives_once() -> None:
+    results: list[int] = []
+    run_batches(square, ((str(x), (x,)) for x in range(20)), workers=2, on_result=results.append)
+    assert sorted(results) == [x * x for x in range(20)]
+
+
+def test_a_killed_worker_costs_only_the_batches_in_flight(tmp_path: Path) -> None:
+    results: list[int] = []
+    batches = ((str(x), (str(tmp_path / "died"), x)) for x in range(8))
+    run_batches(die_once, batches, workers=2, on_result=results.append)
+    assert (tmp_path / "died").exists()
+    assert sorted(results) == list(range(8))
+
+
+def test_a_batch_that_crashes_twice_is_named_and_the_others_are_kept() -> None:
+    results: list[int] = []
+    with pytest.raises(WorkerDiedError, match="photo 2: a native library crashed on it twice"):
+        run_batches(
+            die, ((f"photo {x}", (x,)) for x in range(3)), workers=1, on_result=results.append
+        )
+    assert set(results) <= {0, 1}
+
+
+def test_an_exception_of_the_function_comes_back() -> None:
+    with pytest.raises(ValueError, match="no 1"):
+        run_batches(fail, [("1", (1,))], workers=1, on_result=print)
+
+
+def test_workers_compute_on_one_thread() -> None:
+    results: list[str] = []
+    run_batches(blas_threads, [("a", ())], workers=1, on_result=results.append)
+    assert results == ["1"]
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, sys, time\n"
+        "from spn_data.parallel import run_batches\n"
+        "def wait(path):\n"
+        "    open(path, 'w').write(str(os.getpid())); time.sleep(60)\n"
+        "if __name__ == '__main__':\n"
+        "    run_batches(wait, [('a', (sys.argv[1],))], workers=1, on_result=print)\n"
+    )
+    pid_file = tmp_path / "pid"
+    parent = subprocess.Popen([sys.executable, str(script), str(pid_file)])
+    deadline = time.monotonic() + 30
+    while not (pid_file.exists() and pid_file.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    parent.kill()
+    parent.wait()
+    worker = int(pid_file.read_text())
+    while time.monotonic() < deadline:
+        try:
+            # A zombie has ended too; its parent is gone, so that nobody may have collected it yet.
+            state = Path(f"/proc/{worker}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except FileNotFoundError:
+            return
+        if state == "Z":
+            return
+        time.sleep(0.05)
+    pytest.fail("the worker outlived its parent")
