@@ -7,7 +7,7 @@ lists them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,9 +37,17 @@ def parse_dji_srt(text: str, *, source: str) -> Telemetry:
     """
     if not text.strip():
         raise InputError("the file is empty: no telemetry in it", path=source)
+    return telemetry_of_blocks(_blocks(text), source=source)
+
+
+def telemetry_of_blocks(
+    blocks: Iterable[tuple[int, float, str]], *, source: str, has_lines: bool = True
+) -> Telemetry:
+    """As `parse_dji_srt`, from (line, time_s, text) of each record; its count without `has_lines`."""
+    place = "line" if has_lines else "record"
     records: list[SrtRecord] = []
     skipped: Skipped = []
-    for line, time_s, body in _blocks(text):
+    for line, time_s, body in blocks:
         try:
             record = parse_record(line, time_s, body)
         except ValueError as error:
@@ -50,14 +58,14 @@ def parse_dji_srt(text: str, *, source: str) -> Telemetry:
         else:
             records.append(record)
     if not records:
+        why = f"the first of its {len(skipped)}: {skipped[0][1]}" if skipped else "it has none"
         raise InputError(
-            f"no drone telemetry in its {len(skipped)} records (the first: {skipped[0][1]}); "
-            "give the .SRT that the drone wrote beside the video",
+            f"no subtitle record holds drone telemetry ({why}); give the .SRT that the drone wrote",
             path=source,
-            line=skipped[0][0],
+            line=skipped[0][0] if skipped and has_lines else None,
         )
     records, notes = _with_times(records, source)
-    records, time_notes = _in_order(records, skipped)
+    records, time_notes = _in_order(records, skipped, place)
     lat_lon, position_notes = _positions(records, skipped)
     time = np.array([r.time_s for r in records])
     utc = np.array([r.utc_s for r in records])
@@ -72,7 +80,7 @@ def parse_dji_srt(text: str, *, source: str) -> Telemetry:
         )
     if skipped:
         line, why = min(skipped)
-        notes.append(f"records left out: {len(skipped)}, the first at line {line}: {why}")
+        notes.append(f"records left out: {len(skipped)}, the first at {place} {line}: {why}")
     return Telemetry.from_columns(
         time,
         lat_lon_deg=lat_lon,
@@ -133,7 +141,9 @@ def _with_times(records: list[SrtRecord], source: str) -> tuple[list[SrtRecord],
     return timed, [note]
 
 
-def _in_order(records: list[SrtRecord], skipped: Skipped) -> tuple[list[SrtRecord], list[str]]:
+def _in_order(
+    records: list[SrtRecord], skipped: Skipped, place: str
+) -> tuple[list[SrtRecord], list[str]]:
     """The records whose times increase, up to where the times start over; adds to `skipped`."""
     skipped += [(r.line, "it has no subtitle times") for r in records if np.isnan(r.time_s)]
     records = [r for r in records if not np.isnan(r.time_s)]
@@ -141,7 +151,7 @@ def _in_order(records: list[SrtRecord], skipped: Skipped) -> tuple[list[SrtRecor
     notes = []
     if restart is not None:
         notes.append(
-            f"the times start over at line {records[restart].line}: the {len(records) - restart} "
+            f"the times start over at {place} {records[restart].line}: the {len(records) - restart} "
             "records from there on belong to another recording and are left out"
         )
         records = records[:restart]

@@ -167,6 +167,18 @@ def _interpolate(
     return result.reshape(len(wanted_s), *values.shape[1:])
 
 
+def increasing(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """The index that puts records of times (N,) in order, one record a time, and what was done."""
+    notes = []
+    if np.any(np.diff(time_s) < 0):
+        notes.append("its records were not in the order of time and were sorted")
+    # Of records with one time the first in the file counts.
+    index = np.unique(time_s, return_index=True)[1]
+    if len(index) < len(time_s):
+        notes.append(f"records with the time of another, left out: {len(time_s) - len(index)}")
+    return index, notes
+
+
 def coordinate_step_m(lat_lon_deg: np.ndarray) -> float:
     """The step in metres of latitude to which coordinates (N, 2) in degrees are rounded; or NaN.
 

@@ -1,0 +1,54 @@
+"""Telemetry of a file of any kind that is supported, told by its name and content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spn_data.errors import InputError
+from spn_data.telemetry.csv_log import read_csv_log
+from spn_data.telemetry.dji_srt import read_dji_srt
+from spn_data.telemetry.gpx import read_gpx
+from spn_data.telemetry.subtitles import read_subtitles
+from spn_data.telemetry.track import Telemetry
+
+TELEMETRY_SUFFIXES = (".srt", ".gpx", ".csv", ".tsv", ".txt")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".m4v", ".ts", ".avi")
+
+
+def read_telemetry(path: Path | str) -> Telemetry:
+    """Telemetry of a DJI .srt, a .gpx, a .csv (.tsv, .txt) or a video's own subtitle track.
+
+    Raises InputError where the file is of no such kind, or holds no telemetry.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        telemetry = read_subtitles(path)
+        if telemetry is None:
+            raise InputError("the video has no subtitle track to read telemetry from", path=path)
+        return telemetry
+    if suffix not in TELEMETRY_SUFFIXES:
+        raise InputError(
+            f"{suffix or 'a file without a suffix'} is no telemetry format; supported are "
+            "DJI subtitles (.srt), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
+            f"videos with a subtitle track ({', '.join(VIDEO_SUFFIXES)})",
+            path=path,
+        )
+    if suffix == ".gpx":
+        return read_gpx(path)
+    # Subtitles and GPX are often saved as .txt, and logs from the web under a wrong name.
+    start = _start(path)
+    if start.startswith("<") and "<gpx" in start:
+        return read_gpx(path)
+    if suffix == ".srt" or "-->" in start:
+        return read_dji_srt(path)
+    return read_csv_log(path)
+
+
+def _start(path: Path) -> str:
+    """The first 2,000 characters, for telling formats apart only."""
+    try:
+        with path.open("rb") as file:
+            return file.read(2000).decode("utf-8-sig", errors="replace").lstrip()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error

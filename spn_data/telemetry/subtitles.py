@@ -1,0 +1,73 @@
+"""Telemetry that a drone wrote as a subtitle track inside the video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import av
+
+from spn_data.errors import InputError
+from spn_data.telemetry.dji_srt import telemetry_of_blocks
+from spn_data.telemetry.textfile import MAX_TEXT_BYTES
+from spn_data.telemetry.track import Telemetry
+
+_TEXT_CODECS = ("mov_text", "srt", "subrip", "text", "ass", "ssa")
+
+
+def read_subtitles(path: Path | str) -> Telemetry | None:
+    """Telemetry of the first subtitle track that holds some; None where the video has no such track.
+
+    time_s is 0 at the first frame. Raises InputError where there are text subtitles, but of other
+    content, and where the file is no video.
+    """
+    try:
+        with av.open(str(path)) as container:
+            streams = [
+                s
+                for s in container.streams.subtitles
+                if s.codec_context is not None and s.codec_context.name in _TEXT_CODECS
+            ]
+            video = container.streams.video[0] if container.streams.video else None
+            start_s = 0.0
+            if video is not None and video.start_time is not None and video.time_base is not None:
+                start_s = float(video.start_time * video.time_base)
+            tracks = _tracks(container, streams, start_s, path)
+    except (av.FFmpegError, OSError) as error:
+        raise InputError(f"its subtitles cannot be read: {error.strerror}", path=path) from error
+    failure: InputError | None = None
+    for records in tracks:
+        try:
+            return telemetry_of_blocks(records, source=str(path), has_lines=False)
+        except InputError as error:
+            failure = failure or error
+    if failure is not None:
+        raise failure
+    return None
+
+
+def _tracks(
+    container: Any, streams: list[Any], start_s: float, path: Path | str
+) -> list[list[tuple[int, float, str]]]:
+    """(count from 1, time_s, text) of the subtitles of each stream."""
+    tracks: dict[int, list[tuple[int, float, str]]] = {stream.index: [] for stream in streams}
+    taken = 0
+    for packet in container.demux(streams) if streams else ():
+        data = bytes(packet)
+        taken += len(data)
+        if taken > MAX_TEXT_BYTES:
+            raise InputError(f"its subtitles exceed {MAX_TEXT_BYTES / 1e6:.0f} MB", path=path)
+        text = _text(data, packet.stream.codec_context.name)
+        if packet.pts is not None and text.strip():
+            records = tracks[packet.stream.index]
+            records.append((len(records) + 1, float(packet.pts * packet.time_base) - start_s, text))
+    return list(tracks.values())
+
+
+def _text(data: bytes, codec: str) -> str:
+    if codec == "mov_text":  # two bytes of length, the text, then boxes of style
+        data = data[2 : 2 + int.from_bytes(data[:2], "big")]
+    text = data.decode("utf-8", errors="replace")
+    if codec in ("ass", "ssa"):  # "ReadOrder,Layer,Style,Name,MarginL,MarginR,MarginV,Effect,Text"
+        text = text.split(",", 8)[-1].replace("\\N", "\n")
+    return text
