@@ -1,0 +1,80 @@
+"""Errors on fixes that the fit has not seen: whole blocks of time, or whole flights, left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.georegister.fit import Estimate
+from spn_data.georegister.noise import solve
+from spn_data.georegister.problem import Problem
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors in metres of fixes left out of the fit; NaN where nothing could be left out.
+
+    folds : how often the fit was repeated; frames : how many fixes were judged, outliers aside.
+    """
+
+    folds: int
+    frames: int
+    horizontal_rmse_m: float
+    horizontal_median_m: float
+    vertical_rmse_m: float
+    vertical_median_m: float
+
+
+def time_blocks(flight: np.ndarray, time_s: np.ndarray, length_s: float) -> np.ndarray:
+    """(N,) index of the block of `length_s` seconds of its flight that each frame lies in."""
+    start = np.array([time_s[flight == f].min() for f in range(flight.max() + 1)])[flight]
+    block = np.floor((time_s - start) / length_s).astype(np.int64)
+    return np.unique(np.column_stack([flight, block]), axis=0, return_inverse=True)[1].ravel()
+
+
+def cross_validate(
+    problem: Problem, result: Estimate, fold: np.ndarray, inlier: np.ndarray
+) -> HeldOut:
+    """Each fold (N,) of frames is left out in turn: its fixes and gimbal angles, not its place in the model.
+
+    Noise levels and robust weights are those of the fit of all frames. A flight left out as a whole has lost
+    its vertical offset with it: its heights are judged about their median.
+    """
+    horizontal, vertical, folds = [], [], 0
+    fixes = problem.fixes
+    known = fixes.has_fix & inlier
+    table = np.ones((6, len(problem.model)))
+    table[problem.kind, problem.frame] = result.weights
+    for k in np.unique(fold[known]):
+        left_out = fold == k
+        if not (known & ~left_out).any():
+            continue
+        part = problem.on_frames(~left_out)
+        if np.count_nonzero(part.kind == 0) < problem.options.min_fixes:
+            continue
+        state = result.state
+        for _ in range(3):
+            linear = part.linearise(state, result.offset_sigma_m, result.bias_weight)
+            weights = table[part.kind, part.frame]
+            state = state.moved(solve(part.chains, result.levels, weights, linear).step)
+        error = problem.residuals(state)[:3, left_out & known]
+        horizontal.append(np.hypot(error[0], error[1]))
+        flight = fixes.flight[left_out & known]
+        for f in np.unique(flight):
+            up = error[2, flight == f]
+            up = up[np.isfinite(up)]
+            gone = fixes.free_heights and not (known & ~left_out & (fixes.flight == f)).any()
+            if len(up):
+                vertical.append(np.abs(up - np.median(up) if gone else up))
+        folds += 1
+    h, v = (np.concatenate(e) if e else np.full(0, np.nan) for e in (horizontal, vertical))
+    return HeldOut(folds, len(h), _rms(h), _median(h), _rms(v), _median(v))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

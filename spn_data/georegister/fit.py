@@ -1,0 +1,132 @@
+"""Second step of georegistration: weighted robust least squares of all observations together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.georegister.noise import Levels, Solution, improve_levels, solve, student_weights
+from spn_data.georegister.problem import SHARED, Problem, State
+
+_ROUNDS = 40
+_SAME_PLACE_SIGMAS = 3.0
+_FREE_OFFSET_M = 1e3
+_FIXED_OFFSET_M = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the rounds ended.
+
+    weights, distance : (M,) robust weights and distances in white sigma; covariance : (P, P) of all
+    parameters; offset_sigma_m : (F,) what was assumed of each flight's vertical offset.
+    """
+
+    state: State
+    levels: Levels
+    weights: np.ndarray
+    distance: np.ndarray
+    covariance: np.ndarray
+    offset_sigma_m: np.ndarray
+    bias_weight: np.ndarray
+
+
+def covariance_of(information: np.ndarray) -> np.ndarray:
+    """Inverse (P, P) of an information matrix, very large where nothing is known."""
+    diagonal = np.diag(information)
+    size = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(information * size[:, None] * size)
+    values = np.maximum(values, 1e-12)
+    return (vectors / values) @ vectors.T * size[:, None] * size
+
+
+def _bias_weights(state: State, bias_deg: float, freedom: float = 4.0) -> np.ndarray:
+    """(F,) weights of a Student t distribution on the flights' gimbal biases."""
+    square = (state.gimbal_deg**2).sum(axis=1) / bias_deg**2
+    return np.minimum((freedom + 3) / (freedom + square), 1.0)
+
+
+def iterate(
+    problem: Problem,
+    state: State,
+    inlier: np.ndarray,
+    offset_sigma_m: np.ndarray,
+    levels: Levels,
+    *,
+    rounds: int = _ROUNDS,
+) -> Estimate:
+    """Gauss-Newton steps, robust weights and noise levels in turn, from the inliers (N,) of the first step.
+
+    The number of rounds is fixed, and each is a smooth function of its input: what differs by rounding at the
+    start differs by rounding at the end.
+    """
+    position = problem.kind < 3
+    weights = np.where(position & ~inlier[problem.frame], 1e-4, 1.0)
+    bias_weight = np.ones(len(state.offsets_m))
+    distance = np.zeros(len(weights))
+    solution: Solution | None = None
+    for k in range(rounds):
+        linear = problem.linearise(state, offset_sigma_m, bias_weight)
+        if k >= 2:
+            levels = improve_levels(problem.chains, levels, weights, linear)
+        solution = solve(problem.chains, levels, weights, linear)
+        state = state.moved(solution.step)
+        weights, distance = student_weights(problem.chains, levels, solution.white)
+        bias_weight = _bias_weights(state, problem.options.gimbal_bias_deg)
+    assert solution is not None
+    return Estimate(
+        state,
+        levels,
+        weights,
+        distance,
+        covariance_of(solution.information),
+        offset_sigma_m,
+        bias_weight,
+    )
+
+
+def estimate(problem: Problem, state: State, inlier: np.ndarray) -> Estimate:
+    """The fit of all frames, with the flights' vertical offsets free or tied as the data say.
+
+    A flight whose take-off differs in height from the first flight's by less than its errors explain is taken
+    as having started at the same height, so that all flights together determine the vertical.
+    """
+    f = len(state.offsets_m)
+    levels = problem.levels()
+    first = _first_flight_with_heights(problem)
+    fixed = np.full(f, _FIXED_OFFSET_M)
+    if not problem.fixes.free_heights or f == 1 or not problem.fixes.has_heights:
+        return iterate(problem, _without_offsets(state), inlier, fixed, levels)
+    tied = np.full(f, problem.options.same_takeoff_sigma_m)
+    tied[first] = _FIXED_OFFSET_M
+    if problem.options.same_takeoff is True:
+        return iterate(problem, _without_offsets(state), inlier, tied, levels)
+    free = np.full(f, _FREE_OFFSET_M)
+    free[first] = _FIXED_OFFSET_M
+    shifted = _from_first(state, first)
+    result = iterate(problem, shifted, inlier, free, levels, rounds=_ROUNDS // 2)
+    if problem.options.same_takeoff is None:
+        offsets = result.state.offsets_m
+        sigma = np.sqrt(np.diag(result.covariance)[SHARED : SHARED + f])
+        kind = problem.fixes.relative == problem.fixes.relative[first]
+        same = kind & (np.abs(offsets) < _SAME_PLACE_SIGMAS * sigma)
+        free = np.where(same, tied, free)
+    return iterate(problem, result.state, inlier, free, levels)
+
+
+def _first_flight_with_heights(problem: Problem) -> int:
+    known = np.isfinite(problem.fixes.enu_m[:, 2])
+    return int(problem.fixes.flight[known].min()) if known.any() else 0
+
+
+def _without_offsets(state: State) -> State:
+    """The same state with the offsets at zero and their mean in the centre's height."""
+    return _from_first(state, 0, drop=True)
+
+
+def _from_first(state: State, first: int, *, drop: bool = False) -> State:
+    """Offsets counted from one flight's, the centre's height moved along."""
+    offsets = np.zeros_like(state.offsets_m) if drop else state.offsets_m - state.offsets_m[first]
+    center = state.center - np.array([0.0, 0.0, state.offsets_m[first]])
+    return State(state.rotation, state.scale, center, offsets, state.gimbal_deg, state.level_deg)

@@ -1,0 +1,210 @@
+"""Errors that are correlated in time: Gauss-Markov chains, their likelihood and least squares under them.
+
+An observation's error is the sum of a slowly changing bias, a first-order Gauss-Markov (Ornstein-Uhlenbeck)
+process along its chain, and of white noise. The inverse covariance of such a process is tridiagonal, so that
+least squares under it costs time in proportion to the number of observations (Woodbury's identity).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+# Two observations of one chain are never treated as closer than this part of the correlation time.
+_MIN_STEP = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Which of M observations share a chain, in the order of chain and time.
+
+    group : (M,) index of the noise level; unit : (M,) sigma that the group's factors multiply, in the
+    observation's unit; twin : (M,) index of the set whose members are outliers together;
+    precision : (2, M) tridiagonal inverse covariance of the unit-variance processes (row 0 above the
+    diagonal, as scipy has it); log_det : of their covariance.
+    """
+
+    group: np.ndarray
+    unit: np.ndarray
+    twin: np.ndarray
+    twin_sizes: np.ndarray
+    precision: np.ndarray
+    log_det: float
+
+    @classmethod
+    def build(
+        cls,
+        chain: np.ndarray,
+        time_s: np.ndarray,
+        correlation_s: np.ndarray,
+        group: np.ndarray,
+        unit: np.ndarray,
+        twin: np.ndarray,
+    ) -> tuple[Chains, np.ndarray]:
+        """Chains of observations in any order, and the order (M,) that they have to be brought into."""
+        order = np.lexsort((time_s, chain))
+        chain, time_s, correlation_s = chain[order], time_s[order], correlation_s[order]
+        same = chain[1:] == chain[:-1]
+        steps = np.maximum(np.diff(time_s) / correlation_s[1:], _MIN_STEP)
+        rho = np.where(same, np.exp(-steps), 0.0)
+        innovation = -np.expm1(-2 * steps)
+        innovation = np.where(same, innovation, 1.0)
+        precision = np.zeros((2, len(order)))
+        precision[1] = 1.0
+        precision[1, :-1] += rho**2 / innovation
+        precision[1, 1:] += 1 / innovation - 1
+        precision[0, 1:] = -rho / innovation
+        _, twin = np.unique(twin[order], return_inverse=True)
+        sizes = np.bincount(twin) if len(twin) else np.zeros(0, dtype=np.int64)
+        log_det = float(np.log(innovation).sum())
+        return cls(group[order], unit[order], twin, sizes, precision, log_det), order
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Noise levels of G groups, as factors of the observations' own sigma.
+
+    log_bias, log_white : (G,) natural logarithms; *_center, *_spread : (G,) what they are believed to be
+    before the data, a spread of 0 being fixed.
+    """
+
+    log_bias: np.ndarray
+    log_white: np.ndarray
+    bias_center: np.ndarray
+    bias_spread: np.ndarray
+    white_center: np.ndarray
+    white_spread: np.ndarray
+
+    @classmethod
+    def from_table(cls, table: list[tuple[float, float, float, float]]) -> Levels:
+        """From (bias, its spread in log, white, its spread in log) of each group."""
+        bias, bias_spread, white, white_spread = np.array(table, dtype=np.float64).T
+        return cls(
+            np.log(bias), np.log(white), np.log(bias), bias_spread, np.log(white), white_spread
+        )
+
+    def log_prior(self) -> float:
+        total = 0.0
+        for value, center, spread in (
+            (self.log_bias, self.bias_center, self.bias_spread),
+            (self.log_white, self.white_center, self.white_spread),
+        ):
+            free = spread > 0
+            total -= 0.5 * float((((value - center)[free] / spread[free]) ** 2).sum())
+        return total
+
+    def at_least(self, bias: np.ndarray, white: np.ndarray) -> Levels:
+        """The same levels with lower limits (G,) of the factors."""
+        return replace(
+            self,
+            log_bias=np.maximum(self.log_bias, np.log(bias)),
+            log_white=np.maximum(self.log_white, np.log(white)),
+        )
+
+
+def inverse_times(
+    chains: Chains, levels: Levels, weights: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Inverse covariance of the observations times columns (M, K), and the covariance's log determinant.
+
+    weights : (M,) robust weights, that divide the variance of the white part.
+    """
+    white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
+    amplitude = np.exp(levels.log_bias)[chains.group] * chains.unit
+    banded = chains.precision.copy()
+    banded[1] += amplitude**2 / white_var
+    factor = cholesky_banded(banded, check_finite=False)
+    scaled = columns / white_var[:, None]
+    smooth = cho_solve_banded((factor, False), amplitude[:, None] * scaled, check_finite=False)
+    log_det = np.log(white_var).sum() + 2 * np.log(factor[1]).sum() + chains.log_det
+    return scaled - (amplitude / white_var)[:, None] * smooth, float(log_det)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Observations linearised: ``residual = jacobian @ step + noise``, and what is known of the parameters.
+
+    residual (M,), jacobian (M, P); prior_precision (P,) about the value 0 of parameters now at `value` (P,).
+    """
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    prior_precision: np.ndarray
+    value: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Of the linear problem: step (P,), information (P, P), residuals' white part (M,) after the step."""
+
+    step: np.ndarray
+    information: np.ndarray
+    white: np.ndarray
+    log_likelihood: float  # restricted: parameters integrated out
+
+
+def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> Solution:
+    """Generalised least squares, and the restricted likelihood of the noise levels (Harville 1977)."""
+    columns = np.column_stack([linear.jacobian, linear.residual])
+    inverse, log_det = inverse_times(chains, levels, weights, columns)
+    information = linear.jacobian.T @ inverse[:, :-1] + np.diag(linear.prior_precision)
+    information = (information + information.T) / 2
+    gradient = linear.jacobian.T @ inverse[:, -1] - linear.prior_precision * linear.value
+    # Parameters of very different units: the scaling keeps the factorisation well conditioned.
+    size = 1 / np.sqrt(np.diag(information))
+    scaled = information * size[:, None] * size
+    step = size * np.linalg.solve(scaled, size * gradient)
+    quadratic = linear.residual @ inverse[:, -1] + linear.value @ (
+        linear.prior_precision * linear.value
+    )
+    log_det_information = np.linalg.slogdet(scaled)[1] - 2 * np.log(size).sum()
+    likelihood = -0.5 * (log_det + log_det_information + quadratic - gradient @ step)
+    white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
+    white = white_var * (inverse[:, -1] - inverse[:, :-1] @ step)
+    return Solution(step, information, white, float(likelihood))
+
+
+def student_weights(
+    chains: Chains, levels: Levels, white: np.ndarray, freedom: float = 4.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (M,) of a Student t distribution on the white parts (M,), and their distances in sigma (M,).
+
+    Twins (east and north of one fix) have one distance, the root of their mean square.
+    """
+    standard = white / (np.exp(levels.log_white)[chains.group] * chains.unit)
+    square = np.bincount(chains.twin, standard**2, minlength=len(chains.twin_sizes))
+    weights = (freedom + chains.twin_sizes) / (freedom + square)
+    distance = np.sqrt(square / chains.twin_sizes)
+    return weights[chains.twin], distance[chains.twin]
+
+
+def improve_levels(
+    chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear, *, max_step: float = 0.7
+) -> Levels:
+    """One Newton step of each free level towards the most probable one (restricted likelihood and prior).
+
+    Every step is a smooth function of its input, so that rounding in the observations stays rounding.
+    """
+    h = 0.1
+
+    def objective(candidate: Levels) -> float:
+        return solve(chains, candidate, weights, linear).log_likelihood + candidate.log_prior()
+
+    present = np.bincount(chains.group, minlength=len(levels.log_bias)) > 0
+    for name, spread in (("log_white", levels.white_spread), ("log_bias", levels.bias_spread)):
+        for g in np.flatnonzero(present & (spread > 0)):
+            values = []
+            for delta in (-h, 0.0, h):
+                moved = getattr(levels, name).copy()
+                moved[g] += delta
+                values.append(objective(replace(levels, **{name: moved})))
+            slope = (values[2] - values[0]) / (2 * h)
+            curvature = (values[2] - 2 * values[1] + values[0]) / h**2
+            # Where the likelihood is not concave the prior's curvature sets the step.
+            curvature = max(-curvature, 1 / spread[g] ** 2)
+            moved = getattr(levels, name).copy()
+            moved[g] += np.clip(slope / curvature, -max_step, max_step)
+            levels = replace(levels, **{name: moved})
+    return levels

@@ -1,0 +1,241 @@
+"""Georegistration of a model: from poses and telemetry to the model's place in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from spn_data.errors import GeometryError
+from spn_data.georegister.crossval import HeldOut, cross_validate, time_blocks
+from spn_data.georegister.fit import Estimate, estimate
+from spn_data.georegister.gravity import Gravity, gravity_from_gimbal, level_up
+from spn_data.georegister.observe import Fixes, observe
+from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.problem import Kind, Problem
+from spn_data.georegister.result import FitSummary, GeoFit
+from spn_data.georegister.start import extent, find_start
+from spn_data.georegister.uncertainty import Uncertainty, effective_fixes, require_determined
+from spn_data.pose import Poses, Similarity
+from spn_data.telemetry.track import Telemetry
+
+# A frame whose fix lies this many sigma of white noise off its neighbours is called an outlier.
+_OUTLIER_SIGMAS = 5.0
+# A flight's gimbal with a constant error above this is worth a word.
+_GIMBAL_BIAS_SIGMAS = 4.0
+
+
+def georegister(
+    model: Poses,
+    telemetry: Telemetry,
+    sequence: Sequence[str],
+    time_s: np.ndarray,
+    options: GeoregisterOptions | None = None,
+) -> GeoFit:
+    """The place in the world of a model whose cameras' fixes, heights and gimbal angles are known.
+
+    model : N poses in the reconstruction's own gauge; telemetry : N rows, the records at the frames' times
+    (`align_telemetry`); sequence : flight of each frame; time_s : (N,) within the flight.
+    Two steps: the similarity that most fixes agree with, then robust least squares of fixes, heights and
+    gravity together under errors that are correlated in time.
+    Raises GeometryError where fixes and gimbal angles do not determine the answer, with the remedy.
+    """
+    options = options or GeoregisterOptions()
+    if len(model) != len(telemetry):
+        raise ValueError(f"{len(model)} poses and {len(telemetry)} rows of telemetry")
+    fixes = observe(telemetry, sequence, time_s, options)
+    _require_enough(fixes, options)
+    # The fit works on centred coordinates of unit size, whatever the gauge.
+    middle = model.centers[fixes.has_fix].mean(axis=0)
+    size = float(np.sqrt(((model.centers - middle) ** 2).sum(axis=1).mean()))
+    if not size > 0:
+        raise GeometryError("all cameras of the model are at one point")
+    centers = (model.centers - middle) / size
+    rotations = model.rotations
+    gravity = gravity_from_gimbal(
+        rotations, fixes.up_cam, fixes.flight, fixes.flights, options.gimbal_agreement_deg
+    )
+    fixes = replace(
+        fixes,
+        up_cam=np.where(gravity.usable[:, None], fixes.up_cam, np.nan),
+        notes=fixes.notes + gravity.notes,
+    )
+    use_level = fixes.has_fix & ~gravity.usable
+    up_model = gravity.direction
+    if up_model is None and not fixes.has_heights:
+        up_model = _up_of_level_cameras(rotations)
+    start = find_start(centers, fixes, up_model, options)
+    if start.sigma_factor > 1:
+        note = (
+            f"Fixes agree with the model at {start.sigma_factor:g} times their stated sigma only."
+        )
+        fixes = replace(fixes, notes=(*fixes.notes, note))
+    problem = Problem.build(centers, rotations, fixes, use_level, options)
+    result = estimate(problem, problem.start(start.world_from_model, start.inlier), start.inlier)
+    require_determined(problem, result, options)
+    return _fit_of(problem, result, gravity, middle, size)
+
+
+def _require_enough(fixes: Fixes, options: GeoregisterOptions) -> None:
+    count = int(fixes.has_fix.sum())
+    if count < options.min_fixes:
+        raise GeometryError(f"{count} frames have a fix, {options.min_fixes} are needed")
+    sigma = float(np.median(fixes.sigma_m[fixes.has_fix, 0]))
+    spread = extent(fixes)
+    if spread < sigma:
+        raise GeometryError(
+            f"the fixes lie within {spread:.2g} m (rms) of one place, their sigma is {sigma:.2g} m: "
+            "a hovering drone fixes neither scale nor heading; fly a leg of at least 20 m"
+        )
+
+
+def _up_of_level_cameras(rotations: np.ndarray) -> np.ndarray:
+    up, determined = level_up(rotations)
+    if determined < 0.05:
+        raise GeometryError(
+            "no heights, no gimbal angles, and all cameras look one way: nothing says where up is; "
+            "give heights or gimbal angles"
+        )
+    return up
+
+
+def _fit_of(
+    problem: Problem, result: Estimate, gravity: Gravity, middle: np.ndarray, size: float
+) -> GeoFit:
+    state, fixes, options = result.state, problem.fixes, problem.options
+    centred_from_model = Similarity(1 / size, np.eye(3), -middle / size)
+    world_from_model = Similarity(state.scale, state.rotation, state.center) @ centred_from_model
+    residuals = problem.residuals(state)
+    residuals_m = residuals[:3].T
+    distance = np.zeros((6, len(problem.model)))
+    distance[problem.kind, problem.frame] = result.distance
+    outlier = (distance[:3] > _OUTLIER_SIGMAS).any(axis=0)
+    covariance = result.covariance[:7, :7].copy()
+    if not fixes.has_heights:
+        covariance[2, :] = covariance[:, 2] = 0.0
+        covariance[2, 2] = np.inf
+    uncertainty = Uncertainty.from_covariance(covariance, state.center)
+    blocks = time_blocks(fixes.flight, fixes.time_s, options.correlation_time_s)
+    held_out = [cross_validate(problem, result, fold, ~outlier) for fold in (blocks, fixes.flight)]
+    gimbal = {
+        name: (float(bias[0]), float(bias[1]), float(bias[2]))
+        for f, (name, bias) in enumerate(zip(fixes.flights, state.gimbal_deg, strict=True))
+        if (gravity.usable & (fixes.flight == f)).any()
+    }
+    return GeoFit(
+        world_from_model,
+        fixes.origin,
+        {
+            name: float(offset)
+            for f, (name, offset) in enumerate(zip(fixes.flights, state.offsets_m, strict=True))
+            if np.isfinite(fixes.enu_m[fixes.flight == f, 2]).any()
+        },
+        residuals_m,
+        outlier,
+        residuals[[Kind.PITCH, Kind.ROLL]].T,
+        gimbal,
+        _noise(problem, result),
+        uncertainty,
+        held_out[0],
+        held_out[1],
+        _summary(problem, result, residuals, outlier),
+        _observations(problem, gravity),
+        fixes.notes + _remarks(problem, result, gravity, outlier, held_out[0]),
+    )
+
+
+def _noise(problem: Problem, result: Estimate) -> dict[str, tuple[float, float]]:
+    """(bias, white) sigma in metres of each kind of fix, at its median stated sigma."""
+    names = ("horizontal", "vertical", "horizontal_rtk", "vertical_rtk")
+    noise = {}
+    for g, name in enumerate(names):
+        mine = problem.chains.group == g
+        if mine.any():
+            unit = float(np.median(problem.chains.unit[mine]))
+            noise[name] = (
+                unit * float(np.exp(result.levels.log_bias[g])),
+                unit * float(np.exp(result.levels.log_white[g])),
+            )
+    return noise
+
+
+def _summary(
+    problem: Problem, result: Estimate, residuals: np.ndarray, outlier: np.ndarray
+) -> FitSummary:
+    fixes = problem.fixes
+    horizontal = np.hypot(residuals[0], residuals[1])
+    vertical = np.abs(residuals[2])
+    gravity = residuals[[Kind.PITCH, Kind.ROLL]]
+    return FitSummary(
+        frames=len(outlier),
+        fixes=int(fixes.has_fix.sum()),
+        outliers=int(outlier.sum()),
+        effective_fixes=effective_fixes(problem, result),
+        horizontal_rmse_m=_rms(horizontal[~outlier]),
+        vertical_rmse_m=_rms(vertical[~outlier]),
+        ce90_m=_quantile(horizontal, 0.9),
+        le90_m=_quantile(vertical, 0.9),
+        gravity_rms_deg=_rms(np.hypot(*gravity)),
+    )
+
+
+def _observations(problem: Problem, gravity: Gravity) -> tuple[str, ...]:
+    used = ["fixes"]
+    if problem.fixes.has_heights:
+        used.append("heights")
+    if gravity.usable.any():
+        used.append("gimbal")
+    if problem.use_level.any():
+        used.append("level cameras")
+    return tuple(used)
+
+
+def _remarks(
+    problem: Problem, result: Estimate, gravity: Gravity, outlier: np.ndarray, held_out: HeldOut
+) -> tuple[str, ...]:
+    """What the user should know of this fit, a sentence each."""
+    fixes, state, options = problem.fixes, result.state, problem.options
+    notes = []
+    if not gravity.usable.any():
+        notes.append(
+            "No gimbal angles: up comes from the fixes, helped by cameras that fly level on average "
+            f"(sigma {options.level_camera_sigma_deg:g} deg)."
+        )
+    for f, name in enumerate(fixes.flights):
+        mine = fixes.has_fix & (fixes.flight == f)
+        if not mine.any():
+            notes.append(f"{name}: no frame has a fix; its place follows from the other flights.")
+        elif np.mean(outlier[mine]) > 0.3:
+            notes.append(
+                f"{name}: {np.mean(outlier[mine]):.0%} of its fixes are outliers: "
+                "another flight's telemetry, or its clock is off?"
+            )
+        if result.offset_sigma_m[f] > 10:
+            notes.append(
+                f"{name}: its heights start {state.offsets_m[f]:+.1f} m from the first flight's."
+            )
+        bias = float(np.linalg.norm(state.gimbal_deg[f]))
+        if bias > _GIMBAL_BIAS_SIGMAS * options.gimbal_bias_deg:
+            notes.append(f"{name}: its gimbal angles are off by a constant {bias:.1f} deg.")
+    for group, name in enumerate(("horizontal", "vertical")):
+        level = float(
+            np.hypot(*np.exp([result.levels.log_bias[group], result.levels.log_white[group]]))
+        )
+        if level > 2 and (problem.chains.group == group).any():
+            notes.append(
+                f"The {name} errors of the fixes are {level:.1f} times their stated sigma."
+            )
+    if held_out.folds == 0:
+        notes.append("Too short for cross-validation by blocks of time.")
+    return tuple(notes)
+
+
+def _rms(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def _quantile(values: np.ndarray, q: float) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.quantile(values, q)) if len(values) else float("nan")

@@ -1,0 +1,186 @@
+"""What a georegistration hands on, and its form in geo.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from spn_data.errors import FormatError
+from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.georegister.crossval import HeldOut
+from spn_data.georegister.uncertainty import Uncertainty
+from spn_data.pose import Similarity
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """Figures of a georegistration; lengths in metres.
+
+    Root mean squares are over inliers; CE90 and LE90, the radius and height that hold nine of ten residuals,
+    over all fixes.
+    """
+
+    frames: int
+    fixes: int
+    outliers: int
+    effective_fixes: float
+    horizontal_rmse_m: float
+    vertical_rmse_m: float
+    ce90_m: float
+    le90_m: float
+    gravity_rms_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class GeoFit:
+    """A model's place in the world.
+
+    world_from_model : metres East-North-Up at `origin` from the model's gauge.
+    vertical_offsets_m : by flight, what its heights lack to be up coordinates; for heights above take-off,
+        the height of its take-off point above the zero (the first flight's, where theirs differ).
+    residuals_m : (N, 3) fix minus fitted centre, east north up; NaN where unknown.
+    outlier : (N,) bool; gravity_deg : (N, 2) gimbal minus fit, about the image's right and about the view.
+    gimbal_bias_deg : by flight, constant error of the gimbal about the camera's x, y, z axes.
+    noise_m : by kind of fix, (bias, white) sigma that the data showed.
+    observations : which kinds were used: "fixes", "heights", "gimbal", "level cameras".
+    """
+
+    world_from_model: Similarity
+    origin: GeoOrigin
+    vertical_offsets_m: dict[str, float]
+    residuals_m: np.ndarray
+    outlier: np.ndarray
+    gravity_deg: np.ndarray
+    gimbal_bias_deg: dict[str, tuple[float, float, float]]
+    noise_m: dict[str, tuple[float, float]]
+    uncertainty: Uncertainty
+    held_out_blocks: HeldOut
+    held_out_flights: HeldOut
+    summary: FitSummary
+    observations: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def height_reference(self) -> HeightReference:
+        """What the origin's height is above."""
+        return self.origin.height_reference
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for json.dumps; NaN and infinity as null. Fields as in docs/georegistration.md."""
+        uncertainty = self.uncertainty
+        value = {
+            "version": VERSION,
+            "origin": asdict(self.origin),
+            "world_from_model": {
+                "scale": self.world_from_model.scale,
+                "rotation": self.world_from_model.rotation,
+                "translation_m": self.world_from_model.translation,
+            },
+            "vertical_offsets_m": self.vertical_offsets_m,
+            "gimbal_bias_deg": self.gimbal_bias_deg,
+            "noise_m": self.noise_m,
+            "uncertainty": {
+                "horizontal_m": uncertainty.horizontal_m,
+                "vertical_m": uncertainty.vertical_m,
+                "tilt_deg": uncertainty.tilt_deg,
+                "heading_deg": uncertainty.heading_deg,
+                "scale": uncertainty.scale,
+                "middle_m": uncertainty.middle_m,
+                "covariance": uncertainty.covariance,
+            },
+            "held_out_blocks": asdict(self.held_out_blocks),
+            "held_out_flights": asdict(self.held_out_flights),
+            "summary": asdict(self.summary),
+            "observations": list(self.observations),
+            "notes": list(self.notes),
+            "residuals_m": self.residuals_m,
+            "outlier": self.outlier,
+            "gravity_deg": self.gravity_deg,
+        }
+        return _plain(value)
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> GeoFit:
+        """From what to_json gave. Raises FormatError for a newer version or a missing field."""
+        version = value.get("version")
+        if version != VERSION:
+            raise FormatError(
+                f"georegistration of version {version!r}, this program reads {VERSION}"
+            )
+        try:
+            origin, similarity = value["origin"], value["world_from_model"]
+            stated = value["uncertainty"]
+            return cls(
+                Similarity(
+                    float(similarity["scale"]),
+                    np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
+                    np.array(similarity["translation_m"], dtype=np.float64).reshape(3),
+                ),
+                GeoOrigin(
+                    float(origin["lat_deg"]),
+                    float(origin["lon_deg"]),
+                    float(origin["alt_m"]),
+                    HeightReference(origin["height_reference"]),
+                ),
+                {name: _number(m) for name, m in value["vertical_offsets_m"].items()},
+                _array(value["residuals_m"], 3),
+                np.array(value["outlier"], dtype=bool),
+                _array(value["gravity_deg"], 2),
+                {name: _triple(v) for name, v in value["gimbal_bias_deg"].items()},
+                {name: (_number(v[0]), _number(v[1])) for name, v in value["noise_m"].items()},
+                Uncertainty(
+                    _number(stated["horizontal_m"]),
+                    _number(stated["vertical_m"], math.inf),
+                    _number(stated["tilt_deg"]),
+                    _number(stated["heading_deg"]),
+                    _number(stated["scale"]),
+                    _array(stated["covariance"], 7, math.inf),
+                    _array([stated["middle_m"]], 3)[0],
+                ),
+                HeldOut(**_numbers(value["held_out_blocks"])),
+                HeldOut(**_numbers(value["held_out_flights"])),
+                FitSummary(**_numbers(value["summary"])),
+                tuple(str(o) for o in value["observations"]),
+                tuple(str(n) for n in value["notes"]),
+            )
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise FormatError(f"damaged georegistration: {type(error).__name__} {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.bool_ | bool):
+        return bool(value)
+    if isinstance(value, np.integer | int):
+        return int(value)
+    if isinstance(value, np.floating | float):
+        return float(value) if math.isfinite(value) else None
+    return str(value)
+
+
+def _number(value: Any, unknown: float = math.nan) -> float:
+    return unknown if value is None else float(value)
+
+
+def _triple(value: Any) -> tuple[float, float, float]:
+    return _number(value[0]), _number(value[1]), _number(value[2])
+
+
+def _array(rows: Any, width: int, unknown: float = math.nan) -> np.ndarray:
+    flat = [[unknown if v is None else float(v) for v in row] for row in rows]
+    return np.array(flat, dtype=np.float64).reshape(len(flat), width)
+
+
+def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
+    counts = ("folds", "frames", "fixes", "outliers")
+    return {k: int(v) if k in counts else _number(v) for k, v in fields.items()}

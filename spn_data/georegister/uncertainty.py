@@ -1,0 +1,166 @@
+"""How far a georegistration is to be trusted, and how far it is from a known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from spn_data.errors import GeometryError
+from spn_data.georegister.fit import Estimate, covariance_of
+from spn_data.georegister.noise import inverse_times, solve
+from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.problem import Kind, Problem
+from spn_data.pose import Similarity, rotation_vectors
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Twice each value contains the truth in 95 % of cases, if the errors are as assumed.
+
+    horizontal_m : of the area's middle, radius; vertical_m : of its height, infinite where no heights are known;
+    tilt_deg : of the vertical, in any direction; heading_deg : about the vertical; scale : relative;
+    covariance : (7, 7) of the middle (east, north, up in metres), the world's rotation vector (radians)
+    and the logarithm of scale; middle_m : (3,) where the middle lies.
+    """
+
+    horizontal_m: float
+    vertical_m: float
+    tilt_deg: float
+    heading_deg: float
+    scale: float
+    covariance: np.ndarray
+    middle_m: np.ndarray
+
+    @classmethod
+    def from_covariance(cls, covariance: np.ndarray, middle_m: np.ndarray) -> Uncertainty:
+        sigma = np.sqrt(np.diag(covariance))
+        return cls(
+            radius_sigma(covariance[:2, :2]),
+            float(sigma[2]),
+            float(np.rad2deg(radius_sigma(covariance[3:5, 3:5]))),
+            float(np.rad2deg(sigma[5])),
+            float(sigma[6]),
+            covariance,
+            middle_m,
+        )
+
+    def of_points(self, points_m: np.ndarray) -> np.ndarray:
+        """Covariances (N, 3, 3) of the places of points (N, 3) of the world by the georegistration alone."""
+        lever = np.asarray(points_m) - self.middle_m
+        jacobian = np.zeros((len(lever), 3, 7))
+        jacobian[:, :, :3] = np.eye(3)
+        x, y, z = lever.T
+        jacobian[:, 0, 4], jacobian[:, 0, 5] = z, -y
+        jacobian[:, 1, 3], jacobian[:, 1, 5] = -z, x
+        jacobian[:, 2, 3], jacobian[:, 2, 4] = y, -x
+        jacobian[:, :, 6] = lever
+        return jacobian @ self.covariance @ jacobian.transpose(0, 2, 1)
+
+
+def radius_sigma(covariance: np.ndarray) -> float:
+    """Half of the radius that contains a centred normal vector (K,) in 95 % of cases.
+
+    Satterthwaite's scaled chi-square, which is exact on a line and for a round distribution.
+    """
+    values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    if values.sum() == 0:
+        return 0.0
+    freedom = values.sum() ** 2 / (values**2).sum()
+    # 0.9545 is within two sigma in one dimension.
+    square = 2 * gammaincinv(freedom / 2, 0.9544997361) * values.sum() / freedom
+    return float(np.sqrt(square) / 2)
+
+
+def require_determined(problem: Problem, result: Estimate, options: GeoregisterOptions) -> None:
+    """Raise GeometryError where fixes and gimbal angles alone leave a direction or the scale open."""
+    data = problem.without_level()
+    linear = data.linearise(result.state, result.offset_sigma_m, result.bias_weight)
+    weights = _weights_of(data, problem, result)
+    solution = solve(data.chains, problem.conservative(result.levels), weights, linear)
+    information = solution.information
+    covariance = covariance_of(information + np.diag(np.diag(information)) * 1e-12)[:7, :7]
+    values, axes = np.linalg.eigh(covariance[3:5, 3:5])
+    tilt = float(np.rad2deg(np.sqrt(values[-1])))
+    heading = float(np.rad2deg(np.sqrt(covariance[5, 5])))
+    scale = float(np.sqrt(covariance[6, 6]))
+    if scale > options.max_scale_sigma:
+        raise GeometryError(
+            f"the scale is known to {_percent(scale)} only: the flight's extent is too small against the "
+            "noise of its fixes; fly further across the area"
+        )
+    if tilt > options.max_tilt_sigma_deg:
+        east, north = axes[:, -1]
+        azimuth = np.rad2deg(np.arctan2(east, north)) % 180
+        raise GeometryError(
+            f"the tilt about the line of azimuth {azimuth:.0f} deg is known to {_degrees(tilt)} only "
+            f"(limit {options.max_tilt_sigma_deg:g}): fly a cross leg of at least 20 m, "
+            "or give gimbal angles"
+        )
+    if heading > options.max_heading_sigma_deg:
+        raise GeometryError(
+            f"the heading is known to {_degrees(heading)} only: fly a horizontal leg of at least 20 m"
+        )
+
+
+def _percent(share: float) -> str:
+    return f"{share:.0%}" if share < 1 else "no better than 100%"
+
+
+def _degrees(angle: float) -> str:
+    return f"{angle:.1f} deg" if angle < 90 else "no better than 90 deg"
+
+
+def _weights_of(part: Problem, problem: Problem, result: Estimate) -> np.ndarray:
+    """The weights of a problem's observations, in the order of another's that holds a part of them."""
+    table = np.ones((len(Kind), len(problem.model)))
+    table[problem.kind, problem.frame] = result.weights
+    return table[part.kind, part.frame]
+
+
+def effective_fixes(problem: Problem, result: Estimate) -> float:
+    """How many independent fixes would determine the middle's place as well (east and north, mean of both)."""
+    counts = []
+    for kind in (Kind.EAST, Kind.NORTH):
+        mine = problem.kind == kind
+        # Bias levels of differential and other fixes differ: the median observation stands for all.
+        inverse, _ = inverse_times(
+            problem.chains, result.levels, result.weights, mine[:, None].astype(np.float64)
+        )
+        group = problem.chains.group[mine]
+        bias, white = np.exp(result.levels.log_bias), np.exp(result.levels.log_white)
+        variance = np.median(
+            (bias[group] ** 2 + white[group] ** 2) * problem.chains.unit[mine] ** 2
+        )
+        counts.append(float(inverse[mine, 0].sum() * variance))
+    return float(np.mean(counts))
+
+
+@dataclass(frozen=True)
+class GeoErrors:
+    """Errors of a georegistration against the truth; nothing is aligned."""
+
+    position_m: float  # root mean square over the points
+    horizontal_m: float  # of the points' mean
+    vertical_m: float  # of the points' mean, signed
+    tilt_deg: float
+    heading_deg: float  # signed
+    scale: float  # relative, signed
+
+
+def georegistration_errors(
+    estimated: Similarity, true: Similarity, points: np.ndarray
+) -> GeoErrors:
+    """Errors of a world_from_model against the true one on points (N, 3) of the model."""
+    difference = estimated.apply(points) - true.apply(points)
+    mean = difference.mean(axis=0)
+    turn = np.rad2deg(rotation_vectors(estimated.rotation @ true.rotation.T))
+    return GeoErrors(
+        float(np.sqrt((difference**2).sum(axis=1).mean())),
+        float(np.hypot(mean[0], mean[1])),
+        float(mean[2]),
+        float(np.hypot(turn[0], turn[1])),
+        float(turn[2]),
+        estimated.scale / true.scale - 1,
+    )
