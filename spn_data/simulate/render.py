@@ -1,0 +1,388 @@
+"""Renders textured planar faces through a distorted lens: free of aliasing, and exact to a few hundredths of a pixel.
+
+A plane seen through a pinhole is linear in the ray: with ``X = origin + s*u_edge + t*v_edge``, the vector
+``(s, t, 1) / depth`` is a matrix times the ray ``(x, y, 1)``. Visibility, face edges and texture
+coordinates all come from that matrix, and lens distortion only enters the rays, which are computed once
+per camera. The image is worked off in tiles: where one face covers a tile (most of them), it is sampled
+at once; elsewhere each sample takes the nearest face. Each pixel is the mean of four samples on a rotated
+grid, each of them bilinear in a mip level chosen by the tile's footprint on the texture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spn_data.camera import Camera
+
+TILE_PX = 32
+BAND_PX = 8  # rows of one pose under a rolling shutter
+# Four distinct offsets in x and in y, so that edges of any direction get five shades of coverage.
+# They are point-symmetric (first and last, second and third), which keeps a pixel's centroid at its centre.
+SAMPLE_OFFSETS_PX = np.array([[-3.0, -1.0], [1.0, -3.0], [-1.0, 3.0], [3.0, 1.0]]) / 8
+HAZE_RGB = (208, 214, 220)  # where a ray meets no face
+_MAX_EDGES = 8
+_EDGE_TOLERANCE = 1e-7  # lets neighbouring faces meet without a crack from rounding
+_UNIT_SQUARE_EDGES = np.array([[1.0, 0, 0], [-1, 0, 1], [0, 1, 0], [0, -1, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image (H, W, 3 or 4) uint8 RGB and its mip levels; a fourth channel is the share of mirror reflection."""
+
+    levels: tuple[np.ndarray, ...]
+
+    @classmethod
+    def from_image(cls, image: np.ndarray) -> Texture:
+        """Each level is the area mean of the one before, at half its size (rounded down)."""
+        levels = [np.ascontiguousarray(image)]
+        while min(levels[-1].shape[:2]) > 8:
+            height, width = levels[-1].shape[:2]
+            levels.append(
+                cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+            )
+        return cls(tuple(levels))
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A parallelogram, or a convex polygon in its plane, with a texture on its front.
+
+    origin, u_edge, v_edge : (3,) metres; where the texture's upper-left corner lies, and its upper and
+        left border. Seen from the front, u is to the right of v: the front is where
+        ``(eye - origin) . (u_edge x v_edge) < 0``.
+    region : (s0, t0, s1, t1), the part of the texture used, as fractions of its width and height.
+    polygon : (K, 2), 3 <= K <= 8, convex in units of the two edges, running from +u towards +v; None is the whole.
+    mirrored : what the mirror parts of the texture reflect, as a face at its mirror image behind this one.
+    at_infinity : the face moves along with the eye (sky).
+    """
+
+    texture: str
+    origin: np.ndarray
+    u_edge: np.ndarray
+    v_edge: np.ndarray
+    region: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    polygon: np.ndarray | None = None
+    mirrored: Face | None = None
+    at_infinity: bool = False
+
+
+def mirror_face(target: Face, mirror: Face) -> Face:
+    """The face `target` as it appears behind the plane of `mirror`."""
+    normal = np.cross(mirror.u_edge, mirror.v_edge)
+    normal = normal / np.linalg.norm(normal)
+    reflect = np.eye(3) - 2 * np.outer(normal, normal)
+    origin = mirror.origin + reflect @ (target.origin - mirror.origin)
+    return Face(
+        target.texture, origin, reflect @ target.u_edge, reflect @ target.v_edge, target.region
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _RayGrid:
+    """Rays of some image rows, and what bounds them in each of T tiles.
+
+    rays : (h, w * samples, 2) float32, x/z and y/z; a pixel's samples are neighbours in a row.
+    tiles : (T, 4) int, first row, last row + 1, first column, last column + 1 in `rays`; row by row.
+    middle, half : (T, 2), the bounding box of a tile's rays.
+    jet : (T, 3, 3), columns are the ray of the tile's middle pixel and its change by one pixel in x and y.
+    """
+
+    rays: np.ndarray
+    tiles: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+    jet: np.ndarray
+
+    @classmethod
+    def of_rows(
+        cls, camera: Camera, offsets_px: np.ndarray, first_row: int, last_row: int, tile_rows: int
+    ) -> _RayGrid:
+        samples = len(offsets_px)
+        x = (np.arange(camera.width) + 0.5)[:, None] + offsets_px[:, 0]
+        y = (np.arange(first_row, last_row) + 0.5)[:, None, None] + offsets_px[:, 1]
+        pixels = np.stack(np.broadcast_arrays(x[None], y), axis=-1)
+        rays = camera.unproject(pixels.reshape(-1, 2)).astype(np.float32)
+        rays = rays.reshape(last_row - first_row, camera.width * samples, 2)
+        tiles, boxes, jets = [], [], []
+        for r0 in range(0, len(rays), tile_rows):
+            r1 = min(r0 + tile_rows, len(rays))
+            for c0 in range(0, camera.width, TILE_PX):
+                c1 = min(c0 + TILE_PX, camera.width)
+                tile = rays[r0:r1, c0 * samples : c1 * samples]
+                tiles.append((r0, r1, c0 * samples, c1 * samples))
+                boxes.append((tile.min(axis=(0, 1)), tile.max(axis=(0, 1))))
+                middle = np.array([(c0 + c1) / 2, first_row + (r0 + r1) / 2])
+                jets.append(middle + np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]]))
+        box = np.asarray(boxes, dtype=np.float64)  # (T, 2, 2)
+        cross = camera.unproject(np.concatenate(jets)).reshape(-1, 5, 2)
+        jet = np.zeros((len(tiles), 3, 3))
+        jet[:, :2, 0] = cross[:, 0]
+        jet[:, 2, 0] = 1
+        jet[:, :2, 1] = cross[:, 1] - cross[:, 2]
+        jet[:, :2, 2] = cross[:, 3] - cross[:, 4]
+        half = (box[:, 1] - box[:, 0]) / 2
+        return cls(rays, np.asarray(tiles), box.mean(axis=1), half, jet)
+
+
+class Renderer:
+    """Holds the faces, the textures and one camera's rays; each image is a function of poses alone."""
+
+    def __init__(self, faces: Sequence[Face], textures: Mapping[str, Texture], camera: Camera):
+        mirrors = [face.mirrored for face in faces if face.mirrored is not None]
+        table = [*faces, *mirrors]
+        self._camera = camera
+        self._visible_faces = len(faces)
+        self._textures = [textures[face.texture] for face in table]
+        self._origins = np.stack([face.origin for face in table]).astype(np.float64)
+        self._axes = np.stack([np.stack([face.u_edge, face.v_edge]) for face in table])
+        self._at_infinity = np.array([face.at_infinity for face in table])
+        # Padding edges only ask that the face be in front of the eye.
+        self._edges = np.tile(np.array([0.0, 0.0, 1.0]), (len(faces), _MAX_EDGES, 1))
+        self._edge_counts = []
+        self._mirror_idx = np.full(len(table), -1)
+        following = len(faces)
+        for i, face in enumerate(faces):
+            edges = _UNIT_SQUARE_EDGES if face.polygon is None else _polygon_edges(face.polygon)
+            self._edges[i, : len(edges)] = edges
+            self._edge_counts.append(len(edges))
+            if face.mirrored is not None:
+                self._mirror_idx[i] = following
+                following += 1
+        self._texel_from_face = np.zeros((len(table), 3, 3))
+        for i, (face, texture) in enumerate(zip(table, self._textures, strict=True)):
+            height, width = texture.levels[0].shape[:2]
+            s0, t0, s1, t1 = face.region
+            self._texel_from_face[i] = [
+                [(s1 - s0) * width, 0, s0 * width],
+                [0, (t1 - t0) * height, t0 * height],
+                [0, 0, 1],
+            ]
+        self._grids: dict[str, list[_RayGrid]] = {}
+
+    def render(self, center: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
+        """Sharp image (H, W, 3) uint8 RGB from one pose: centre (3,) and rotation (3, 3)."""
+        return _mean_samples(self._cast(self._grid("sharp")[0], center, cam_from_world))
+
+    def render_exposure(self, centers: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
+        """Mean (H, W, 3) uint8 of what is seen from K poses during one exposure: (K, 3), (K, 3, 3).
+
+        Each pose is rendered with one sample a pixel; poses that lie symmetrically in time take
+        point-symmetric samples, so that the image is centred on the middle of the exposure.
+        """
+        count = len(centers)
+        total = np.zeros((self._camera.height, self._camera.width, 3), np.float32)
+        for k in range(count):
+            sample = k % 4 if 2 * k < count else 3 - (count - 1 - k) % 4
+            cv2.accumulate(
+                self._cast(self._grid(f"single{sample}")[0], centers[k], cam_from_world[k]), total
+            )
+        return np.rint(total / count).astype(np.uint8)
+
+    def render_rolling(self, centers: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
+        """Image (H, W, 3) uint8 whose i-th band of `BAND_PX` rows is seen from the i-th pose (B, 3), (B, 3, 3)."""
+        bands = self._grid("bands")
+        if len(bands) != len(centers):
+            raise ValueError(f"{len(centers)} poses for {len(bands)} bands of rows")
+        parts = [self._cast(*args) for args in zip(bands, centers, cam_from_world, strict=True)]
+        return _mean_samples(np.concatenate(parts))
+
+    def _grid(self, kind: str) -> list[_RayGrid]:
+        if kind not in self._grids:
+            height = self._camera.height
+            if kind == "bands":
+                starts = range(0, height, BAND_PX)
+                spans = [(row, min(row + BAND_PX, height)) for row in starts]
+            else:
+                spans = [(0, height)]
+            offsets = SAMPLE_OFFSETS_PX
+            if kind.startswith("single"):
+                offsets = offsets[[int(kind[-1])]]
+            self._grids[kind] = [
+                _RayGrid.of_rows(self._camera, offsets, *span, tile_rows=TILE_PX) for span in spans
+            ]
+        return self._grids[kind]
+
+    def _face_from_ray(self, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """(F, 3, 3) matrices that take a ray (x, y, 1) to (s, t, 1) / depth; NaN for faces seen edge-on."""
+        offsets = self._origins - np.where(self._at_infinity[:, None], 0.0, center)
+        matrices = np.concatenate([self._axes, offsets[:, None]], axis=1) @ rotation.T  # rows
+        edge_on = np.abs(np.linalg.det(matrices)) < 1e-9
+        matrices[edge_on] = np.eye(3)
+        inverse = np.linalg.inv(np.swapaxes(matrices, 1, 2))
+        inverse[edge_on] = np.nan
+        return inverse
+
+    def _cast(self, grid: _RayGrid, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Colours (h, w * samples, 3) uint8 of a grid's rays."""
+        face_from_ray = self._face_from_ray(center, rotation)
+        faces, keep, covered = self._faces_of_tiles(grid, face_from_ray, center)
+        tile_idx, candidate = np.nonzero(keep.T)  # by tile
+        face_idx = faces[candidate]
+        levels = self._mip_levels(face_from_ray, face_idx, grid.jet[tile_idx])
+        mirror_idx = self._mirror_idx[face_idx]
+        mirror_levels = self._mip_levels(face_from_ray, mirror_idx, grid.jet[tile_idx])
+        mirror_levels[mirror_idx < 0] = 0
+        firsts = np.searchsorted(tile_idx, np.arange(len(grid.tiles) + 1))
+        colours = np.empty((*grid.rays.shape[:2], 3), np.uint8)
+        run: tuple[int, int, int] | None = (
+            None  # face, level and mirror level of the tiles in `span`
+        )
+        span = (0, 0, 0, 0)
+        for t, (r0, r1, c0, c1) in enumerate(grid.tiles.tolist()):
+            first, last = int(firsts[t]), int(firsts[t + 1])
+            alone = last - first == 1 and bool(covered[candidate[first], t])
+            key = (
+                (int(face_idx[first]), int(levels[first]), int(mirror_levels[first]))
+                if alone
+                else None
+            )
+            if run is not None and (key != run or r0 != span[0]):
+                view = np.s_[span[0] : span[1], span[2] : span[3]]
+                colours[view] = self._shade(face_from_ray, *run, grid.rays[view])
+                run = None
+            if key is not None:
+                span = (r0, r1, span[2] if run is not None else c0, c1)
+                run = key
+            elif first == last:
+                colours[r0:r1, c0:c1] = HAZE_RGB
+            else:
+                pairs = range(first, last)
+                rays = np.ascontiguousarray(grid.rays[r0:r1, c0:c1]).reshape(-1, 2)
+                mixed = self._shade_nearest(
+                    face_from_ray,
+                    [(int(face_idx[p]), int(levels[p]), int(mirror_levels[p])) for p in pairs],
+                    [bool(covered[candidate[p], t]) for p in pairs],
+                    rays,
+                )
+                colours[r0:r1, c0:c1] = mixed.reshape(r1 - r0, c1 - c0, 3)
+        if run is not None:
+            view = np.s_[span[0] : span[1], span[2] : span[3]]
+            colours[view] = self._shade(face_from_ray, *run, grid.rays[view])
+        return colours
+
+    def _faces_of_tiles(
+        self, grid: _RayGrid, face_from_ray: np.ndarray, center: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces (M,) that may be seen, in which tiles each may (M, T), and which tiles it covers (M, T)."""
+        n = self._visible_faces
+        normals = np.cross(self._axes[:n, 0], self._axes[:n, 1])
+        offsets = self._origins[:n] - np.where(self._at_infinity[:n, None], 0.0, center)
+        seen = np.einsum("fi,fi->f", normals, offsets) > 0
+        seen &= np.isfinite(face_from_ray[:n]).all(axis=(1, 2))
+        # Linear forms of the ray, all >= 0 inside the face; the last is the inverse depth.
+        forms = np.concatenate([self._edges @ face_from_ray[:n], face_from_ray[:n, 2:]], axis=1)
+        low, high = (grid.middle - grid.half).min(axis=0), (grid.middle + grid.half).max(axis=0)
+        middle, half = (low + high)[None] / 2, (high - low)[None] / 2
+        seen &= (_form_bounds(forms, middle, half)[1] >= 0).all(axis=(1, 2))
+        faces = np.flatnonzero(seen)
+        low_m, high_m = _form_bounds(forms[faces], grid.middle, grid.half)  # (M, E, T)
+        overlaps = (high_m >= -_EDGE_TOLERANCE).all(axis=1)
+        covers = (low_m >= 0).all(axis=1)
+        nearest = np.where(covers, low_m[:, -1], 0.0).max(axis=0, initial=0.0)
+        return faces, overlaps & (high_m[:, -1] >= nearest), covers
+
+    def _mip_levels(
+        self, face_from_ray: np.ndarray, face_idx: np.ndarray, jet: np.ndarray
+    ) -> np.ndarray:
+        """Mip levels (P,) of faces (P,) at tiles with jets (P, 3, 3), from a pixel's footprint in texels."""
+        q = self._texel_from_face[face_idx] @ face_from_ray[face_idx] @ jet
+        inverse_depth = np.maximum(np.abs(q[:, 2, :1]), 1e-6)
+        step = (q[:, :2, 1:] - q[:, :2, :1] * (q[:, 2:, 1:] / inverse_depth[:, None])) / (
+            inverse_depth[:, None]
+        )
+        square = (step**2).sum(axis=(1, 2))
+        det = np.abs(step[:, 0, 0] * step[:, 1, 1] - step[:, 0, 1] * step[:, 1, 0])
+        major = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * det**2, 0.0))) / 2)
+        minor = det / np.maximum(major, 1e-12)
+        # Four samples a pixel resolve half a pixel both ways, and a quarter along one axis.
+        texels = np.maximum(0.6 * minor, 0.3 * major)
+        deepest = np.array([len(texture.levels) - 1 for texture in self._textures])[face_idx]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level = np.nan_to_num(np.rint(np.log2(texels)), posinf=0.0, neginf=0.0)
+        return np.clip(level, 0, deepest).astype(np.int64)
+
+    def _sample(
+        self, face_from_ray: np.ndarray, face: int, level: int, rays: np.ndarray
+    ) -> np.ndarray:
+        """Texture colours (h, w, 3 or 4) of one face along rays (h, w, 2); beyond its border, its mirror image."""
+        base = self._textures[face].levels[0].shape
+        image = self._textures[face].levels[level]
+        sx, sy = image.shape[1] / base[1], image.shape[0] / base[0]
+        # OpenCV's texel centres are at whole numbers, ours at half ones.
+        level_from_texel = np.array([[sx, 0, -0.5], [0, sy, -0.5], [0, 0, 1]])
+        texel_from_ray = level_from_texel @ self._texel_from_face[face] @ face_from_ray[face]
+        texels = cv2.perspectiveTransform(rays, texel_from_ray)
+        return cv2.remap(image, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+    def _shade(
+        self, face_from_ray: np.ndarray, face: int, level: int, mirror_level: int, rays: np.ndarray
+    ) -> np.ndarray:
+        """Colours (h, w, 3) of one face along rays (h, w, 2), with what its mirror parts reflect."""
+        own = self._sample(face_from_ray, face, level, rays)
+        if own.shape[2] == 3:
+            return own
+        share = own[:, :, 3]
+        own = cv2.cvtColor(own, cv2.COLOR_RGBA2RGB)
+        mirror = int(self._mirror_idx[face])
+        if mirror < 0 or not share.any():
+            return own
+        reflected = self._sample(face_from_ray, mirror, mirror_level, rays)
+        weight = share.astype(np.float32) * np.float32(1 / 255)
+        return cv2.blendLinear(reflected[:, :, :3].copy(), own, weight, 1 - weight)
+
+    def _shade_nearest(
+        self,
+        face_from_ray: np.ndarray,
+        keys: list[tuple[int, int, int]],
+        covered: list[bool],
+        rays: np.ndarray,
+    ) -> np.ndarray:
+        """Colours (n, 3) along rays (n, 2) of the nearest among candidate faces (face, level, mirror level)."""
+        nearest = np.zeros(len(rays), np.float32)
+        winner = np.full(len(rays), -1, np.int16)
+        for j, ((face, _, _), covers) in enumerate(zip(keys, covered, strict=True)):
+            forms = face_from_ray[face, 2:]
+            if not covers:
+                edges = self._edges[face, : self._edge_counts[face]] @ face_from_ray[face]
+                forms = np.concatenate([forms, edges])
+            values = forms[:, :2].astype(np.float32) @ rays.T + forms[:, 2:].astype(np.float32)
+            closer = values[0] > nearest
+            if not covers:
+                closer &= values[1:].min(axis=0) >= -_EDGE_TOLERANCE
+            np.copyto(nearest, values[0], where=closer)
+            winner[closer] = j
+        colours = np.empty((len(rays), 3), np.uint8)
+        colours[winner < 0] = HAZE_RGB
+        for j, key in enumerate(keys):
+            chosen = np.flatnonzero(winner == j)
+            if len(chosen):
+                colours[chosen] = self._shade(face_from_ray, *key, rays[chosen][None])[0]
+        return colours
+
+
+def _mean_samples(colours: np.ndarray) -> np.ndarray:
+    """Pixels (h, w, 3) from samples (h, 4 w, 3)."""
+    height, width = colours.shape[0], colours.shape[1] // len(SAMPLE_OFFSETS_PX)
+    return cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _form_bounds(
+    forms: np.ndarray, middle: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest values (F, E, T) of linear forms (F, E, 3) over boxes of rays (T, 2), (T, 2)."""
+    value = forms[..., :2] @ middle.T + forms[..., 2:]
+    spread = np.abs(forms[..., :2]) @ half.T
+    return value - spread, value + spread
+
+
+def _polygon_edges(polygon: np.ndarray) -> np.ndarray:
+    """Lines (K, 3) with ``a s + b t + c >= 0`` inside a convex polygon (K, 2)."""
+    if not 3 <= len(polygon) <= _MAX_EDGES:
+        raise ValueError(f"a face has 3 to {_MAX_EDGES} corners, not {len(polygon)}")
+    start, step = polygon, np.roll(polygon, -1, axis=0) - polygon
+    a, b = -step[:, 1], step[:, 0]
+    return np.stack([a, b, -(a * start[:, 0] + b * start[:, 1])], axis=1)

@@ -1,0 +1,119 @@
+"""The exact truth beside simulated flights: files written and read."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.errors import FormatError, InputError
+from spn_data.geodesy import GeoOrigin
+from spn_data.pose import Poses
+from spn_data.simulate.flight import FlightPath
+from spn_data.simulate.presets import SimulateOptions
+
+VERSION = 1
+_COLUMNS = ("frame", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "blurred")
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is exactly known of one flight.
+
+    time_s : (N,) container timestamps of the video's frames; poses : East-North-Up in metres about `origin`,
+    at mid-exposure of the middle row; blurred : (N,) bool; origin : with ellipsoidal height.
+    """
+
+    time_s: np.ndarray
+    poses: Poses
+    blurred: np.ndarray
+    camera: Camera
+    origin: GeoOrigin
+
+
+def write_truth(folder: Path, path: FlightPath) -> None:
+    """`<flight>.csv` and `<flight>_camera.json` in a folder."""
+    with (folder / f"{path.name}.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        rows = zip(path.time_s, path.poses, path.blurred, strict=True)
+        for i, (time_s, (center, quat), blurred) in enumerate(rows):
+            values = [f"{time_s:.6f}", *(f"{v:.9f}" for v in center), *(f"{v:.12f}" for v in quat)]
+            writer.writerow([i, *values, int(blurred)])
+    camera = {
+        "model": path.camera.model,
+        "width": path.camera.width,
+        "height": path.camera.height,
+        "params": [float(v) for v in path.camera.params],
+    }
+    write_json(folder / f"{path.name}_camera.json", camera)
+
+
+def write_options(folder: Path, options: SimulateOptions) -> None:
+    """`origin.json` and `options.json` in a folder."""
+    origin = options.origin
+    write_json(
+        folder / "origin.json",
+        {
+            "lat_deg": origin.lat_deg,
+            "lon_deg": origin.lon_deg,
+            "alt_m": origin.alt_m,
+            "height_reference": str(origin.height_reference),
+            "abs_alt_minus_up_m": origin.alt_m - options.geoid_m,
+            "rel_alt_minus_up_m": 0.0,
+        },
+    )
+    write_json(folder / "options.json", asdict(options))
+
+
+def write_json(path: Path, values: dict[str, object]) -> None:
+    text = json.dumps({"version": VERSION, **values}, indent=2, sort_keys=True)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def read_truth(folder: Path, flight: str) -> Truth:
+    """The truth of one flight from `OUT/truth`.
+
+    Raises InputError where there is none, FormatError where it is damaged or of a newer version.
+    """
+    table_path, camera_path = folder / f"{flight}.csv", folder / f"{flight}_camera.json"
+    if not table_path.is_file():
+        raise InputError(f"no truth of a flight {flight!r}", path=folder)
+    camera, origin = _read_json(camera_path), _read_json(folder / "origin.json")
+    try:
+        with table_path.open(encoding="utf-8", newline="") as file:
+            header = tuple(next(csv.reader(file)))
+            if header != _COLUMNS:
+                raise ValueError(f"columns are {', '.join(header)}")
+            table = np.loadtxt(file, delimiter=",", ndmin=2)
+        return Truth(
+            table[:, 1],
+            Poses(table[:, 2:5], table[:, 5:9]),
+            table[:, 9] != 0,
+            Camera(
+                camera["model"],
+                int(camera["width"]),
+                int(camera["height"]),
+                np.array(camera["params"], dtype=np.float64),
+            ),
+            GeoOrigin(origin["lat_deg"], origin["lon_deg"], origin["alt_m"]),
+        )
+    except (ValueError, KeyError, IndexError, StopIteration, TypeError) as error:
+        raise FormatError(
+            f"{table_path}: this is not a truth file as written here ({error})"
+        ) from error
+
+
+def _read_json(path: Path) -> dict[str, object] | dict[str, float]:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        version = int(values["version"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: cannot be read as JSON with a version ({error})") from error
+    if version > VERSION:
+        raise FormatError(f"{path}: version {version} is newer than this program's {VERSION}")
+    return dict(values)
