@@ -1,0 +1,208 @@
+"""From a source to its candidate frames: every image measured once, rows for frames.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data import video
+from spn_data.errors import InputError
+from spn_data.frames import Frames
+from spn_data.measurement import MEASURE_WIDTH, GrayImage, Measurements, measure
+from spn_data.photos import PhotoHeaders, decode_photo_gray, read_headers
+from spn_data.selection import Choice
+from spn_data.sources import Source, SourceKind, safe_name
+from spn_data.telemetry.exif import telemetry_of_photos
+from spn_data.telemetry.track import Telemetry
+
+_ZOOM_CHANGE = 0.02  # relative change of focal length that makes another camera
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The measured images of one source, N rows.
+
+    part_start_s : (P,) when each video file begins on the sequence's clock; photos : headers of photos;
+    photo_telemetry : their EXIF and XMP, N rows on the sequence's clock; notes : one sentence each.
+    """
+
+    source: Source
+    measured: Measurements
+    part_start_s: tuple[float, ...]
+    photos: PhotoHeaders | None
+    photo_telemetry: Telemetry | None
+    notes: tuple[str, ...]
+
+
+def analyse(
+    source: Source, *, threads: int = 0, progress: Callable[[int], None] | None = None
+) -> Candidates:
+    """Measures every image of a source once, at a reduced size; `progress` hears how many are done."""
+    if source.kind is SourceKind.PHOTOS:
+        return _analyse_photos(source, progress)
+    starts: list[float] = []
+    notes: list[str] = []
+    measured = measure(_video_images(source, threads, starts, notes), progress=progress)
+    return Candidates(source, measured, tuple(starts), None, None, tuple(notes))
+
+
+def frames_of(candidates: Candidates, choice: Choice, *, focal: np.ndarray | None = None) -> Frames:
+    """The rows of frames.csv for one source, telemetry still unknown.
+
+    focal : (N,) focal length in any unit where the telemetry tells it, NaN where not. A change of it by
+    2 %, or of the image's size, begins another camera, `<sequence>-2` and so on.
+    """
+    source, measured = candidates.source, candidates.measured
+    n = len(measured)
+    if candidates.photos is None:
+        stems = [f"{i:06d}" for i in range(n)]
+        video_frame = measured.index
+        keys = _camera_runs(measured, focal)
+    else:
+        stems = _photo_stems(source.parts)
+        video_frame = np.full(n, -1)
+        keys = list(candidates.photos.lens)
+    nan = np.full(n, np.nan)
+    return Frames(
+        names=_strings(f"{source.sequence}/{stem}.jpg" for stem in stems),
+        sequences=_strings([source.sequence] * n),
+        cameras=_strings(_camera_names(source.sequence, keys)),
+        sources=_strings(source.parts[i].name for i in measured.source_idx),
+        video_frame=video_frame.astype(np.int64),
+        time_s=measured.time_s,
+        status=choice.status,
+        reason=choice.reason,
+        sharpness=np.round(measured.sharpness, 3),
+        motion_px=choice.motion_px,
+        width=measured.width,
+        height=measured.height,
+        lat_lon_deg=np.full((n, 2), np.nan),
+        rel_alt_m=nan,
+        abs_alt_m=nan,
+        sigma_m=np.full((n, 3), np.nan),
+        gimbal_deg=np.full((n, 3), np.nan),
+    )
+
+
+def _video_images(
+    source: Source, threads: int, starts: list[float], notes: list[str]
+) -> Iterator[GrayImage]:
+    """The frames of all parts on one clock; fills when the parts start and what was lost."""
+    begin_s = 0.0
+    for part_idx, part in enumerate(source.parts):
+        report = video.DecodeReport()
+        starts.append(begin_s)
+        times: list[float] = []
+        for frame in video.decode_gray(
+            part, max_width=MEASURE_WIDTH, threads=threads, report=report
+        ):
+            times.append(frame.time_s)
+            yield GrayImage(
+                part_idx,
+                frame.index,
+                round(begin_s + frame.time_s, 6),
+                frame.width,
+                frame.height,
+                frame.image,
+                frame.damaged,
+            )
+        # The next part begins one frame after this one's last.
+        step_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.04
+        begin_s = round(begin_s + times[-1] + step_s, 6)
+        notes += [f"{part.name}: {note}" for note in report.notes]
+
+
+def _analyse_photos(source: Source, progress: Callable[[int], None] | None) -> Candidates:
+    headers = read_headers(source.parts)
+    known = [i for i, photo in enumerate(headers.metadata) if photo is not None]
+    telemetry = telemetry_of_photos(
+        [photo for photo in headers.metadata if photo is not None], source=source.sequence
+    )
+    # Photos that can't be read take the time of the one before.
+    place = np.maximum(np.searchsorted(known, np.arange(len(source.parts)), side="right") - 1, 0)
+    times = telemetry.time_s[place] if known else np.zeros(len(source.parts))
+
+    def images() -> Iterator[GrayImage]:
+        for i, (path, (width, height)) in enumerate(
+            zip(source.parts, headers.sizes.tolist(), strict=True)
+        ):
+            gray, problem = None, headers.problem[i]
+            if not problem:
+                try:
+                    gray = decode_photo_gray(path, max_width=MEASURE_WIDTH)
+                except InputError as error:
+                    problem = str(error).removeprefix(f"{path}: ")
+            yield GrayImage(i, 0, float(times[i]), width, height, gray, problem=problem)
+
+    measured = measure(images(), progress=progress)
+    spread = np.full(len(source.parts), -1)
+    spread[known] = np.arange(len(known))
+    rows = _spread(telemetry, spread, times)
+    return Candidates(source, measured, (), headers, rows, telemetry.notes)
+
+
+def _spread(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Telemetry:
+    """Rows of telemetry by index (N,), NaN where it is -1."""
+
+    def column(values: np.ndarray) -> np.ndarray:
+        result = np.full((len(row), *values.shape[1:]), np.nan)
+        result[row >= 0] = values[row[row >= 0]]
+        return result
+
+    return Telemetry(
+        time_s,
+        column(telemetry.lat_lon_deg),
+        column(telemetry.rel_alt_m),
+        column(telemetry.abs_alt_m),
+        column(telemetry.sigma_m),
+        column(telemetry.gimbal_deg),
+        column(telemetry.utc_s),
+        telemetry.abs_reference,
+        telemetry.utc_is_local,
+        telemetry.kind,
+        telemetry.source,
+        telemetry.notes,
+    )
+
+
+def _camera_runs(measured: Measurements, focal: np.ndarray | None) -> list[object]:
+    """A key for each frame that changes with the size or the zoom; back at an old one, the old key."""
+    zooms: list[float] = []
+    keys: list[object] = []
+    zoom = 0
+    for i in range(len(measured)):
+        if focal is not None and np.isfinite(focal[i]):
+            near = [k for k, z in enumerate(zooms) if abs(focal[i] / z - 1) <= _ZOOM_CHANGE]
+            zoom = near[0] if near else len(zooms)
+            if not near:
+                zooms.append(float(focal[i]))
+        keys.append((int(measured.width[i]), int(measured.height[i]), zoom))
+    return keys
+
+
+def _camera_names(sequence: str, keys: Sequence[object]) -> list[str]:
+    """`<sequence>` for the first key, `<sequence>-2` for the second; an unknown key takes the first's."""
+    order = {key: i for i, key in enumerate(dict.fromkeys(k for k in keys if k is not None))}
+    numbers = [order.get(key, 0) for key in keys]
+    return [sequence if k == 0 else f"{sequence}-{k + 1}" for k in numbers]
+
+
+def _photo_stems(paths: Sequence[Path]) -> list[str]:
+    """A safe name for each photo, unique also where case does not count."""
+    taken: set[str] = set()
+    stems = []
+    for path in paths:
+        base = stem = safe_name(path.stem, "photo")
+        number = 2
+        while stem.lower() in taken:
+            stem, number = f"{base}-{number}", number + 1
+        taken.add(stem.lower())
+        stems.append(stem)
+    return stems
+
+
+def _strings(values: Iterator[str] | Sequence[str]) -> np.ndarray:
+    return np.array(list(values), dtype=np.str_)

@@ -1,0 +1,296 @@
+"""What a folder holds: videos, photos and the telemetry beside them, as sequences. Decodes nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from spn_data.errors import InputError
+
+if TYPE_CHECKING:
+    from spn_data.video import VideoInfo
+
+_MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
+VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
+PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff"])
+TELEMETRY_SUFFIXES = frozenset([".srt", ".gpx", ".csv"])
+PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
+
+MIN_SPLIT_BYTES = int(
+    3.5 * 2**30
+)  # cameras split a flight where FAT32 ends a file, just below 4 GiB
+_CONTIGUOUS_S = 5.0  # creation times have whole seconds, and a part starts while the last is closed
+_MAX_DEPTH = 8
+_MAX_FILES = 200_000
+
+_DJI = re.compile(r"(?P<head>DJI_)(?:\d{14}_)?(?P<number>\d{3,5})(?P<tail>(?:_[A-Z]{1,3})?)", re.I)
+_GOPRO = re.compile(r"(?P<head>G[HXP])(?P<chapter>\d{2})(?P<number>\d{4})", re.I)
+_GOPRO_FIRST = re.compile(r"GOPR(?P<number>\d{4})", re.I)
+
+
+_T = TypeVar("_T")
+
+
+class SourceKind(StrEnum):
+    """What a sequence is made of."""
+
+    VIDEO = "video"
+    PHOTOS = "photos"
+
+
+@dataclass(frozen=True)
+class Source:
+    """One sequence: a flight's video, in one or several parts, or a folder of photos.
+
+    sequence : unique, of the characters A-Z a-z 0-9 . _ -, so that it can name a folder.
+    parts : video files in the order of time, or photos in the order of their names.
+    telemetry : files beside them, of the same name.
+    """
+
+    sequence: str
+    kind: SourceKind
+    parts: tuple[Path, ...]
+    telemetry: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What was found, in the order of names; ignored : (path, reason) of everything else."""
+
+    sources: tuple[Source, ...]
+    ignored: tuple[tuple[Path, str], ...]
+
+
+def discover(
+    folder: Path,
+    *,
+    probe: Callable[[Path], VideoInfo] | None = None,
+    min_split_bytes: int = MIN_SPLIT_BYTES,
+) -> Sources:
+    """The sequences of a folder and those below it, or of a single video or photo.
+
+    Several video files are one sequence where a camera split one recording:
+    - GoPro: `GX010042`, `GX020042`, ... (also GH) and `GOPR0042`, `GP010042`, ...: the same number,
+      chapters without a hole;
+    - DJI: consecutive numbers (`DJI_0007`, `DJI_0008`), all but the last part at least `min_split_bytes`, and
+      by `probe` (default `video.probe`, called only for these) the same size and rate, and either each begins
+      when the one before it ends or all bear the same creation time. Without creation times they stay apart.
+
+    Links are not followed, proxies and hidden files are passed over: all are listed in `ignored`.
+    InputError where there is no video and no photo.
+    """
+    if not folder.exists():
+        raise InputError("does not exist", path=folder)
+    ignored: list[tuple[Path, str]] = []
+    if folder.is_dir():
+        root = folder
+        files = list(_walk(folder, ignored))
+    else:
+        root = folder.parent
+        files = [folder, *_siblings(folder)]
+    by_kind = _sort(files, ignored)
+    sources: list[Source] = []
+    taken: set[str] = set()
+    for parts in _group_videos(by_kind["video"], probe, min_split_bytes):
+        beside = tuple(t for part in parts for t in _beside(part, by_kind["telemetry"]))
+        name = _unique(parts[0].stem, parts[0].parent.name, taken)
+        sources.append(Source(name, SourceKind.VIDEO, parts, beside))
+    for place, photos in _by_folder(by_kind["photo"]).items():
+        name = _unique(place.resolve().name, place.resolve().parent.name, taken)
+        # A folder's telemetry bears the folder's name, or is the only one lying in it.
+        here = [t for t in by_kind["telemetry"] if t.parent == place]
+        used = {t for s in sources for t in s.telemetry}
+        free = [t for t in here if t not in used and t.suffix.lower() != ".srt"]
+        named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
+        beside = named or (tuple(free) if len(free) == 1 else ())
+        sources.append(Source(name, SourceKind.PHOTOS, photos, beside))
+    if not sources:
+        raise InputError(_nothing_found(folder, ignored), path=folder)
+    used = {t for s in sources for t in s.telemetry}
+    for path in by_kind["telemetry"]:
+        if path not in used and folder.is_dir():
+            ignored.append((path, "telemetry without a video or photo folder of the same name"))
+    ignored.sort()
+    return Sources(tuple(sources), tuple((p.relative_to(root), why) for p, why in ignored))
+
+
+def safe_name(text: str, fallback: str = "sequence") -> str:
+    """Text as a name of A-Z a-z 0-9 . _ - that does not begin with a dot; at most 80 characters."""
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", plain).strip(".-")[:80].rstrip(".-")
+    return plain or fallback
+
+
+def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
+    """Regular files below a folder, sorted; links, hidden and special files go to `ignored`."""
+    count = 0
+
+    def refuse(error: OSError) -> None:
+        ignored.append((Path(error.filename), f"can't be read: {error.strerror}"))
+
+    for place, folders, names in os.walk(folder, onerror=refuse):
+        here = Path(place)
+        for name in sorted(folders):
+            if (here / name).is_symlink():
+                ignored.append((here / name, "link: name the folder that it points to instead"))
+            elif name.startswith("."):
+                ignored.append((here / name, "hidden"))
+            elif len((here / name).relative_to(folder).parts) > _MAX_DEPTH:
+                ignored.append((here / name, f"more than {_MAX_DEPTH} folders deep"))
+            else:
+                continue
+            folders.remove(name)
+        folders.sort()
+        for name in sorted(names):
+            path = here / name
+            count += 1
+            if count > _MAX_FILES:
+                raise InputError(f"holds more than {_MAX_FILES} files", path=folder)
+            if path.is_symlink():
+                ignored.append((path, "link: name the file that it points to instead"))
+            elif not path.is_file():
+                ignored.append((path, "not a regular file"))
+            else:
+                yield path
+
+
+def _siblings(video: Path) -> list[Path]:
+    """Telemetry beside a single file."""
+    return sorted(
+        p
+        for p in video.parent.iterdir()
+        if p.stem.lower() == video.stem.lower()
+        and p.suffix.lower() in TELEMETRY_SUFFIXES
+        and not p.is_symlink()
+    )
+
+
+def _sort(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[str, list[Path]]:
+    kinds: dict[str, list[Path]] = {"video": [], "photo": [], "telemetry": []}
+    for path in files:
+        suffix = path.suffix.lower()
+        if path.name.startswith("._"):
+            ignored.append((path, "macOS metadata"))
+        elif path.name.startswith("."):
+            ignored.append((path, "hidden"))
+        elif suffix in PROXY_SUFFIXES:
+            ignored.append((path, "preview or thumbnail made by the camera"))
+        elif suffix in VIDEO_SUFFIXES:
+            kinds["video"].append(path)
+        elif suffix in PHOTO_SUFFIXES:
+            kinds["photo"].append(path)
+        elif suffix in TELEMETRY_SUFFIXES:
+            kinds["telemetry"].append(path)
+        else:
+            ignored.append((path, "not a video, photo or telemetry file"))
+    return kinds
+
+
+def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
+    if not folder.is_dir():
+        return f"is no video or photo: its name ends in {folder.suffix or 'nothing'}"
+    links = sum(why.startswith("link") for _, why in ignored)
+    found = f"; {len(ignored)} other files are there" if ignored else "; the folder is empty"
+    return "holds no video and no photo" + found + (f", {links} of them links" if links else "")
+
+
+def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:
+    folders: dict[Path, list[Path]] = {}
+    for photo in photos:
+        folders.setdefault(photo.parent, []).append(photo)
+    return {place: tuple(sorted(found)) for place, found in sorted(folders.items())}
+
+
+def _beside(part: Path, telemetry: list[Path]) -> list[Path]:
+    return [t for t in telemetry if t.parent == part.parent and t.stem.lower() == part.stem.lower()]
+
+
+def _unique(stem: str, parent: str, taken: set[str]) -> str:
+    """A safe name that no other sequence has, also where case does not count."""
+    name = safe_name(stem)
+    if name.lower() in taken:
+        name = safe_name(f"{parent}-{stem}")
+    number = 2
+    base = name
+    while name.lower() in taken:
+        name = f"{base}-{number}"
+        number += 1
+    taken.add(name.lower())
+    return name
+
+
+def _group_videos(
+    videos: list[Path], probe: Callable[[Path], VideoInfo] | None, min_split_bytes: int
+) -> list[tuple[Path, ...]]:
+    """Video files, parts of one recording together, in the order of names."""
+    chapters: dict[tuple[Path, str, str], list[tuple[int, Path]]] = {}
+    groups: list[tuple[Path, ...]] = []
+    others: list[Path] = []
+    for path in videos:
+        first, later = _GOPRO_FIRST.fullmatch(path.stem), _GOPRO.fullmatch(path.stem)
+        if first:
+            key, chapter = (path.parent, "GP", first["number"]), 0
+        elif later:
+            key, chapter = (
+                (path.parent, later["head"].upper(), later["number"]),
+                int(later["chapter"]),
+            )
+        else:
+            others.append(path)
+            continue
+        chapters.setdefault(key, []).append((chapter, path))
+    for found in chapters.values():
+        found.sort()
+        runs = _runs(found, lambda a, b: b[0] == a[0] + 1)
+        groups += [tuple(path for _, path in run) for run in runs]
+    others.sort()
+    groups += [
+        tuple(run)
+        for run in _runs(others, lambda a, b: _is_next_dji_part(a, b, probe, min_split_bytes))
+    ]
+    return sorted(groups)
+
+
+def _runs(items: list[_T], joined: Callable[[_T, _T], bool]) -> list[list[_T]]:
+    """Items cut wherever two neighbours are not joined."""
+    runs = [[item] for item in items[:1]]
+    for before, after in pairwise(items):
+        if joined(before, after):
+            runs[-1].append(after)
+        else:
+            runs.append([after])
+    return runs
+
+
+def _is_next_dji_part(
+    before: Path, after: Path, probe: Callable[[Path], VideoInfo] | None, min_split_bytes: int
+) -> bool:
+    a, b = _DJI.fullmatch(before.stem), _DJI.fullmatch(after.stem)
+    if a is None or b is None or before.parent != after.parent:
+        return False
+    if int(b["number"]) != int(a["number"]) + 1 or a["tail"].lower() != b["tail"].lower():
+        return False
+    if before.suffix.lower() != after.suffix.lower() or before.stat().st_size < min_split_bytes:
+        return False
+    if probe is None:
+        from spn_data import video
+
+        probe = video.probe
+    try:
+        first, second = probe(before), probe(after)
+    except InputError:  # it is told when the file is used
+        return False
+    same = (first.width, first.height, first.codec) == (second.width, second.height, second.codec)
+    if not same or abs(first.fps - second.fps) > 0.01 * first.fps:
+        return False
+    if first.created_utc is None or second.created_utc is None:
+        return False
+    later_s = (second.created_utc - first.created_utc).total_seconds()
+    return later_s == 0 or abs(later_s - first.duration_s) <= _CONTIGUOUS_S
