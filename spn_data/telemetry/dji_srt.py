@@ -66,7 +66,7 @@ def telemetry_of_blocks(
         )
     records, notes = _with_times(records, source)
     records, time_notes = _in_order(records, skipped, place)
-    lat_lon, position_notes = _positions(records, skipped)
+    lat_lon, position_notes = _positions(records, place)
     time = np.array([r.time_s for r in records])
     utc = np.array([r.utc_s for r in records])
     abs_alt = np.array([r.abs_alt_m for r in records])
@@ -176,7 +176,7 @@ def _increasing(times: Sequence[float]) -> tuple[list[bool], int | None]:
     return keep, None
 
 
-def _positions(records: list[SrtRecord], skipped: Skipped) -> tuple[np.ndarray, list[str]]:
+def _positions(records: list[SrtRecord], place: str) -> tuple[np.ndarray, list[str]]:
     """(N, 2) latitude, longitude, NaN without a fix, and how an order was decided."""
     pairs = [p for r in records for p in (r.pair, r.home_pair) if p is not None]
     # A latitude is at most 90 degrees: one larger value tells the order of the whole file.
@@ -192,14 +192,17 @@ def _positions(records: list[SrtRecord], skipped: Skipped) -> tuple[np.ndarray, 
             "the numbers fit both orders"
         )
     lat_lon = np.full((len(records), 2), np.nan)
+    impossible: list[str] = []
     for i, record in enumerate(records):
         lat, lon = record.lat_lon_deg or (NAN, NAN)
         if record.pair is not None:
             lat, lon = record.pair[::-1] if lon_first else record.pair
         if abs(lat) > 90 or abs(lon) > 180:
-            skipped.append((record.line, f"{lat}, {lon} is no position on Earth (height kept)"))
+            impossible.append(f"{lat}, {lon} at {place} {record.line}")
         elif lat != 0 or lon != 0:  # 0, 0 is how DJI says that there is no fix
             lat_lon[i] = (lat, lon) if np.isfinite(lat + lon) else NAN
+    if impossible:
+        notes.append(f"positions not on Earth: {len(impossible)}, the first {impossible[0]}")
     return lat_lon, notes
 
 
@@ -210,7 +213,7 @@ def _rate_notes(time_s: np.ndarray, lat_lon: np.ndarray, utc_s: np.ndarray) -> l
     if not fixed.any():
         notes.append("no record has a position fix")
     elif (step_m := coordinate_step_m(lat_lon)) > 0.5:
-        notes.append(f"the coordinates are rounded to steps of {step_m:.2g} m")
+        notes.append(f"the coordinates are rounded to steps of {step_m:.0f} m")
     if fixed.sum() > 10:
         span_s = time_s[fixed][-1] - time_s[fixed][0]
         changes = np.count_nonzero(np.any(np.diff(lat_lon[fixed], axis=0) != 0, axis=1))

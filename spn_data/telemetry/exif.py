@@ -82,7 +82,7 @@ def read_photo(path: Path | str) -> PhotoMetadata:
                     f"is larger than the {MAX_PHOTO_BYTES / 1e9:.0f} GB that a photo may have",
                     path=path,
                 )
-            with Image.open(path, formats=("JPEG", "MPO", "PNG", "TIFF")) as image:
+            with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
                 width, height = image.size
                 main, exif, gps = exif_tags(image, notes)
                 xmp = xmp_properties(image, notes)

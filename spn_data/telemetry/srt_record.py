@@ -18,7 +18,7 @@ _FIELD = re.compile(
     r"|difftime)\s*[:(]\s*([^\s\],;()<>]*)",
     re.IGNORECASE,
 )
-_HEIGHT = re.compile(r"(?<![\w.])H\s*[ =:]\s*([^\s,;]+)")
+_HEIGHT = re.compile(r"(?<![\w.])H\s?[ =:]\s?([-+]?[\d.]+)\s?m(?![\w/])")
 _POSITION = re.compile(r"(?<![\w.])(GPS|RTK|HOME)\s*\(([^()]{0,120})\)", re.IGNORECASE)
 _GIMBAL = re.compile(r"(?<![\w.])G\.PRY\s*\(([^()]{0,120})\)", re.IGNORECASE)
 # U+FFFD: a degree sign that was not written as UTF-8.
@@ -31,7 +31,7 @@ _LETTER = re.compile(r"([NSEW])\s*:\s*(.*)", re.IGNORECASE)
 class SrtRecord:
     """What one record says; NaN or None for what it does not."""
 
-    line: int  # where it begins in the file
+    line: int  # of its times, or else its first, in the file
     time_s: float  # start in the video
     utc_s: float  # the drone's clock, as if it were UTC
     diff_s: float  # since the record before

@@ -1,0 +1,261 @@
+"""EXIF and XMP of photos: real ones, photos of our own with known tags, and damaged ones."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import piexif
+import pytest
+from PIL import Image, PngImagePlugin
+
+from spn_data.errors import InputError
+from spn_data.geodesy import HeightReference
+from spn_data.telemetry.exif import PhotoMetadata, read_photo, telemetry_of_photos
+from spn_data.telemetry.track import summarize
+
+NAN = float("nan")
+XMP = (
+    "<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:RDF "
+    "xmlns:rdf='http://www.w3.org/1999/02/22-rdf-syntax-ns#'>"
+    "<rdf:Description xmlns:d='http://www.dji.com/drone-dji/1.0/' {}/></rdf:RDF></x:xmpmeta>"
+)
+GPS = {
+    piexif.GPSIFD.GPSLatitudeRef: "S",
+    piexif.GPSIFD.GPSLatitude: ((33, 1), (30, 1), (36, 1)),  # 33.51
+    piexif.GPSIFD.GPSLongitudeRef: "W",
+    piexif.GPSIFD.GPSLongitude: ((70, 1), (15, 1), (3600, 100)),  # 70.26
+    piexif.GPSIFD.GPSAltitudeRef: 0,
+    piexif.GPSIFD.GPSAltitude: (1234, 10),
+}
+
+
+def jpeg(path, *, gps=None, exif=None, main=None, xmp=None, size=(40, 30)):
+    tags = {"0th": main or {}, "Exif": exif or {}, "GPS": GPS if gps is None else gps}
+    more = (
+        {} if xmp is None else {"xmp": xmp if isinstance(xmp, bytes) else XMP.format(xmp).encode()}
+    )
+    Image.new("RGB", size).save(path, "JPEG", exif=piexif.dump(tags), **more)
+    return path
+
+
+def test_real_photo_of_the_first_pass(shared_data):
+    """A DJI photo without XMP gives its position, lens and the negative altitude as it stands."""
+    photo = read_photo(shared_data / "photos-two-passes" / "DJI_0054.JPG")
+    assert (photo.width, photo.height, photo.orientation) == (800, 600, 1)
+    assert (photo.make, photo.model) == ("DJI", "FC300S")  # padded with zero bytes in the file
+    assert (photo.focal_mm, photo.focal_35mm) == (3.61, 20.0)
+    assert photo.lat_deg == pytest.approx(28 + 2 / 60 + 28.5116 / 3600, abs=1e-12)
+    assert photo.lon_deg == pytest.approx(-(82 + 41 / 60 + 54.5072 / 3600), abs=1e-12)
+    assert photo.altitude_m == -5.677
+    assert photo.local_s == 1525003606.0  # 2018-04-29 12:06:46 as if it were UTC
+    assert math.isnan(photo.utc_s)
+    assert math.isnan(photo.relative_altitude_m)
+    assert photo.notes == ()
+
+
+def test_real_photo_with_xmp(shared_data):
+    """DJI's XMP gives height above take-off and the gimbal, which looks straight down."""
+    photo = read_photo(shared_data / "photos-dji-xmp" / "DJI_0018.JPG")
+    assert photo.relative_altitude_m == 39.8
+    assert photo.gimbal_deg == (45.0, -89.9, 0.0)
+    assert photo.altitude_m == pytest.approx(198.309, abs=1e-3)
+    assert photo.altitude_reference is HeightReference.UNKNOWN
+
+
+def test_two_passes_are_one_track_with_a_pause(shared_data):
+    """All 172 photos have a fix, and the pause between the passes is the only gap."""
+    paths = sorted((shared_data / "photos-two-passes").glob("*.JPG"))
+    t = telemetry_of_photos([read_photo(path) for path in paths], source="photos")
+    summary = summarize(t)
+    assert (summary.records, summary.with_fix, summary.gaps) == (172, 172, ((494.0, 766.0),))
+    assert t.time_s[0] == 0.0
+    assert t.utc_is_local
+    assert t.abs_reference is HeightReference.UNKNOWN
+    assert (t.abs_alt_m.min(), t.abs_alt_m.max()) == (-6.886, -5.277)
+    assert any("-6.9 m, below sea level" in note for note in t.notes)
+
+
+def test_hemispheres_and_clock_with_zone(tmp_path):
+    """South and west are negative; an offset tells UTC; fractions of a second count."""
+    exif = {
+        piexif.ExifIFD.DateTimeOriginal: "2024:05:01 12:00:00",
+        piexif.ExifIFD.SubSecTimeOriginal: "250",
+        piexif.ExifIFD.OffsetTimeOriginal: "+02:00",
+    }
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif=exif))
+    assert (photo.lat_deg, photo.lon_deg) == pytest.approx((-33.51, -70.26), abs=1e-9)
+    assert photo.local_s == 1714564800.25
+    assert photo.utc_s == 1714564800.25 - 7200
+    assert photo.altitude_m == 123.4
+    t = telemetry_of_photos([photo])
+    assert not t.utc_is_local
+    assert t.utc_s[0] == photo.utc_s
+
+
+@pytest.mark.parametrize(
+    ("code", "altitude_m", "reference"),
+    [
+        (0, 123.4, HeightReference.UNKNOWN),
+        (1, -123.4, HeightReference.UNKNOWN),
+        (2, 123.4, HeightReference.AMSL),
+        (3, -123.4, HeightReference.AMSL),
+    ],
+)
+def test_altitude_reference(tmp_path, code, altitude_m, reference):
+    """Odd codes are below zero; only the codes that came with EXIF 3 say sea level for sure."""
+    photo = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | {piexif.GPSIFD.GPSAltitudeRef: code}))
+    assert (photo.altitude_m, photo.altitude_reference) == (altitude_m, reference)
+
+
+@pytest.mark.parametrize(
+    ("gps", "xmp", "sigma_m"),
+    [
+        ({}, "d:RtkFlag='50' d:RtkStdLon='0.012' d:RtkStdLat='0.014' d:RtkStdHgt='0.025'",
+         (0.012, 0.014, 0.025)),
+        ({}, "d:RtkFlag='0' d:RtkStdLon='0.012' d:RtkStdLat='0.014' d:RtkStdHgt='0.025'", (NAN, NAN, NAN)),
+        ({}, "d:RtkStdLon='0.0' d:RtkStdLat='0.014' d:RtkStdHgt='0.025'", (NAN, NAN, NAN)),
+        ({}, "xmlns:c='http://pix4d.com/camera/1.0' c:GPSXYAccuracy='0.5' c:GPSZAccuracy='0.9'",
+         (0.5, 0.5, 0.9)),
+        ({piexif.GPSIFD.GPSHPositioningError: (15, 10)}, "", (1.5, 1.5, NAN)),
+        ({piexif.GPSIFD.GPSDOP: (2, 1), piexif.GPSIFD.GPSMeasureMode: "2"}, "", (2.8284, 2.8284, 4.2426)),
+        ({piexif.GPSIFD.GPSDOP: (2, 1), piexif.GPSIFD.GPSMeasureMode: "3"}, "", (1.9403, 1.9403, 2.9104)),
+        ({}, "", (NAN, NAN, NAN)),
+    ],
+)  # fmt: skip
+def test_stated_accuracy(tmp_path, gps, xmp, sigma_m):
+    """RTK deviations, accuracies and dilutions (of 2 m range error) become sigma; silence stays NaN."""
+    photo = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | gps, xmp=xmp))
+    np.testing.assert_allclose(photo.sigma_m, sigma_m, rtol=1e-4, equal_nan=True)
+
+
+def test_xmp_position_serves_where_exif_has_none(tmp_path):
+    """Without EXIF position XMP's counts, also under its misspelt name; with one, EXIF's counts."""
+    xmp = "d:GpsLatitude='-33.5' d:GpsLongtitude='+70.5' d:AbsoluteAltitude='+88.5' d:AltitudeType='RtkAlt'"
+    photo = read_photo(jpeg(tmp_path / "a.jpg", gps={}, xmp=xmp))
+    assert (photo.lat_deg, photo.lon_deg, photo.altitude_m) == (-33.5, 70.5, 88.5)
+    assert photo.altitude_reference is HeightReference.UNKNOWN
+    assert any("RtkAlt" in note for note in telemetry_of_photos([photo]).notes)
+    assert read_photo(jpeg(tmp_path / "b.jpg", xmp=xmp)).lat_deg == pytest.approx(-33.51, abs=1e-9)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_other_formats_carry_the_same_tags(tmp_path, suffix):
+    """PNG and TIFF give position and XMP like JPEG."""
+    path = tmp_path / f"a.{suffix}"
+    image = Image.new("RGB", (40, 30))
+    exif = Image.Exif()
+    exif[0x8825] = {1: "N", 2: (50.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0)}
+    xmp = XMP.format("d:RelativeAltitude='+39.80'")
+    if suffix == "png":
+        info = PngImagePlugin.PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", xmp)
+        image.save(path, exif=exif, pnginfo=info)
+    else:
+        exif[700] = xmp.encode()
+        image.save(path, exif=exif)
+    photo = read_photo(path)
+    assert (photo.lat_deg, photo.lon_deg) == (50.5, 8.25)
+    assert photo.relative_altitude_m == 39.8
+
+
+def photo(name, **values) -> PhotoMetadata:
+    return PhotoMetadata(Path(name), 10, 10, **values)
+
+
+@pytest.mark.parametrize(
+    ("times", "expected", "words"),
+    [
+        ([10.0, 10.0, 12.5], [0.0, 0.0, 2.5], ""),
+        ([10.0, NAN, 12.0], [0.0, 1.0, 2.0], "1 photos have no time, the first b.jpg"),
+        ([10.0, 14.0, 12.0], [0.0, 1.0, 2.0], "c.jpg was taken before the photo ahead of it"),
+    ],
+)
+def test_photo_times(times, expected, words):
+    """Times count from the first photo; missing or decreasing ones are replaced, and it is said."""
+    photos = [photo(n, local_s=t) for n, t in zip(("a.jpg", "b.jpg", "c.jpg"), times, strict=True)]
+    t = telemetry_of_photos(photos)
+    np.testing.assert_allclose(t.time_s, expected)
+    assert [words in note for note in t.notes] == ([True] if words else [])
+
+
+def test_no_photos_are_no_records():
+    """No photos give telemetry without records."""
+    assert len(telemetry_of_photos([])) == 0
+
+
+def test_mixed_references_are_unknown():
+    """Photos whose altitudes have different references have none in common."""
+    both = [
+        photo("a", altitude_m=1.0, altitude_reference=HeightReference.AMSL),
+        photo("b", altitude_m=1.0),
+    ]
+    assert telemetry_of_photos(both).abs_reference is HeightReference.UNKNOWN
+    assert telemetry_of_photos(both[:1] * 2).abs_reference is HeightReference.AMSL
+
+
+@pytest.mark.parametrize(
+    ("gps", "xmp", "words"),
+    [
+        ({}, b"<x:xmpmeta", "damaged XMP"),
+        ({}, b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "damaged XMP"),
+        ({piexif.GPSIFD.GPSLatitude: ((99, 1), (0, 1), (0, 1))}, None, "no position on Earth"),
+        ({piexif.GPSIFD.GPSLatitude: ((9, 0), (0, 1), (0, 1))}, None, ""),
+        ({piexif.GPSIFD.GPSLatitudeRef: "?"}, None, ""),
+        ({piexif.GPSIFD.GPSLatitude: ((0, 1),) * 3, piexif.GPSIFD.GPSLongitude: ((0, 1),) * 3}, None, ""),
+    ],
+)  # fmt: skip
+def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
+    """Damaged tags make no number up and do not stop the photo from being used."""
+    found = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | gps, xmp=xmp))
+    assert found.width == 40
+    assert math.isnan(found.lat_deg) == bool(gps)
+    assert [words in note for note in found.notes] == ([True] if words else [])
+
+
+def test_unset_clock_and_strange_orientation(tmp_path):
+    """A clock that was never set is no time, and an orientation that does not exist is 1."""
+    exif = {piexif.ExifIFD.DateTimeOriginal: "0000:00:00 00:00:00"}
+    found = read_photo(jpeg(tmp_path / "a.jpg", exif=exif, main={piexif.ImageIFD.Orientation: 77}))
+    assert math.isnan(found.local_s)
+    assert found.orientation == 1
+    turned = jpeg(tmp_path / "b.jpg", main={piexif.ImageIFD.Orientation: 6})
+    assert (read_photo(turned).orientation, read_photo(turned).width) == (6, 40)
+
+
+def test_what_is_no_photo_is_refused(tmp_path):
+    """Text under a photo's name, an empty file and a missing one each give one line with the path."""
+    (tmp_path / "a.jpg").write_text("no photo")
+    (tmp_path / "b.jpg").write_bytes(b"")
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        with pytest.raises(InputError, match=f"{name}: cannot be read as a photo") as error:
+            read_photo(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_every_cut_and_flip_of_a_photo_is_survived(tmp_path, shared_data):
+    """Cut short or with damaged bytes, a photo is read or refused, and never breaks the reader."""
+    whole = (shared_data / "photos-dji-xmp" / "DJI_0018.JPG").read_bytes()[:30_000]
+    rng = np.random.default_rng(3)
+    path = tmp_path / "a.jpg"
+    read = 0
+    for trial in range(150):
+        data = bytearray(whole[: int(rng.integers(1, len(whole)))] if trial % 3 == 0 else whole)
+        for position in rng.integers(0, min(len(data), 5000), 30 if trial % 3 else 0):
+            data[position] = int(rng.integers(256))
+        path.write_bytes(bytes(data))
+        with contextlib.suppress(InputError):
+            read_photo(path)
+            read += 1
+    assert read > 10
+
+
+def test_a_large_photo_is_not_decoded(tmp_path):
+    """A photo of 120 million pixels is read without a warning, from its header alone."""
+    buffer = io.BytesIO()
+    Image.new("1", (12_000, 10_000)).save(buffer, "PNG")
+    (tmp_path / "a.png").write_bytes(buffer.getvalue()[:2000])
+    assert read_photo(tmp_path / "a.png").width == 12_000
