@@ -14,7 +14,7 @@ from spn_data.errors import InputError
 from spn_data.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
 from spn_data.telemetry.csv_columns import COLUMNS, Column, columns_of
-from spn_data.telemetry.textfile import read_text
+from spn_data.telemetry.textfile import MAX_RECORDS, read_text
 from spn_data.telemetry.track import Telemetry, increasing
 
 MAX_DAMAGED_FRACTION = 0.05  # of the rows, above which the log as a whole is not believed
@@ -39,13 +39,15 @@ def read_csv_log(path: Path | str) -> Telemetry:
     Up to 5 % damaged rows are left out and counted in the notes.
     """
     rows = _rows(read_text(path), path)
-    header_line, header = next(rows)
+    header_line, header = next(rows, (1, []))
     columns = _understood(header, header_line, path)
     records: list[dict[str, float]] = []
     damaged: list[tuple[int, str]] = []
     zoneless = False
     references: set[str] = set()
     for line, row in rows:
+        if len(records) == MAX_RECORDS:
+            raise InputError(f"has more than {MAX_RECORDS:,} rows", path=path, line=line)
         try:
             record, without_zone = _record(row, columns, len(header))
         except ValueError as error:
@@ -148,10 +150,10 @@ def _understood(header: list[str], line: int, path: Path | str) -> dict[str, Col
     if "time" not in columns and "utc" not in columns:
         missing.insert(0, "time")
     if missing:
-        names = {"time": ("time_s", "datetime"), **{n: COLUMNS[n][:2] for n in missing[-2:]}}
+        names = {n: COLUMNS[n][:2] for n in missing} | {"time": ("time_s", "datetime")}
         expected = ", ".join(" or ".join(names[n]) for n in missing)
         raise InputError(
-            f"has no column for {' and '.join(missing)}: found {', '.join(header)[:300]}; "
+            f"has no column for {' and '.join(missing)}: found {', '.join(header)[:300] or 'none'}; "
             f"expected {expected} (see docs/telemetry.md)",
             path=path,
             line=line,

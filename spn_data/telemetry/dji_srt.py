@@ -15,7 +15,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.telemetry.srt_record import NAN, SrtRecord, parse_record
-from spn_data.telemetry.textfile import read_text
+from spn_data.telemetry.textfile import MAX_RECORDS, read_text
 from spn_data.telemetry.track import Telemetry, coordinate_step_m
 
 _TIMES = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})[,.](\d{1,6})\s*-->")
@@ -48,6 +48,8 @@ def telemetry_of_blocks(
     records: list[SrtRecord] = []
     skipped: Skipped = []
     for line, time_s, body in blocks:
+        if len(records) == MAX_RECORDS:
+            raise InputError(f"has more than {MAX_RECORDS:,} records", path=source)
         try:
             record = parse_record(line, time_s, body)
         except ValueError as error:

@@ -27,7 +27,7 @@ _UNKNOWN = {"", "n/a", "na", "nan", "null", "none", "-", "--"}
 _LETTER = re.compile(r"([NSEW])\s*:\s*(.*)", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SrtRecord:
     """What one record says; NaN or None for what it does not."""
 

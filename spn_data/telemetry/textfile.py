@@ -9,6 +9,8 @@ from spn_data.errors import InputError
 
 # A 60 Hz subtitle file takes 1 MB a minute: an hour of flight is far below this.
 MAX_TEXT_BYTES = 200_000_000
+# Four and a half hours at 60 Hz; a file of tiny records could otherwise fill the memory.
+MAX_RECORDS = 1_000_000
 
 
 def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
