@@ -2,6 +2,7 @@
 
 from spn_data.georegister.crossval import HeldOut
 from spn_data.georegister.observe import align_telemetry
+from spn_data.georegister.offset import OffsetOptions, TimeOffset, estimate_time_offset
 from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.georegister.register import georegister
 from spn_data.georegister.result import FitSummary, GeoFit
@@ -14,8 +15,11 @@ __all__ = [
     "GeoregisterOptions",
     "Heights",
     "HeldOut",
+    "OffsetOptions",
+    "TimeOffset",
     "Uncertainty",
     "align_telemetry",
+    "estimate_time_offset",
     "georegister",
     "georegistration_errors",
 ]

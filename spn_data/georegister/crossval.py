@@ -8,7 +8,7 @@ import numpy as np
 
 from spn_data.georegister.fit import Estimate
 from spn_data.georegister.noise import solve
-from spn_data.georegister.problem import Problem
+from spn_data.georegister.problem import Kind, Problem
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def cross_validate(
     horizontal, vertical, folds = [], [], 0
     fixes = problem.fixes
     known = fixes.has_fix & inlier
-    table = np.ones((6, len(problem.model)))
+    table = np.ones((len(Kind), len(problem.model)))
     table[problem.kind, problem.frame] = result.weights
     for k in np.unique(fold[known]):
         left_out = fold == k

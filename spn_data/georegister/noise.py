@@ -23,7 +23,7 @@ class Chains:
     group : (M,) index of the noise level; unit : (M,) sigma that the group's factors multiply, in the
     observation's unit; twin : (M,) index of the set whose members are outliers together;
     precision : (2, M) tridiagonal inverse covariance of the unit-variance processes (row 0 above the
-    diagonal, as scipy has it); log_det : of their covariance.
+    diagonal, as scipy has it); log_innovation : (M,) logarithm of their variance given what came before.
     """
 
     group: np.ndarray
@@ -31,7 +31,7 @@ class Chains:
     twin: np.ndarray
     twin_sizes: np.ndarray
     precision: np.ndarray
-    log_det: float
+    log_innovation: np.ndarray
 
     @classmethod
     def build(
@@ -49,17 +49,26 @@ class Chains:
         same = chain[1:] == chain[:-1]
         steps = np.maximum(np.diff(time_s) / correlation_s[1:], _MIN_STEP)
         rho = np.where(same, np.exp(-steps), 0.0)
-        innovation = -np.expm1(-2 * steps)
-        innovation = np.where(same, innovation, 1.0)
+        innovation = np.ones(len(order))
+        innovation[1:] = np.where(same, -np.expm1(-2 * steps), 1.0)
         precision = np.zeros((2, len(order)))
-        precision[1] = 1.0
-        precision[1, :-1] += rho**2 / innovation
-        precision[1, 1:] += 1 / innovation - 1
-        precision[0, 1:] = -rho / innovation
+        precision[1] = 1 / innovation
+        precision[1, :-1] += rho**2 / innovation[1:]
+        precision[0, 1:] = -rho / innovation[1:]
         _, twin = np.unique(twin[order], return_inverse=True)
         sizes = np.bincount(twin) if len(twin) else np.zeros(0, dtype=np.int64)
-        log_det = float(np.log(innovation).sum())
-        return cls(group[order], unit[order], twin, sizes, precision, log_det), order
+        return cls(group[order], unit[order], twin, sizes, precision, np.log(innovation)), order
+
+    def part(self, mask: np.ndarray) -> Chains:
+        """Some whole chains, by a mask (M,) of their observations; twins keep their numbers."""
+        return replace(
+            self,
+            group=self.group[mask],
+            unit=self.unit[mask],
+            twin=self.twin[mask],
+            precision=self.precision[:, mask],
+            log_innovation=self.log_innovation[mask],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +94,14 @@ class Levels:
             np.log(bias), np.log(white), np.log(bias), bias_spread, np.log(white), white_spread
         )
 
+    def moved(self, name: str, group: int, delta: float) -> Levels:
+        """The same levels with one of `log_bias` or `log_white` changed."""
+        values = getattr(self, name).copy()
+        values[group] += delta
+        return replace(self, **{name: values})
+
     def log_prior(self) -> float:
+        """Logarithm of the density of the free levels, up to a constant."""
         total = 0.0
         for value, center, spread in (
             (self.log_bias, self.bias_center, self.bias_spread),
@@ -99,8 +115,8 @@ class Levels:
         """The same levels with lower limits (G,) of the factors."""
         return replace(
             self,
-            log_bias=np.maximum(self.log_bias, np.log(bias)),
-            log_white=np.maximum(self.log_white, np.log(white)),
+            log_bias=np.log(np.maximum(np.exp(self.log_bias), bias)),
+            log_white=np.log(np.maximum(np.exp(self.log_white), white)),
         )
 
 
@@ -118,7 +134,7 @@ def inverse_times(
     factor = cholesky_banded(banded, check_finite=False)
     scaled = columns / white_var[:, None]
     smooth = cho_solve_banded((factor, False), amplitude[:, None] * scaled, check_finite=False)
-    log_det = np.log(white_var).sum() + 2 * np.log(factor[1]).sum() + chains.log_det
+    log_det = np.log(white_var).sum() + 2 * np.log(factor[1]).sum() + chains.log_innovation.sum()
     return scaled - (amplitude / white_var)[:, None] * smooth, float(log_det)
 
 
@@ -142,28 +158,39 @@ class Solution:
     step: np.ndarray
     information: np.ndarray
     white: np.ndarray
-    log_likelihood: float  # restricted: parameters integrated out
 
 
-def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> Solution:
-    """Generalised least squares, and the restricted likelihood of the noise levels (Harville 1977)."""
-    columns = np.column_stack([linear.jacobian, linear.residual])
-    inverse, log_det = inverse_times(chains, levels, weights, columns)
-    information = linear.jacobian.T @ inverse[:, :-1] + np.diag(linear.prior_precision)
-    information = (information + information.T) / 2
-    gradient = linear.jacobian.T @ inverse[:, -1] - linear.prior_precision * linear.value
+def _normal(matrix: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, float]:
+    """Information (P, P), gradient (P,) and squared residual of observations and prior together.
+
+    matrix : (P + 1, P + 1) products of (jacobian, residual) under the inverse covariance.
+    """
+    pull = linear.prior_precision * linear.value
+    information = matrix[:-1, :-1] + np.diag(linear.prior_precision)
+    return (
+        (information + information.T) / 2,
+        matrix[:-1, -1] - pull,
+        float(matrix[-1, -1] + linear.value @ pull),
+    )
+
+
+def _step(information: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
+    """Least-squares step (P,) and the information's log determinant."""
     # Parameters of very different units: the scaling keeps the factorisation well conditioned.
     size = 1 / np.sqrt(np.diag(information))
     scaled = information * size[:, None] * size
     step = size * np.linalg.solve(scaled, size * gradient)
-    quadratic = linear.residual @ inverse[:, -1] + linear.value @ (
-        linear.prior_precision * linear.value
-    )
-    log_det_information = np.linalg.slogdet(scaled)[1] - 2 * np.log(size).sum()
-    likelihood = -0.5 * (log_det + log_det_information + quadratic - gradient @ step)
+    return step, float(np.linalg.slogdet(scaled)[1] - 2 * np.log(size).sum())
+
+
+def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> Solution:
+    """Generalised least squares under the chains' covariance."""
+    columns = np.column_stack([linear.jacobian, linear.residual])
+    inverse, _ = inverse_times(chains, levels, weights, columns)
+    information, gradient, _ = _normal(columns.T @ inverse, linear)
+    step, _ = _step(information, gradient)
     white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
-    white = white_var * (inverse[:, -1] - inverse[:, :-1] @ step)
-    return Solution(step, information, white, float(likelihood))
+    return Solution(step, information, white_var * (inverse[:, -1] - inverse[:, :-1] @ step))
 
 
 def student_weights(
@@ -180,31 +207,64 @@ def student_weights(
     return weights[chains.twin], distance[chains.twin]
 
 
+def robust_cost(
+    chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray, freedom: float = 4.0
+) -> float:
+    """Half of -2 log likelihood of residuals (M,) with Student t white noise, at its weights (M,).
+
+    The bias is at its most probable course rather than integrated out: good for comparing fits of one flight.
+    """
+    inverse, _ = inverse_times(chains, levels, weights, residual[:, None])
+    sigma = np.exp(levels.log_white)[chains.group] * chains.unit
+    white = sigma**2 / weights * inverse[:, 0]
+    bias_cost = residual @ inverse[:, 0] - (weights * (white / sigma) ** 2).sum()
+    square = np.bincount(chains.twin, (white / sigma) ** 2, minlength=len(chains.twin_sizes))
+    tails = ((freedom + chains.twin_sizes) * np.log1p(square / freedom)).sum()
+    _, log_det = inverse_times(chains, levels, np.ones_like(weights), residual[:, None])
+    return 0.5 * float(bias_cost + tails + log_det)
+
+
 def improve_levels(
     chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear, *, max_step: float = 0.7
 ) -> Levels:
-    """One Newton step of each free level towards the most probable one (restricted likelihood and prior).
+    """One Newton step of each free level towards the most probable one.
 
+    Probability is the restricted likelihood (Harville 1977: parameters integrated out) times the prior.
     Every step is a smooth function of its input, so that rounding in the observations stays rounding.
     """
+    columns = np.column_stack([linear.jacobian, linear.residual])
+    groups = [g for g in range(len(levels.log_bias)) if (chains.group == g).any()]
+    rows = {g: chains.group == g for g in groups}
+    parts = {g: chains.part(rows[g]) for g in groups}
+
+    def products(g: int, candidate: Levels) -> tuple[np.ndarray, float]:
+        mine = columns[rows[g]]
+        inverse, log_det = inverse_times(parts[g], candidate, weights[rows[g]], mine)
+        return mine.T @ inverse, log_det
+
+    # Groups have chains of their own: only that whose level moves is computed anew.
+    current = {g: products(g, levels) for g in groups}
+
+    def objective(g: int, candidate: Levels, own: tuple[np.ndarray, float]) -> float:
+        all_products = [own if k == g else current[k] for k in groups]
+        matrix = np.sum(np.stack([p[0] for p in all_products]), axis=0)
+        information, gradient, quadratic = _normal(matrix, linear)
+        step, log_det = _step(information, gradient)
+        log_det += sum(p[1] for p in all_products)
+        return -0.5 * (log_det + quadratic - gradient @ step) + candidate.log_prior()
+
     h = 0.1
-
-    def objective(candidate: Levels) -> float:
-        return solve(chains, candidate, weights, linear).log_likelihood + candidate.log_prior()
-
-    present = np.bincount(chains.group, minlength=len(levels.log_bias)) > 0
     for name, spread in (("log_white", levels.white_spread), ("log_bias", levels.bias_spread)):
-        for g in np.flatnonzero(present & (spread > 0)):
+        for g in (g for g in groups if spread[g] > 0):
             values = []
             for delta in (-h, 0.0, h):
-                moved = getattr(levels, name).copy()
-                moved[g] += delta
-                values.append(objective(replace(levels, **{name: moved})))
+                candidate = levels.moved(name, g, delta)
+                own = products(g, candidate) if delta else current[g]
+                values.append(objective(g, candidate, own))
             slope = (values[2] - values[0]) / (2 * h)
-            curvature = (values[2] - 2 * values[1] + values[0]) / h**2
+            curvature = -(values[2] - 2 * values[1] + values[0]) / h**2
             # Where the likelihood is not concave the prior's curvature sets the step.
-            curvature = max(-curvature, 1 / spread[g] ** 2)
-            moved = getattr(levels, name).copy()
-            moved[g] += np.clip(slope / curvature, -max_step, max_step)
-            levels = replace(levels, **{name: moved})
+            curvature = max(curvature, 1 / spread[g] ** 2)
+            levels = levels.moved(name, g, float(np.clip(slope / curvature, -max_step, max_step)))
+            current[g] = products(g, levels)
     return levels

@@ -27,13 +27,15 @@ class Fixes:
     """Observations of N frames in the local frame of `origin`.
 
     enu_m : (N, 3) NaN where unknown (up apart from east and north); sigma_m : (N, 3); up_cam : (N, 3) unit
-    direction of up in camera axes by the gimbal, NaN where unknown; flight : (N,) index into `flights`;
+    direction of up in camera axes by the gimbal, NaN where unknown; attitude : (N, 3, 3) cam_from_world by
+    the gimbal, heading included, NaN where it is not to be used; flight : (N,) index into `flights`;
     time_s : (N,) within the flight; relative : (F,) bool, the flight's heights are above its take-off.
     """
 
     enu_m: np.ndarray
     sigma_m: np.ndarray
     up_cam: np.ndarray
+    attitude: np.ndarray
     flight: np.ndarray
     flights: tuple[str, ...]
     time_s: np.ndarray
@@ -59,6 +61,7 @@ class Fixes:
             self,
             enu_m=np.where(mask[:, None], self.enu_m, np.nan),
             up_cam=np.where(mask[:, None], self.up_cam, np.nan),
+            attitude=np.where(mask[:, None, None], self.attitude, np.nan),
         )
 
 
@@ -192,6 +195,7 @@ def observe(
         enu,
         _sigma(telemetry, options),
         up_cam,
+        np.full((n, 3, 3), np.nan),
         flight,
         flights,
         np.where(np.isfinite(time_s), time_s, 0.0),

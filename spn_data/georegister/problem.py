@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.georegister.noise import Chains, Levels, Linear
 from spn_data.georegister.observe import Fixes
 from spn_data.georegister.options import GeoregisterOptions
-from spn_data.pose import Similarity, rotations_from_vectors
+from spn_data.pose import Similarity, quats_from_rotations, rotations_from_vectors
 
 SHARED = 7  # parameters: centre (3), rotation vector in the world (3), logarithm of scale
 _FREE_HEIGHT_M = 1e3  # sigma of a vertical offset that nothing is known of
@@ -25,6 +25,7 @@ class Kind(IntEnum):
     PITCH = 3  # rotation in degrees about the image's right
     ROLL = 4  # about what is across both that and up
     LEVEL = 5  # of the image's right above the horizon
+    HEADING = 6  # rotation in degrees about up
 
 
 # Noise levels: (bias, spread of its logarithm, white, spread of its logarithm), in the observation's sigma.
@@ -37,16 +38,19 @@ _TABLE = [
     (0.4, 1.0, 0.8, 0.6),  # vertical, differential
     (0.05, 0.7, 0.15, 0.8),  # gimbal
     (0.1, 0.0, 1.0, 0.0),  # level camera
+    (5.0, 0.0, 0.2, 0.8),  # heading of the gimbal, in degrees
 ]
-_HORIZONTAL, _VERTICAL, _RTK, _GIMBAL, _LEVEL = 0, 1, 2, 4, 5
+_HORIZONTAL, _VERTICAL, _RTK, _GIMBAL, _LEVEL, _HEADING = 0, 1, 2, 4, 5, 6
+# A compass is off by degrees for as long as a flight lasts, and changes slowly.
+_HEADING_TIME_S = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
 class State:
     """Current values: ``x_world = scale * rotation @ x_model + center`` on centred model coordinates.
 
-    offsets_m : (F,) height of each flight's zero above the first's; gimbal_deg : (F, 3) constant error of each
-    flight's gimbal about the camera's axes; level_deg : (F,) mean roll of cameras without gimbal angles.
+    offsets_m : (F,) height of each flight's zero above the first's; gimbal_deg : (F, 3) constant error
+    of each flight's gimbal about the camera's axes; level_deg : (F,) mean roll where no gimbal angles are.
     """
 
     rotation: np.ndarray
@@ -102,7 +106,8 @@ class Problem:
     ) -> Problem:
         """From centred model coordinates; use_level (N,) bool: frames whose roll is taken as about zero."""
         gimbal = np.isfinite(fixes.up_cam).all(axis=1)
-        present = np.stack([*np.isfinite(fixes.enu_m).T, gimbal, gimbal, use_level])
+        heading = np.isfinite(fixes.attitude).all(axis=(1, 2))
+        present = np.stack([*np.isfinite(fixes.enu_m).T, gimbal, gimbal, use_level, heading])
         present[:2] &= fixes.has_fix
         kind, frame = np.nonzero(present)
         rtk = fixes.is_rtk[frame]
@@ -111,10 +116,11 @@ class Problem:
         group = np.where(kind == Kind.UP, _VERTICAL, _HORIZONTAL) + np.where(rtk, _RTK, 0)
         group = np.where(kind >= Kind.PITCH, _GIMBAL, group)
         group = np.where(kind == Kind.LEVEL, _LEVEL, group)
+        group = np.where(kind == Kind.HEADING, _HEADING, group)
         chain = (kind * len(fixes.flights) + fixes.flight[frame]) * 2 + (rtk & (kind <= Kind.UP))
         # East and north, and the gimbal's two angles, are outliers together; a height on its own.
-        twin = np.array([0, 0, 1, 2, 2, 3])[kind] * len(model) + frame
-        tau = np.full(len(kind), options.correlation_time_s)
+        twin = np.array([0, 0, 1, 2, 2, 3, 4])[kind] * len(model) + frame
+        tau = np.where(kind == Kind.HEADING, _HEADING_TIME_S, options.correlation_time_s)
         chains, order = Chains.build(chain, fixes.time_s[frame], tau, group, unit, twin)
         return cls(
             model, cam_from_model, fixes, use_level, options, chains, kind[order], frame[order]
@@ -125,9 +131,9 @@ class Problem:
         return Levels.from_table(_TABLE)
 
     def conservative(self, levels: Levels) -> Levels:
-        """Levels for deciding what the data determine: no trust in fixes that agree by luck or by filtering."""
-        floor_bias = np.array([0.5, 0.5, 0.2, 0.2, 1e-6, 1e-6])
-        floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.05, 1e-6])
+        """Levels for deciding what the data determine: fixes may agree by luck or by filtering."""
+        floor_bias = np.array([0.5, 0.5, 0.2, 0.2, 0.0, 0.0, 0.0])
+        floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.05, 0.0, 0.2])
         return levels.at_least(floor_bias, floor_white)
 
     def start(self, world_from_model: Similarity, inlier: np.ndarray) -> State:
@@ -174,17 +180,17 @@ class Problem:
         return Linear(residual[rows], jacobian[rows], precision, value)
 
     def _all_rows(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (6, N) and their Jacobian (6, N, P), NaN where nothing was observed."""
+        """Residuals (7, N) and their Jacobian (7, N, P), NaN where nothing was observed."""
         n, f = len(self.model), len(self.fixes.flights)
         flight, every = self.fixes.flight, np.arange(n)
-        residual = np.full((6, n), np.nan)
-        jacobian = np.zeros((6, n, SHARED + 5 * f))
+        residual: np.ndarray = np.full((len(Kind), n), np.nan)
+        jacobian: np.ndarray = np.zeros((len(Kind), n, SHARED + 5 * f))
         lever = state.scale * self.model @ state.rotation.T
         residual[:3] = (self.fixes.enu_m - lever - state.center).T
         residual[2] += state.offsets_m[flight]
-        for axis in range(3):
-            jacobian[axis, :, axis] = 1.0
-            jacobian[axis, :, 6] = lever[:, axis]
+        for k in range(3):
+            jacobian[k, :, k] = 1.0
+            jacobian[k, :, 6] = lever[:, k]
         # omega x lever
         x, y, z = lever.T
         jacobian[0, :, 4], jacobian[0, :, 5] = z, -y
@@ -212,10 +218,14 @@ class Problem:
         turned = up[:, 1, None] * cam_from_world[:, 2] - up[:, 2, None] * cam_from_world[:, 1]
         jacobian[Kind.LEVEL, :, 3:6] = np.rad2deg(turned)
         jacobian[Kind.LEVEL, every, SHARED + 4 * f + flight] = 1.0
+
+        if np.isfinite(self.fixes.attitude).any():
+            residual[Kind.HEADING] = _turn_about_up_deg(self.fixes.attitude, cam_from_world)
+            jacobian[Kind.HEADING, :, 5] = np.rad2deg(1.0)
         return residual, jacobian
 
     def residuals(self, state: State) -> np.ndarray:
-        """(6, N) residuals of all kinds; NaN where nothing was observed."""
+        """(7, N) residuals of all kinds; NaN where nothing was observed."""
         residual = self._all_rows(state)[0]
         residual[Kind.LEVEL] = np.where(self.use_level, residual[Kind.LEVEL], np.nan)
         return residual
@@ -249,3 +259,14 @@ def _tilt_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = axis - np.einsum("ni,ni->n", axis, up)[:, None] * up
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(up, first)
+
+
+def _turn_about_up_deg(attitude: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
+    """Degrees (N,) about up by which the world would have to turn for cam_from_world to be the attitude."""
+    known = np.isfinite(attitude).all(axis=(1, 2))
+    turn = np.full(len(attitude), np.nan)
+    quats = quats_from_rotations(attitude[known].transpose(0, 2, 1) @ cam_from_world[known])
+    # The twist about z of a rotation that may tilt a little too.
+    angle = np.rad2deg(2 * np.arctan2(quats[:, 3], quats[:, 0]))
+    turn[known] = (angle + 180.0) % 360.0 - 180.0
+    return turn

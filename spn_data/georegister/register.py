@@ -108,9 +108,9 @@ def _fit_of(
     world_from_model = Similarity(state.scale, state.rotation, state.center) @ centred_from_model
     residuals = problem.residuals(state)
     residuals_m = residuals[:3].T
-    distance = np.zeros((6, len(problem.model)))
+    distance = np.zeros((len(Kind), len(problem.model)))
     distance[problem.kind, problem.frame] = result.distance
-    outlier = (distance[:3] > _OUTLIER_SIGMAS).any(axis=0)
+    outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
     covariance = result.covariance[:7, :7].copy()
     if not fixes.has_heights:
         covariance[2, :] = covariance[:, 2] = 0.0

@@ -121,8 +121,9 @@ def find_start(
 ) -> Start:
     """The sampled similarity with the smallest truncated distances, by RANSAC (Torr & Zisserman 2000, MSAC).
 
-    model : (N, 3) centres; up_model : (3,) direction of up in the model where known. The sigmas are widened
-    up to fourfold where fewer than half of the fixes agree, as long as they stay well below the flight's extent.
+    model : (N, 3) centres; up_model : (3,) direction of up in the model where known. The sigmas are
+    widened up to fourfold where fewer than half of the fixes agree, as long as they stay well below the
+    flight's extent.
     Raises GeometryError where no half of the fixes agrees with any similarity.
     """
     rng = np.random.default_rng(options.seed)

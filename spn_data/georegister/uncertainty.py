@@ -19,10 +19,10 @@ from spn_data.pose import Similarity, rotation_vectors
 class Uncertainty:
     """Twice each value contains the truth in 95 % of cases, if the errors are as assumed.
 
-    horizontal_m : of the area's middle, radius; vertical_m : of its height, infinite where no heights are known;
-    tilt_deg : of the vertical, in any direction; heading_deg : about the vertical; scale : relative;
-    covariance : (7, 7) of the middle (east, north, up in metres), the world's rotation vector (radians)
-    and the logarithm of scale; middle_m : (3,) where the middle lies.
+    horizontal_m : of the area's middle, radius; vertical_m : of its height, infinite where no heights
+    are known; tilt_deg : of the vertical, in any direction; heading_deg : about the vertical; scale :
+    relative; covariance : (7, 7) of the middle (east, north, up in metres), the world's rotation vector
+    (radians) and the logarithm of scale; middle_m : (3,) where the middle lies.
     """
 
     horizontal_m: float
@@ -120,7 +120,7 @@ def _weights_of(part: Problem, problem: Problem, result: Estimate) -> np.ndarray
 
 
 def effective_fixes(problem: Problem, result: Estimate) -> float:
-    """How many independent fixes would determine the middle's place as well (east and north, mean of both)."""
+    """How many independent fixes would determine the middle's east and north as well."""
     counts = []
     for kind in (Kind.EAST, Kind.NORTH):
         mine = problem.kind == kind

@@ -1,0 +1,273 @@
+"""The offset between a flight's telemetry and its video, from the model's own motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spn_data.errors import GeometryError
+from spn_data.georegister.fit import covariance_of
+from spn_data.georegister.noise import (
+    Linear,
+    improve_levels,
+    robust_cost,
+    solve,
+    student_weights,
+)
+from spn_data.georegister.observe import Fixes, observe
+from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.problem import Kind, Problem, State
+from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
+from spn_data.telemetry.track import Telemetry
+
+_MIN_FRAMES = 12
+_ROUNDS = 20
+_STARTS = 4
+_NO_OFFSET_M = 1e-4  # a flight alone has no vertical offset to another
+_WEAK_PRECISION = 1e-4  # of the time offset: keeps the equations solvable where nothing tells it
+# Two offsets whose costs differ by less than this are both possible (nine is three sigma).
+_AMBIGUOUS_COST = 9.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetOptions:
+    """Where an offset is looked for, and when it counts as found."""
+
+    max_offset_s: float = 5.0
+    max_sigma_s: float = 0.1  # an offset known worse than this is called undetermined
+    step_s: float = 0.1  # of the first search
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """What has to be added to telemetry's times to get the video's (`Telemetry.shifted`).
+
+    offset_s : None where the flight cannot tell; sigma_s : infinite where nothing was estimated;
+    reason : why it is undetermined, empty where it is not.
+    """
+
+    offset_s: float | None
+    sigma_s: float
+    reason: str = ""
+
+    @property
+    def applied_s(self) -> float:
+        """The offset, or zero where it is undetermined."""
+        return 0.0 if self.offset_s is None else self.offset_s
+
+    def tell(self, name: str) -> str:
+        """One sentence for the user."""
+        if self.offset_s is None:
+            return (
+                f"{name}: time offset of the telemetry undetermined ({self.reason}); 0 s is used."
+            )
+        return f"{name}: time offset of the telemetry {self.offset_s:+.2f} s (sigma {self.sigma_s:.2f} s)."
+
+
+def estimate_time_offset(
+    model: Poses,
+    time_s: np.ndarray,
+    telemetry: Telemetry,
+    options: GeoregisterOptions | None = None,
+    search: OffsetOptions | None = None,
+) -> TimeOffset:
+    """The offset of one flight, from poses of its frames (N), their times (N,) and its telemetry as read.
+
+    Positions and, where known, gimbal angles are fitted together with the offset as one more unknown, under
+    errors that are correlated in time: what a drifting GNSS bias could as well explain does not count as
+    information. The result is undetermined where that leaves more than `max_sigma_s`.
+    """
+    options = options or GeoregisterOptions()
+    search = search or OffsetOptions()
+    order = np.argsort(time_s, kind="stable")
+    model, time_s = model[order], np.asarray(time_s, dtype=np.float64)[order]
+    if len(model) < _MIN_FRAMES or not telemetry.has_fix.any():
+        return _undetermined(f"{len(model)} frames, {int(telemetry.has_fix.sum())} fixes")
+    window_s = min(search.max_offset_s, float(time_s[-1] - time_s[0]) / 4)
+    if window_s < search.step_s:
+        return _undetermined(f"the flight lasts {time_s[-1] - time_s[0]:.1f} s")
+    origin = observe(telemetry, [""] * len(telemetry), telemetry.time_s, options).origin
+    flight = _Flight(model, time_s, telemetry, replace(options, origin=origin, same_takeoff=True))
+    steps = int(window_s / search.step_s)
+    grid = np.arange(-steps, steps + 1) * search.step_s
+    flight = flight.only(flight.known_at(grid))
+    if len(flight.time_s) < _MIN_FRAMES:
+        return _undetermined(f"{len(flight.time_s)} frames have a fix at all offsets")
+    try:
+        rough = [flight.rough(offset_s) for offset_s in grid]
+    except GeometryError as error:
+        return _undetermined(str(error))
+    cost = np.array([r[0] for r in rough])
+    padded = np.concatenate([[np.inf], cost, [np.inf]])
+    minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
+    minima = minima[np.argsort(cost[minima], kind="stable")][:_STARTS]
+    limit_s = window_s + search.step_s
+    refined = [flight.refine(rough[k][1], float(grid[k]), limit_s) for k in minima]
+    found = [f for f in refined if f is not None]
+    if not found:
+        return _undetermined(f"the best one lies outside {window_s:.1f} s")
+    best = min(found, key=lambda f: f.cost)
+    if best.sigma_s > search.max_sigma_s:
+        return TimeOffset(
+            None, best.sigma_s, "the flight's motion is too even, or too small against its errors"
+        )
+    for other in found:
+        far = abs(other.offset_s - best.offset_s) > 5 * best.sigma_s + search.step_s
+        if far and other.cost - best.cost < _AMBIGUOUS_COST:
+            return TimeOffset(
+                None,
+                best.sigma_s,
+                f"{best.offset_s:+.2f} s and {other.offset_s:+.2f} s fit alike",
+            )
+    return TimeOffset(best.offset_s, best.sigma_s)
+
+
+def _undetermined(reason: str) -> TimeOffset:
+    return TimeOffset(None, float("inf"), reason)
+
+
+@dataclass(frozen=True)
+class _Found:
+    offset_s: float
+    sigma_s: float
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Flight:
+    """One flight's frames in the order of time, and its telemetry."""
+
+    model: Poses
+    time_s: np.ndarray
+    telemetry: Telemetry
+    options: GeoregisterOptions
+
+    def only(self, mask: np.ndarray) -> _Flight:
+        return replace(self, model=self.model[mask], time_s=self.time_s[mask])
+
+    def fixes(self, offset_s: float) -> Fixes:
+        """Observations of the frames under an offset, the gimbal's heading among them."""
+        rows = self.telemetry.shifted(offset_s).at(self.time_s)
+        fixes = observe(rows, [""] * len(rows), self.time_s, self.options)
+        if not self.options.use_gimbal:
+            return fixes
+        return replace(fixes, attitude=rotations_from_angles(rows.gimbal_deg))
+
+    def known_at(self, grid: np.ndarray) -> np.ndarray:
+        """(N,) bool: the frame has a fix, and gimbal angles where the flight has any, at all offsets."""
+        known = np.ones(len(self.time_s), dtype=bool)
+        gimbal = known.copy()
+        for offset_s in grid[:: max(1, len(grid) // 20)]:
+            rows = self.telemetry.shifted(offset_s).at(self.time_s)
+            known &= rows.has_fix
+            gimbal &= np.isfinite(rows.gimbal_deg).all(axis=1)
+        return known & gimbal if np.mean(known & gimbal) > 0.5 * np.mean(known) else known
+
+    def _centred(self) -> np.ndarray:
+        centers = self.model.centers - self.model.centers.mean(axis=0)
+        return centers / np.sqrt((centers**2).sum(axis=1).mean())
+
+    def rough(self, offset_s: float) -> tuple[float, Similarity]:
+        """Robust cost of an offset and the similarity that goes with it, quickly."""
+        fixes, centers = self.fixes(offset_s), self._centred()
+        rotations = self.model.rotations
+        gimbal = np.isfinite(fixes.attitude).all(axis=(1, 2))
+        enu = np.where(np.isfinite(fixes.enu_m), fixes.enu_m, 0.0)
+        weights = np.ones(len(enu))
+        sigma = fixes.sigma_m.mean(axis=1)
+        cost, rotation = 0.0, None
+        if gimbal.sum() >= _MIN_FRAMES:
+            each = fixes.attitude[gimbal].transpose(0, 2, 1) @ rotations[gimbal]
+            rotation, turn_deg = _mean_rotation(each)
+            cost += float(np.log1p((turn_deg / 1.0) ** 2).sum())
+        elif not fixes.has_heights:
+            raise GeometryError("neither gimbal angles nor heights")
+        similarity = Similarity.identity()
+        for _ in range(8):
+            if rotation is None:
+                similarity = Similarity.fit(centers, enu, weights)
+            else:
+                similarity = _scale_and_shift(centers @ rotation.T, rotation, enu, weights)
+            square = (((enu - similarity.apply(centers)) / sigma[:, None]) ** 2).sum(axis=1)
+            weights = 1 / (1 + square)
+        return cost + float(np.log1p(square).sum()), similarity
+
+    def refine(self, similarity: Similarity, offset_s: float, limit_s: float) -> _Found | None:
+        """Similarity, biases and offset together, from a rough start; None where it runs off."""
+        centers, rotations = self._centred(), self.model.rotations
+        level = np.zeros(len(centers), dtype=bool)
+        problem = Problem.build(centers, rotations, self.fixes(offset_s), level, self.options)
+        state = replace(problem.start(similarity, ~level), offsets_m=np.zeros(1))
+        levels = problem.levels()
+        # By kind and frame: which observations there are changes with the offset.
+        weight = np.ones((len(Kind), len(centers)))
+        for k in range(_ROUNDS):
+            linear = self._linear(problem, state)
+            weights = weight[problem.kind, problem.frame]
+            if k >= 4:
+                levels = improve_levels(problem.chains, levels, weights, linear)
+            solution = solve(problem.chains, levels, weights, linear)
+            weights, _ = student_weights(problem.chains, levels, solution.white)
+            weight[problem.kind, problem.frame] = weights
+            state = state.moved(solution.step[:-1])
+            offset_s += float(np.clip(solution.step[-1], -1.0, 1.0))
+            if abs(offset_s) > limit_s:
+                return None
+            problem = Problem.build(centers, rotations, self.fixes(offset_s), level, self.options)
+        linear = self._linear(problem, state)
+        weights = weight[problem.kind, problem.frame]
+        cost = robust_cost(problem.chains, levels, linear.residual, weights)
+        careful = solve(problem.chains, problem.conservative(levels), weights, linear)
+        return _Found(offset_s, float(np.sqrt(covariance_of(careful.information)[-1, -1])), cost)
+
+    def _linear(self, problem: Problem, state: State) -> Linear:
+        """The fit's linear problem with the offset as its last parameter."""
+        linear = problem.linearise(state, np.full(1, _NO_OFFSET_M), np.ones(1))
+        return Linear(
+            linear.residual,
+            np.column_stack([linear.jacobian, -self._rate(problem, state)]),
+            np.append(linear.prior_precision, _WEAK_PRECISION),
+            np.append(linear.value, 0.0),
+        )
+
+    def _rate(self, problem: Problem, state: State) -> np.ndarray:
+        """(M,) change of each residual by a second of offset, by the model's motion between its neighbours.
+
+        Not by the telemetry's own: its noise would pass for motion.
+        """
+        n = len(self.time_s)
+        after, before = np.minimum(np.arange(n) + 1, n - 1), np.maximum(np.arange(n) - 1, 0)
+        moved = []
+        for index in (after, before):
+            shifted = replace(
+                problem, model=problem.model[index], cam_from_model=problem.cam_from_model[index]
+            )
+            moved.append(shifted.residuals(state))
+        change = moved[0] - moved[1]
+        change[Kind.HEADING] = (change[Kind.HEADING] + 180.0) % 360.0 - 180.0
+        elapsed = np.maximum(self.time_s[after] - self.time_s[before], 1e-3)
+        return (change / elapsed)[problem.kind, problem.frame]
+
+
+def _mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Robust mean (3, 3) of rotations (N, 3, 3) and their angles (N,) in degrees from it."""
+    weights = np.ones(len(rotations))
+    for _ in range(8):
+        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))
+        mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        angle = np.rad2deg(np.linalg.norm(rotation_vectors(rotations @ mean.T), axis=1))
+        weights = 1 / (1 + (angle / 2.0) ** 2)
+    return mean, angle
+
+
+def _scale_and_shift(
+    turned: np.ndarray, rotation: np.ndarray, enu: np.ndarray, weights: np.ndarray
+) -> Similarity:
+    """Weighted least-squares scale and translation where the rotation is known."""
+    w = weights / weights.sum()
+    a, b = turned - w @ turned, enu - w @ enu
+    scale = float((w @ (a * b).sum(axis=1)) / (w @ (a * a).sum(axis=1)))
+    # A start that mirrors the flight is none: the offset is far off.
+    scale = max(scale, 1e-3 * float(np.sqrt((b * b).sum() / (a * a).sum())))
+    return Similarity(scale, rotation, w @ enu - scale * w @ turned)
