@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class GnssOptions:
-    """Error model of one receiver. The bias is an Ornstein-Uhlenbeck process, started in its stationary state."""
+    """Error model of one receiver; the bias is an Ornstein-Uhlenbeck process in its stationary state."""
 
     bias_sigma_m: tuple[float, float, float] = (0.7, 0.7, 1.1)  # east, north, up
     bias_time_s: float = 60.0  # after which the bias's correlation has fallen to 1/e
@@ -27,7 +27,7 @@ class GnssOptions:
 def gnss_errors(
     time_s: np.ndarray, options: GnssOptions, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (N, 3) in metres east, north, up at increasing times (N,), and whether each lies in a burst (N,).
+    """Errors (N, 3) in metres east, north, up at increasing times (N,), and which lie in a burst (N,).
 
     Uhlenbeck and Ornstein 1930; exact for any spacing of the times.
     """

@@ -17,7 +17,8 @@ MARGIN_S = 6.0  # a motion is known this long before its start and after its end
 class Motion:
     """A path on a fine grid of time, linear in between.
 
-    time_s : (M,), evenly spaced; centers : (M, 3) metres; angles_deg : (M, 3) heading (unwrapped), pitch, roll.
+    time_s : (M,), evenly spaced; centers : (M, 3) metres; angles_deg : (M, 3) heading (unwrapped),
+        pitch and roll.
     """
 
     time_s: np.ndarray

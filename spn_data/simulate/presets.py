@@ -56,6 +56,7 @@ class SimulateOptions:
         1.3,
     )  # least and greatest rotation during such an exposure
     exposure_sigma_ev: float = 0.2  # slow changes of exposure
+    lens_blur_px: float = 0.45  # deviation of the lens's point spread
     noise_sigma: float = 1.8  # of the sensor, in grey levels of 255
     readout_s: float = (
         0.0  # rolling shutter: from the first row to the last; 0 for a global shutter

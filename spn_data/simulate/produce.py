@@ -10,11 +10,13 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from spn_data.errors import StageError
+from spn_data.simulate.faces import Texture
 from spn_data.simulate.flight import (
     FlightPath,
     exposure_poses,
@@ -23,7 +25,7 @@ from spn_data.simulate.flight import (
     simulate_telemetry,
 )
 from spn_data.simulate.presets import SimulateOptions
-from spn_data.simulate.render import BAND_PX, Renderer, Texture
+from spn_data.simulate.render import BAND_PX, Renderer
 from spn_data.simulate.scene import Place, build_place, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
@@ -143,7 +145,13 @@ def _render(studio: _Studio, flight: str, frame: int) -> np.ndarray:
     path = studio.paths[flight]
     image = render_frame(studio.renderer(path), path, frame, studio.options.readout_s)
     rng = flight_rng(studio.options, flight, 1000 + frame)
-    return develop(image, float(path.exposure_ev[frame]), studio.noise, rng)
+    return develop(
+        image,
+        lens_blur_px=studio.options.lens_blur_px,
+        exposure_ev=float(path.exposure_ev[frame]),
+        noise=studio.noise,
+        rng=rng,
+    )
 
 
 def render_frame(
@@ -178,9 +186,7 @@ def _open_studio(options: SimulateOptions, texture_folder: Path) -> None:
     _studio = _Studio(options, texture_folder)
 
 
-def _in_studio(
-    task: Callable[..., np.ndarray | None], args: tuple[object, ...]
-) -> np.ndarray | None:
+def _in_studio(task: Callable[..., Any], args: tuple[object, ...]) -> Any:
     assert _studio is not None
     return task(_studio, *args)
 
@@ -209,15 +215,13 @@ class _Crew:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def map(
-        self, task: Callable[..., np.ndarray | None], arguments: list[tuple[object, ...]]
-    ) -> Iterator[np.ndarray | None]:
+    def map(self, task: Callable[..., Any], arguments: list[tuple[object, ...]]) -> Iterator[Any]:
         """Results in order, with a few tasks under way ahead of the one awaited."""
         if self._pool is None:
             for args in arguments:
                 yield task(self._studio, *args)
             return
-        pending: deque[Future[np.ndarray | None]] = deque()
+        pending: deque[Future[Any]] = deque()
         for args in arguments:
             pending.append(self._pool.submit(_in_studio, task, args))
             if len(pending) > 4 * self._workers:

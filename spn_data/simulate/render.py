@@ -1,4 +1,4 @@
-"""Renders textured planar faces through a distorted lens: free of aliasing, and exact to a few hundredths of a pixel.
+"""Renders textured planar faces through a distorted lens: free of aliasing, exact to a few 0.01 px.
 
 A plane seen through a pinhole is linear in the ray: with ``X = origin + s*u_edge + t*v_edge``, the vector
 ``(s, t, 1) / depth`` is a matrix times the ray ``(x, y, 1)``. Visibility, face edges and texture
@@ -11,121 +11,20 @@ grid, each of them bilinear in a mip level chosen by the tile's footprint on the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from spn_data.camera import Camera
+from spn_data.simulate.faces import MAX_CORNERS, Face, Texture
+from spn_data.simulate.rays import TILE_PX, RayGrid
 
-TILE_PX = 32
 BAND_PX = 8  # rows of one pose under a rolling shutter
 # Four distinct offsets in x and in y, so that edges of any direction get five shades of coverage.
 # They are point-symmetric (first and last, second and third), which keeps a pixel's centroid at its centre.
 SAMPLE_OFFSETS_PX = np.array([[-3.0, -1.0], [1.0, -3.0], [-1.0, 3.0], [3.0, 1.0]]) / 8
 HAZE_RGB = (208, 214, 220)  # where a ray meets no face
-_MAX_EDGES = 8
 _EDGE_TOLERANCE = 1e-7  # lets neighbouring faces meet without a crack from rounding
-_UNIT_SQUARE_EDGES = np.array([[1.0, 0, 0], [-1, 0, 1], [0, 1, 0], [0, -1, 1]])
-
-
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """An image (H, W, 3 or 4) uint8 RGB and its mip levels; a fourth channel is the share of mirror reflection."""
-
-    levels: tuple[np.ndarray, ...]
-
-    @classmethod
-    def from_image(cls, image: np.ndarray) -> Texture:
-        """Each level is the area mean of the one before, at half its size (rounded down)."""
-        levels = [np.ascontiguousarray(image)]
-        while min(levels[-1].shape[:2]) > 8:
-            height, width = levels[-1].shape[:2]
-            levels.append(
-                cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-            )
-        return cls(tuple(levels))
-
-
-@dataclass(frozen=True, eq=False)
-class Face:
-    """A parallelogram, or a convex polygon in its plane, with a texture on its front.
-
-    origin, u_edge, v_edge : (3,) metres; where the texture's upper-left corner lies, and its upper and
-        left border. Seen from the front, u is to the right of v: the front is where
-        ``(eye - origin) . (u_edge x v_edge) < 0``.
-    region : (s0, t0, s1, t1), the part of the texture used, as fractions of its width and height.
-    polygon : (K, 2), 3 <= K <= 8, convex in units of the two edges, running from +u towards +v; None is the whole.
-    mirrored : what the mirror parts of the texture reflect, as a face at its mirror image behind this one.
-    at_infinity : the face moves along with the eye (sky).
-    """
-
-    texture: str
-    origin: np.ndarray
-    u_edge: np.ndarray
-    v_edge: np.ndarray
-    region: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
-    polygon: np.ndarray | None = None
-    mirrored: Face | None = None
-    at_infinity: bool = False
-
-
-def mirror_face(target: Face, mirror: Face) -> Face:
-    """The face `target` as it appears behind the plane of `mirror`."""
-    normal = np.cross(mirror.u_edge, mirror.v_edge)
-    normal = normal / np.linalg.norm(normal)
-    reflect = np.eye(3) - 2 * np.outer(normal, normal)
-    origin = mirror.origin + reflect @ (target.origin - mirror.origin)
-    return Face(
-        target.texture, origin, reflect @ target.u_edge, reflect @ target.v_edge, target.region
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _RayGrid:
-    """Rays of some image rows, and what bounds them in each of T tiles.
-
-    rays : (h, w * samples, 2) float32, x/z and y/z; a pixel's samples are neighbours in a row.
-    tiles : (T, 4) int, first row, last row + 1, first column, last column + 1 in `rays`; row by row.
-    middle, half : (T, 2), the bounding box of a tile's rays.
-    jet : (T, 3, 3), columns are the ray of the tile's middle pixel and its change by one pixel in x and y.
-    """
-
-    rays: np.ndarray
-    tiles: np.ndarray
-    middle: np.ndarray
-    half: np.ndarray
-    jet: np.ndarray
-
-    @classmethod
-    def of_rows(
-        cls, camera: Camera, offsets_px: np.ndarray, first_row: int, last_row: int, tile_rows: int
-    ) -> _RayGrid:
-        samples = len(offsets_px)
-        x = (np.arange(camera.width) + 0.5)[:, None] + offsets_px[:, 0]
-        y = (np.arange(first_row, last_row) + 0.5)[:, None, None] + offsets_px[:, 1]
-        pixels = np.stack(np.broadcast_arrays(x[None], y), axis=-1)
-        rays = camera.unproject(pixels.reshape(-1, 2)).astype(np.float32)
-        rays = rays.reshape(last_row - first_row, camera.width * samples, 2)
-        tiles, boxes, jets = [], [], []
-        for r0 in range(0, len(rays), tile_rows):
-            r1 = min(r0 + tile_rows, len(rays))
-            for c0 in range(0, camera.width, TILE_PX):
-                c1 = min(c0 + TILE_PX, camera.width)
-                tile = rays[r0:r1, c0 * samples : c1 * samples]
-                tiles.append((r0, r1, c0 * samples, c1 * samples))
-                boxes.append((tile.min(axis=(0, 1)), tile.max(axis=(0, 1))))
-                middle = np.array([(c0 + c1) / 2, first_row + (r0 + r1) / 2])
-                jets.append(middle + np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]]))
-        box = np.asarray(boxes, dtype=np.float64)  # (T, 2, 2)
-        cross = camera.unproject(np.concatenate(jets)).reshape(-1, 5, 2)
-        jet = np.zeros((len(tiles), 3, 3))
-        jet[:, :2, 0] = cross[:, 0]
-        jet[:, 2, 0] = 1
-        jet[:, :2, 1] = cross[:, 1] - cross[:, 2]
-        jet[:, :2, 2] = cross[:, 3] - cross[:, 4]
-        half = (box[:, 1] - box[:, 0]) / 2
-        return cls(rays, np.asarray(tiles), box.mean(axis=1), half, jet)
 
 
 class Renderer:
@@ -141,12 +40,12 @@ class Renderer:
         self._axes = np.stack([np.stack([face.u_edge, face.v_edge]) for face in table])
         self._at_infinity = np.array([face.at_infinity for face in table])
         # Padding edges only ask that the face be in front of the eye.
-        self._edges = np.tile(np.array([0.0, 0.0, 1.0]), (len(faces), _MAX_EDGES, 1))
+        self._edges = np.tile(np.array([0.0, 0.0, 1.0]), (len(faces), MAX_CORNERS, 1))
         self._edge_counts = []
         self._mirror_idx = np.full(len(table), -1)
         following = len(faces)
         for i, face in enumerate(faces):
-            edges = _UNIT_SQUARE_EDGES if face.polygon is None else _polygon_edges(face.polygon)
+            edges = face.edges()
             self._edges[i, : len(edges)] = edges
             self._edge_counts.append(len(edges))
             if face.mirrored is not None:
@@ -161,7 +60,7 @@ class Renderer:
                 [0, (t1 - t0) * height, t0 * height],
                 [0, 0, 1],
             ]
-        self._grids: dict[str, list[_RayGrid]] = {}
+        self._grids: dict[str, list[RayGrid]] = {}
 
     def render(self, center: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
         """Sharp image (H, W, 3) uint8 RGB from one pose: centre (3,) and rotation (3, 3)."""
@@ -183,14 +82,14 @@ class Renderer:
         return np.rint(total / count).astype(np.uint8)
 
     def render_rolling(self, centers: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-        """Image (H, W, 3) uint8 whose i-th band of `BAND_PX` rows is seen from the i-th pose (B, 3), (B, 3, 3)."""
+        """Image (H, W, 3) uint8 whose i-th band of `BAND_PX` rows is seen from the i-th of B poses."""
         bands = self._grid("bands")
         if len(bands) != len(centers):
             raise ValueError(f"{len(centers)} poses for {len(bands)} bands of rows")
         parts = [self._cast(*args) for args in zip(bands, centers, cam_from_world, strict=True)]
         return _mean_samples(np.concatenate(parts))
 
-    def _grid(self, kind: str) -> list[_RayGrid]:
+    def _grid(self, kind: str) -> list[RayGrid]:
         if kind not in self._grids:
             height = self._camera.height
             if kind == "bands":
@@ -202,7 +101,7 @@ class Renderer:
             if kind.startswith("single"):
                 offsets = offsets[[int(kind[-1])]]
             self._grids[kind] = [
-                _RayGrid.of_rows(self._camera, offsets, *span, tile_rows=TILE_PX) for span in spans
+                RayGrid.of_rows(self._camera, offsets, *span, tile_rows=TILE_PX) for span in spans
             ]
         return self._grids[kind]
 
@@ -216,7 +115,7 @@ class Renderer:
         inverse[edge_on] = np.nan
         return inverse
 
-    def _cast(self, grid: _RayGrid, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    def _cast(self, grid: RayGrid, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Colours (h, w * samples, 3) uint8 of a grid's rays."""
         face_from_ray = self._face_from_ray(center, rotation)
         faces, keep, covered = self._faces_of_tiles(grid, face_from_ray, center)
@@ -265,7 +164,7 @@ class Renderer:
         return colours
 
     def _faces_of_tiles(
-        self, grid: _RayGrid, face_from_ray: np.ndarray, center: np.ndarray
+        self, grid: RayGrid, face_from_ray: np.ndarray, center: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces (M,) that may be seen, in which tiles each may (M, T), and which tiles it covers (M, T)."""
         n = self._visible_faces
@@ -283,7 +182,7 @@ class Renderer:
         overlaps = (high_m >= -_EDGE_TOLERANCE).all(axis=1)
         covers = (low_m >= 0).all(axis=1)
         nearest = np.where(covers, low_m[:, -1], 0.0).max(axis=0, initial=0.0)
-        return faces, overlaps & (high_m[:, -1] >= nearest), covers
+        return faces, np.asarray(overlaps & (high_m[:, -1] >= nearest)), np.asarray(covers)
 
     def _mip_levels(
         self, face_from_ray: np.ndarray, face_idx: np.ndarray, jet: np.ndarray
@@ -298,8 +197,8 @@ class Renderer:
         det = np.abs(step[:, 0, 0] * step[:, 1, 1] - step[:, 0, 1] * step[:, 1, 0])
         major = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * det**2, 0.0))) / 2)
         minor = det / np.maximum(major, 1e-12)
-        # Four samples a pixel resolve half a pixel both ways, and a quarter along one axis.
-        texels = np.maximum(0.6 * minor, 0.3 * major)
+        # Texels of about a pixel; four samples a pixel resolve a finer grain along one axis.
+        texels = np.maximum(0.85 * minor, 0.35 * major)
         deepest = np.array([len(texture.levels) - 1 for texture in self._textures])[face_idx]
         with np.errstate(divide="ignore", invalid="ignore"):
             level = np.nan_to_num(np.rint(np.log2(texels)), posinf=0.0, neginf=0.0)
@@ -308,7 +207,7 @@ class Renderer:
     def _sample(
         self, face_from_ray: np.ndarray, face: int, level: int, rays: np.ndarray
     ) -> np.ndarray:
-        """Texture colours (h, w, 3 or 4) of one face along rays (h, w, 2); beyond its border, its mirror image."""
+        """Texture colours (h, w, 3 or 4) of one face along rays (h, w, 2); beyond its border, mirrored."""
         base = self._textures[face].levels[0].shape
         image = self._textures[face].levels[level]
         sx, sy = image.shape[1] / base[1], image.shape[0] / base[0]
@@ -341,7 +240,7 @@ class Renderer:
         covered: list[bool],
         rays: np.ndarray,
     ) -> np.ndarray:
-        """Colours (n, 3) along rays (n, 2) of the nearest among candidate faces (face, level, mirror level)."""
+        """Colours (n, 3) along rays (n, 2) of the nearest among faces (face, level, mirror level)."""
         nearest = np.zeros(len(rays), np.float32)
         winner = np.full(len(rays), -1, np.int16)
         for j, ((face, _, _), covers) in enumerate(zip(keys, covered, strict=True)):
@@ -377,12 +276,3 @@ def _form_bounds(
     value = forms[..., :2] @ middle.T + forms[..., 2:]
     spread = np.abs(forms[..., :2]) @ half.T
     return value - spread, value + spread
-
-
-def _polygon_edges(polygon: np.ndarray) -> np.ndarray:
-    """Lines (K, 3) with ``a s + b t + c >= 0`` inside a convex polygon (K, 2)."""
-    if not 3 <= len(polygon) <= _MAX_EDGES:
-        raise ValueError(f"a face has 3 to {_MAX_EDGES} corners, not {len(polygon)}")
-    start, step = polygon, np.roll(polygon, -1, axis=0) - polygon
-    a, b = -step[:, 1], step[:, 0]
-    return np.stack([a, b, -(a * start[:, 0] + b * start[:, 1])], axis=1)

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spn_data.simulate.render import Face, Texture, mirror_face
-from spn_data.simulate.surfaces import PAINTERS, REFLECTION_SKY_SHARE
-from spn_data.simulate.textures import Canvas, target_texel
+from spn_data.simulate.facade import target_texel
+from spn_data.simulate.faces import Face, Texture, mirror_face
+from spn_data.simulate.shapes import Builder, vector
+from spn_data.simulate.surfaces import PAINTERS, REFLECTION_PARTS
+from spn_data.simulate.textures import Canvas
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,18 +46,11 @@ class Place:
 
 
 BUILDING_DEPTH_M = 10.0
-_SHEETS = {  # painter, size in metres, texels per metre: shared by the objects, each face at its own place
-    "leaves": ((6.0, 6.0), 160.0),
-    "planks": ((4.0, 4.0), 200.0),
-    "concrete": ((5.0, 5.0), 160.0),
-    "posters": ((4.0, 4.0), 200.0),
-    "bark": ((3.0, 3.0), 160.0),
-}
 
 
 def build_place(options: SceneOptions) -> Place:
     """The courtyard for a seed; textures are painted apart (`paint`)."""
-    builder = _Builder(options)
+    builder = _Courtyard(options)
     builder.shell()
     builder.surroundings()
     builder.roof_things()
@@ -79,147 +74,42 @@ def paint_all(place: Place) -> dict[str, Texture]:
     return {name: Texture.from_image(paint(place, name)) for name in place.canvases}
 
 
-def _vector(*values: float) -> np.ndarray:
-    return np.array(values, dtype=np.float64)
-
-
-class _Builder:
-    """Collects the parts of one place."""
+class _Courtyard(Builder):
+    """Collects the parts of the courtyard."""
 
     def __init__(self, options: SceneOptions):
+        super().__init__(options.seed)
         self.options = options
-        self.rng = np.random.default_rng([options.seed, 77])
-        self.faces: list[Face] = []
-        self.canvases: dict[str, tuple[str, Canvas]] = {}
-        self.obstacles: list[tuple[float, ...]] = []
         self.landmarks: list[np.ndarray] = []
-        for name, (size_m, resolution) in _SHEETS.items():
-            self.canvas(name, name, size_m, resolution)
-
-    def canvas(
-        self,
-        texture: str,
-        painter: str,
-        size_m: tuple[float, float],
-        resolution: float,
-        name: str = "",
-    ) -> None:
-        # Textures stay within what OpenCV's remap can address.
-        resolution = min(resolution, 30000 / max(size_m))
-        self.canvases[texture] = (
-            painter,
-            Canvas(
-                name=name or texture, size_m=size_m, texels_per_m=resolution, seed=self.options.seed
-            ),
-        )
-
-    def patch(
-        self, sheet: str, width_m: float, height_m: float
-    ) -> tuple[float, float, float, float]:
-        """A random part of a sheet, of the given size at the sheet's scale, or all of it where it is smaller."""
-        size = self.canvases[sheet][1].size_m
-        ds, dt = min(1.0, width_m / size[0]), min(1.0, height_m / size[1])
-        s, t = self.rng.uniform(0, 1 - ds), self.rng.uniform(0, 1 - dt)
-        return float(s), float(t), float(s + ds), float(t + dt)
-
-    def add(self, texture: str, origin: np.ndarray, u_edge: np.ndarray, v_edge: np.ndarray) -> None:
-        region = (0.0, 0.0, 1.0, 1.0)
-        if texture in _SHEETS:
-            region = self.patch(
-                texture, float(np.linalg.norm(u_edge)), float(np.linalg.norm(v_edge))
-            )
-        self.faces.append(Face(texture, origin, u_edge, v_edge, region))
-
-    def polygon(self, texture: str, points: np.ndarray) -> None:
-        """Convex planar polygon (K, 3), clockwise as seen from its front."""
-        right = points[1] - points[0]
-        right = right / np.linalg.norm(right)
-        away = np.cross(right, points[2] - points[1])
-        down = np.cross(away / np.linalg.norm(away), right)
-        flat = (points - points[0]) @ np.stack([right, down], axis=1)
-        low, size = flat.min(axis=0), np.ptp(flat, axis=0)
-        origin = points[0] + low[0] * right + low[1] * down
-        region = self.patch(texture, float(size[0]), float(size[1]))
-        self.faces.append(
-            Face(texture, origin, size[0] * right, size[1] * down, region, (flat - low) / size)
-        )
-
-    def box(
-        self,
-        low: tuple[float, float, float],
-        high: tuple[float, float, float],
-        side: str,
-        top: str,
-        *,
-        blocks: bool = True,
-    ) -> None:
-        """Axis-parallel box without its bottom."""
-        (x0, y0, z0), (x1, y1, z1) = low, high
-        down = _vector(0, 0, z0 - z1)
-        self.add(side, _vector(x0, y0, z1), _vector(x1 - x0, 0, 0), down)
-        self.add(side, _vector(x1, y1, z1), _vector(x0 - x1, 0, 0), down)
-        self.add(side, _vector(x1, y0, z1), _vector(0, y1 - y0, 0), down)
-        self.add(side, _vector(x0, y1, z1), _vector(0, y0 - y1, 0), down)
-        self.add(top, _vector(x0, y1, z1), _vector(x1 - x0, 0, 0), _vector(0, y0 - y1, 0))
-        if blocks:
-            self.obstacles.append((x0, y0, z0, x1, y1, z1))
-
-    def rings(
-        self, texture: str, x: float, y: float, rings: list[tuple[float, float]], sides: int
-    ) -> None:
-        """Solid of rotation with flat sides, through rings of (height, radius) from top to bottom, closed above."""
-        angles = np.arange(sides) * 2 * np.pi / sides + 0.2
-        loops = [
-            np.stack([x + r * np.cos(angles), y + r * np.sin(angles), np.full(sides, z)], axis=1)
-            for z, r in rings
-        ]
-        self.polygon(texture, loops[0][::-1])
-        for upper, lower in zip(loops[:-1], loops[1:], strict=True):
-            for k in range(sides):
-                j = (k + 1) % sides  # seen from outside, a growing angle runs to the right
-                self.polygon(texture, np.stack([upper[k], upper[j], lower[j], lower[k]]))
-        reach = max(r for _, r in rings)
-        self.obstacles.append(
-            (x - reach, y - reach, rings[-1][0], x + reach, y + reach, rings[0][0])
-        )
-
-    def tree(self, x: float, y: float, height: float, radius: float) -> None:
-        self.rings("bark", x, y, [(height * 0.5, 0.14), (0.0, 0.22)], 6)
-        low = height * 0.42
-        profile = [(1.0, 0.2), (0.85, 0.7), (0.5, 1.0), (0.15, 0.75), (0.0, 0.3)]
-        rings = [(low + f * (height - low), r * radius) for f, r in profile]
-        self.rings("leaves", x, y, rings, 8)
-        angles = np.arange(8) * 2 * np.pi / 8 + 0.2
-        r = rings[-1][1]
-        self.polygon(
-            "leaves",
-            np.stack([x + r * np.cos(angles), y + r * np.sin(angles), np.full(8, low)], axis=1),
-        )
 
     def shell(self) -> None:
         """Four inner facades with what their panes reflect, the ground between them, the sky."""
         hx, hy = self.options.half_m
         height, resolution = self.options.height_m, self.options.texels_per_m
-        down = _vector(0, 0, -height)
+        down = vector(0, 0, -height)
         walls = {
-            "north": (_vector(-hx, hy, height), _vector(2 * hx, 0, 0), "south"),
-            "south": (_vector(hx, -hy, height), _vector(-2 * hx, 0, 0), "north"),
-            "east": (_vector(hx, hy, height), _vector(0, -2 * hy, 0), "west"),
-            "west": (_vector(-hx, -hy, height), _vector(0, 2 * hy, 0), "east"),
+            "north": (vector(-hx, hy, height), vector(2 * hx, 0, 0), "south"),
+            "south": (vector(hx, -hy, height), vector(-2 * hx, 0, 0), "north"),
+            "east": (vector(hx, hy, height), vector(0, -2 * hy, 0), "west"),
+            "west": (vector(-hx, -hy, height), vector(0, 2 * hy, 0), "east"),
         }
-        rise = height * REFLECTION_SKY_SHARE / (1 - REFLECTION_SKY_SHARE)
+        sky, ground = (height * REFLECTION_PARTS[0], height * REFLECTION_PARTS[1])
         for name, (origin, along, opposite) in walls.items():
             width = float(np.linalg.norm(along))
             self.canvas(f"facade-{name}", "facade", (width, height), resolution)
             self.canvas(
-                f"reflection-{name}", "reflection", (width, height + rise), 14.0, f"facade-{name}"
+                f"reflection-{name}",
+                "reflection",
+                (width, sky + height + ground),
+                14.0,
+                f"facade-{name}",
             )
             seen_origin, seen_along, _ = walls[opposite]
             seen = Face(
                 f"reflection-{opposite}",
-                seen_origin + _vector(0, 0, rise),
+                seen_origin + vector(0, 0, sky),
                 seen_along,
-                down - _vector(0, 0, rise),
+                down - vector(0, 0, sky + ground),
             )
             wall = Face(f"facade-{name}", origin, along, down)
             self.faces.append(replace(wall, mirrored=mirror_face(seen, wall)))
@@ -228,14 +118,14 @@ class _Builder:
             rows, columns = canvas.shape
             self.landmarks.append(origin + along * column / columns + down * row / rows)
         self.canvas("plaza", "plaza", (2 * hx, 2 * hy), min(resolution, 125.0))
-        self.add("plaza", _vector(-hx, hy, 0), _vector(2 * hx, 0, 0), _vector(0, -2 * hy, 0))
+        self.add("plaza", vector(-hx, hy, 0), vector(2 * hx, 0, 0), vector(0, -2 * hy, 0))
         self.canvas("sky", "sky", (12000.0, 12000.0), 0.1)
         self.faces.append(
             Face(
                 "sky",
-                _vector(-6000, -6000, 1000),
-                _vector(12000, 0, 0),
-                _vector(0, 12000, 0),
+                vector(-6000, -6000, 1000),
+                vector(12000, 0, 0),
+                vector(0, 12000, 0),
                 at_infinity=True,
             )
         )
@@ -252,14 +142,14 @@ class _Builder:
         }
         for name, (x0, y0, x1, y1) in strips.items():
             self.canvas(name, "roof", (x1 - x0, y1 - y0), 50.0)
-            self.add(name, _vector(x0, y1, height), _vector(x1 - x0, 0, 0), _vector(0, y0 - y1, 0))
-        down = _vector(0, 0, -height)
+            self.add(name, vector(x0, y1, height), vector(x1 - x0, 0, 0), vector(0, y0 - y1, 0))
+        down = vector(0, 0, -height)
         self.canvas("outside", "facade", (2 * ox, height), 25.0)
         for origin, along in (
-            (_vector(-ox, -oy, height), _vector(2 * ox, 0, 0)),
-            (_vector(ox, oy, height), _vector(-2 * ox, 0, 0)),
-            (_vector(ox, -oy, height), _vector(0, 2 * oy, 0)),
-            (_vector(-ox, oy, height), _vector(0, -2 * oy, 0)),
+            (vector(-ox, -oy, height), vector(2 * ox, 0, 0)),
+            (vector(ox, oy, height), vector(-2 * ox, 0, 0)),
+            (vector(ox, -oy, height), vector(0, 2 * oy, 0)),
+            (vector(-ox, oy, height), vector(0, -2 * oy, 0)),
         ):
             self.add("outside", origin, along, down)
         reach = max(ox, oy) + 90.0
@@ -268,9 +158,9 @@ class _Builder:
             # Below the courtyard's own ground, which hides it.
             Face(
                 "town",
-                _vector(-reach, reach, -0.05),
-                _vector(2 * reach, 0, 0),
-                _vector(0, -2 * reach, 0),
+                vector(-reach, reach, -0.05),
+                vector(2 * reach, 0, 0),
+                vector(0, -2 * reach, 0),
             )
         )
         self.canvas("house", "facade", (24.0, 10.0), 20.0)
@@ -319,8 +209,9 @@ class _Builder:
             self.rings("concrete", x * sx * 0.9, y * sy * 0.9, [(4.6, 0.35), (0.0, 0.4)], 8)
         for x, y, across in (
             (-12.0, 16.6, False), (-3.0, 16.7, False), (7.0, 16.6, False), (-8.0, -16.6, False),
-            (3.0, -16.7, False), (18.1, 4.0, True), (18.1, -7.0, True), (-18.1, -3.0, True), (-18.2, 8.0, True),
-            (-9.5, 6.0, True), (9.3, -6.2, True), (2.0, 10.2, False), (-3.0, -10.4, False),
+            (3.0, -16.7, False), (18.1, 4.0, True), (18.1, -7.0, True), (-18.1, -3.0, True),
+            (-18.2, 8.0, True), (-9.5, 6.0, True), (9.3, -6.2, True), (2.0, 10.2, False),
+            (-3.0, -10.4, False),
         ):  # fmt: skip
             long, wide = (0.25, 0.95) if across else (0.95, 0.25)
             x, y = x * sx, y * sy

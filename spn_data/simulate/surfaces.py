@@ -8,34 +8,34 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from spn_data.simulate.facade import paint_facade
 from spn_data.simulate.textures import (
     Canvas,
-    _brick_palette,
-    _masonry,
-    _stains,
     clouds,
     grain,
-    paint_facade,
+    masonry,
     paint_plaza,
+    palette_around,
     poster,
     shade,
+    stain,
 )
 
 
 def paint_roof(canvas: Canvas) -> np.ndarray:
     """Flat roof (H, W, 3): sheets of bitumen and gravel, patches, drains."""
     rng = canvas.rng
-    image = _masonry(
+    image = masonry(
         canvas,
         rng,
-        _brick_palette(rng, (118, 116, 112), 0.1),
+        palette_around(rng, (118, 116, 112), 0.1),
         (1.0, 4.0),
         joint_m=0.05,
         joint_rgb=(72, 70, 68),
     )
     gravel = clouds(rng, canvas, largest_m=7.0, smallest_m=0.1, gain=0.75)
     image = shade(image, 1 + 0.14 * gravel + grain(rng, canvas.shape, 0.11))
-    _stains(image, canvas, rng, count=round(canvas.size_m[0] * canvas.size_m[1] * 0.08))
+    stain(image, canvas, rng, count=round(canvas.size_m[0] * canvas.size_m[1] * 0.08))
     return image
 
 
@@ -122,10 +122,10 @@ def _leaves(canvas: Canvas) -> np.ndarray:
 
 def _planks(canvas: Canvas) -> np.ndarray:
     rng = canvas.rng
-    image = _masonry(
+    image = masonry(
         canvas,
         rng,
-        _brick_palette(rng, (134, 96, 62), 0.16),
+        palette_around(rng, (134, 96, 62), 0.16),
         (2.0, 0.12),
         joint_m=0.014,
         joint_rgb=(40, 30, 22),
@@ -146,7 +146,7 @@ def _concrete(canvas: Canvas) -> np.ndarray:
         + 0.13 * clouds(rng, canvas, largest_m=0.9, smallest_m=0.03, gain=0.75)
         + grain(rng, canvas.shape, 0.07),
     )
-    _stains(image, canvas, rng, count=5)
+    stain(image, canvas, rng, count=5)
     return image
 
 
@@ -200,19 +200,22 @@ def _sky(canvas: Canvas) -> np.ndarray:
     return np.rint(inner * blue + (1 - inner) * np.array([208, 214, 220])).astype(np.uint8)
 
 
-REFLECTION_SKY_SHARE = 2 / 3
+REFLECTION_PARTS = (2, 1)  # of sky above and ground below, in heights of the facade between
 
 
 def _reflection(canvas: Canvas) -> np.ndarray:
-    """What a pane sees across the courtyard (H, W, 3): the facade of that name, and the sky above it."""
-    height_m = canvas.size_m[1] * (1 - REFLECTION_SKY_SHARE)
+    """What a pane sees across the courtyard (H, W, 3): the facade of that name, sky above, ground below."""
+    height_m = canvas.size_m[1] / (1 + sum(REFLECTION_PARTS))
     facade = paint_facade(replace(canvas, size_m=(canvas.size_m[0], height_m)))
     wall = cv2.GaussianBlur(cv2.cvtColor(facade, cv2.COLOR_RGBA2RGB), (0, 0), 0.8)
-    rows = canvas.shape[0] - len(wall)
-    fade = np.linspace(0, 1, rows)[:, None, None]
+    field = clouds(canvas.rng, canvas, largest_m=14.0, smallest_m=0.5)[:, :, None]
+    above = len(wall) * REFLECTION_PARTS[0]
+    fade = np.linspace(0, 1, above)[:, None, None]
     sky = (1 - fade) * np.array([176, 196, 222]) + fade * np.array([214, 218, 222])
-    field = clouds(canvas.rng, canvas, largest_m=14.0, smallest_m=2.0)[:rows, :, None]
-    return np.vstack([np.clip(sky + 12 * field, 0, 255).astype(np.uint8), wall])
+    below = canvas.shape[0] - above - len(wall)
+    ground = np.array([124, 122, 112]) * (1 + 0.12 * field[-below:])
+    parts = [sky + 8 * field[:above], wall, ground]
+    return np.vstack([np.clip(part, 0, 255).astype(np.uint8) for part in parts])
 
 
 PAINTERS: dict[str, Callable[[Canvas], np.ndarray]] = {

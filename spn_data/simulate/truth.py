@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -108,7 +109,7 @@ def read_truth(folder: Path, flight: str) -> Truth:
         ) from error
 
 
-def _read_json(path: Path) -> dict[str, object] | dict[str, float]:
+def _read_json(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         version = int(values["version"])

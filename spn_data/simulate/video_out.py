@@ -21,10 +21,17 @@ def noise_field(width: int, height: int, sigma: float, seed: int) -> np.ndarray:
 
 
 def develop(
-    image: np.ndarray, exposure_ev: float, noise: np.ndarray, rng: np.random.Generator
+    image: np.ndarray,
+    *,
+    lens_blur_px: float,
+    exposure_ev: float,
+    noise: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """Image (H, W, 3) uint8 as exposed and with the sensor's noise."""
+    """Image (H, W, 3) uint8 as the lens blurs it and as exposed, with the sensor's noise."""
     height, width = image.shape[:2]
+    if lens_blur_px > 0:
+        image = cv2.GaussianBlur(image, (5, 5), lens_blur_px)
     # Display values grow with about the 2.2th root of the light.
     exposed = cv2.convertScaleAbs(image, alpha=2.0 ** (exposure_ev / 2.2))
     r, c = rng.integers(0, _NOISE_MARGIN_PX, 2)
@@ -37,7 +44,7 @@ def develop(
 def write_video(
     path: Path, frames: Iterable[np.ndarray], *, width: int, height: int, fps: float, crf: int
 ) -> None:
-    """H.264 in the container of the path's suffix; frames (H, W, 3) uint8 RGB, the i-th at i / fps seconds."""
+    """H.264 in the container that the suffix says; frames (H, W, 3) uint8 RGB, the i-th at i / fps s."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height = width, height
