@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import click
@@ -94,7 +94,7 @@ class _PlainProgress:
         out.print(f"{step}: {done}{f' of {total}' if total else ''}{left}")
 
 
-def table(title: str, rows: list[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
+def table(title: str, rows: Sequence[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
     """Rows of text; the first column is the name of what stands beside it."""
     shown = Table(title=title, title_justify="left", show_header=bool(header), box=None)
     width = len(header or rows[0])

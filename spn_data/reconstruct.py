@@ -8,7 +8,7 @@ from pathlib import Path
 
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping
-from spn_data.colmap.model import count_registered, read_scene
+from spn_data.colmap.model import Scene, count_registered, read_scene
 from spn_data.correspondences import FramesToMap, extract_missing, match_missing, pairs_of
 from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
@@ -76,7 +76,7 @@ class ReconstructResult:
     attempts: tuple[str, ...]  # sentences: what was tried and what it gave
     pairs_tried: int
     pairs_verified: int
-    points: int
+    scene: Scene
 
 
 def reconstruct(
@@ -137,7 +137,7 @@ def reconstruct(
         tuple(story),
         tried,
         verified,
-        len(read_scene(refined).points),
+        read_scene(refined),
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area import FRAMES, MODEL, Area, StageRecord, read_json
+from spn_data.area import FRAMES, MODEL, Area, StageRecord, StageWork, read_json
 from spn_data.camera import Camera
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
@@ -26,13 +26,23 @@ REGISTRATION = "registration.csv"
 
 
 def build_model(
-    area: Area, options: ReconstructOptions, progress: Progress, *, overwrite: bool = False
+    area: Area,
+    options: ReconstructOptions,
+    progress: Progress,
+    *,
+    extend: Area | None = None,
+    overwrite: bool = False,
 ) -> StageRecord:
-    """Reconstruct the area's frames into one model."""
+    """Reconstruct the area's frames into one model.
+
+    extend : the area whose features and matches are taken over, if they were made with the same options.
+    """
     made_of = {k: v for k, v in asdict(options).items() if k != "threads"}
     work = area.begin(MODEL, made_of, {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
+    if extend is not None and not (work.path / DATABASE).exists():
+        _take_over(extend, work)
     frames = read_frames(area.folder(FRAMES) / "frames.csv")
     chosen = frames.select(frames.chosen)
     stopwatch = Stopwatch()
@@ -41,11 +51,21 @@ def build_model(
     write_registration(work.path / REGISTRATION, result.registrations)
     _keep_only_results(work.path, result)
     return work.finish(
-        counts=_counts(result),
+        counts=_counts(result, chosen),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=(*result.attempts, *passages),
     )
+
+
+def _take_over(extend: Area, work: StageWork) -> None:
+    """Features and matches of an area, where they were made with the same options."""
+    before = extend.record(MODEL).made_of["options"]
+    now = work.record.made_of["options"]
+    if all(before[name] == now[name] for name in ("features", "matching")):
+        copied = work.path / "copied.db"
+        shutil.copyfile(extend.folder(MODEL) / DATABASE, copied)
+        copied.rename(work.path / DATABASE)
 
 
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
@@ -118,16 +138,29 @@ def _keep_only_results(work: Path, result: ReconstructResult) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _counts(result: ReconstructResult) -> dict[str, object]:
+def _counts(result: ReconstructResult, chosen: Frames) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
+    scene = result.scene
+    key_of = dict(zip(chosen.names.tolist(), chosen.cameras.tolist(), strict=True))
+    keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
+    cameras = {
+        key: {
+            "focal_px": round(scene.cameras[i].focal_px[0], 2),
+            "fov_deg": round(scene.cameras[i].horizontal_fov_deg, 2),
+            "model": scene.cameras[i].model,
+            "params": [round(float(p), 6) for p in scene.cameras[i].params],
+        }
+        for i, key in keys.items()
+    }
     return {
+        "cameras": cameras,
         "frames": len(result.registrations),
         "registered": len(registered),
         "submodels": list(result.submodels),
         "pairs_tried": result.pairs_tried,
         "pairs_verified": result.pairs_verified,
-        "points": result.points,
+        "points": len(scene.points),
         "observations": observations,
         "mean_error_px": round(
             sum(r.error_px * r.observations for r in registered) / observations, 4

@@ -1,0 +1,110 @@
+"""Compare an area with the exact truth of the simulated flights that it was made from.
+
+    python benchmarks/truth.py AREA FLIGHTS [--json OUT]
+
+FLIGHTS is what `spn-data simulate` wrote. Positions and rotations are judged twice: after the best
+similarity (the reconstruction alone), and as they are (the georegistration too, nothing aligned).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from spn_data.area import FRAMES, GEO, MODEL, Area
+from spn_data.colmap.model import Scene, read_scene
+from spn_data.frames import Frames, read_frames
+from spn_data.pose import Poses, Similarity, pose_errors
+from spn_data.simulate.truth import read_truth
+
+
+def true_poses(frames: Frames, truth_folder: Path) -> Poses:
+    """(N,) exact poses of frames, by their place in the video."""
+    poses = []
+    for sequence, index in zip(frames.sequences.tolist(), frames.video_frame.tolist(), strict=True):
+        truth = read_truth(truth_folder, sequence)
+        poses.append(truth.poses[index : index + 1])
+    return Poses(
+        np.concatenate([p.centers for p in poses]), np.concatenate([p.quats_wxyz for p in poses])
+    )
+
+
+def compare(area: Area, flights: Path) -> dict[str, Any]:
+    """All figures, lengths in metres."""
+    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    chosen = frames.select(frames.chosen)
+    scene = read_scene(area.folder(MODEL))
+    true = _true_of(scene, chosen, flights)
+    world_from_model = Similarity.fit(scene.poses.centers, true.centers)
+    figures: dict[str, Any] = {
+        "chosen": len(chosen),
+        "registered": len(scene.names),
+        "model": _errors(world_from_model.apply_to_poses(scene.poses), true),
+    }
+    if area.has(GEO):
+        geo = read_scene(area.folder(GEO))
+        true_from_geo = Similarity.fit(geo.poses.centers, true.centers)
+        up = true_from_geo.rotation[2, 2]
+        figures["georegistered"] = _errors(geo.poses, true)
+        figures["tilt_deg"] = float(np.rad2deg(np.arccos(np.clip(up, -1, 1))))
+        figures["scale_error"] = 1 / true_from_geo.scale - 1
+    return figures
+
+
+def _true_of(scene: Scene, chosen: Frames, flights: Path) -> Poses:
+    row = {name: k for k, name in enumerate(chosen.names.tolist())}
+    registered = chosen.select(np.array([row[name] for name in scene.names]))
+    return true_poses(registered, flights / "truth")
+
+
+def _errors(poses: Poses, true: Poses) -> dict[str, float]:
+    error_m, error_deg = pose_errors(poses, true)
+    return {
+        "position_median_m": float(np.median(error_m)),
+        "position_p95_m": float(np.quantile(error_m, 0.95)),
+        "position_max_m": float(error_m.max()),
+        "rotation_median_deg": float(np.median(error_deg)),
+        "rotation_p95_deg": float(np.quantile(error_deg, 0.95)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("area", type=Path)
+    parser.add_argument("flights", type=Path)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    figures = compare(Area(arguments.area), arguments.flights)
+    table = Table(title="Against exact truth", title_justify="left", box=None)
+    for column in ("", "median", "p95", "max", "rotation median", "p95"):
+        table.add_column(column)
+    for key, label in (
+        ("model", "after the best similarity"),
+        ("georegistered", "as georegistered"),
+    ):
+        if key in figures:
+            e = figures[key]
+            table.add_row(
+                label,
+                *(f"{e[f'position_{q}_m'] * 100:.1f} cm" for q in ("median", "p95", "max")),
+                *(f"{e[f'rotation_{q}_deg']:.3f} deg" for q in ("median", "p95")),
+            )
+    console = Console()
+    console.print(table)
+    console.print(f"{figures['registered']} of {figures['chosen']} frames in one model")
+    if "tilt_deg" in figures:
+        console.print(f"tilt {figures['tilt_deg']:.2f} deg, scale {figures['scale_error']:+.3%}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

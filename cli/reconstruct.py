@@ -1,0 +1,58 @@
+"""What `spn-data reconstruct` does."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from cli import options, show
+from spn_data.features import FeatureOptions
+from spn_data.pipeline.frames import FramesOptions
+from spn_data.pipeline.reconstruct import Options, reconstruct
+from spn_data.pipeline.reconstruct import add as extend
+from spn_data.reconstruct import ReconstructOptions
+from spn_data.selection import SelectionOptions
+
+
+def run(
+    inputs: tuple[Path, ...],
+    area_folder: Path,
+    *,
+    add: bool,
+    overwrite: bool,
+    fov_deg: tuple[tuple[str, float], ...],
+    target_count: int | None,
+    motion_share: float,
+    mask: str | None,
+    any_telemetry: bool,
+    engine: str,
+    max_features: int,
+    max_image_size: int,
+    threads: int | None,
+    seed: int,
+    **geo: Any,
+) -> None:
+    """Make or extend the area, telling each stage as it is done."""
+    wanted = Options(
+        frames=FramesOptions(
+            selection=SelectionOptions(target_count=target_count, motion_share=motion_share),
+            fov_deg=dict(fov_deg),
+            mask=mask,
+            any_telemetry=any_telemetry,
+        ),
+        model=ReconstructOptions(
+            features=FeatureOptions(max_features=max_features, max_image_size_px=max_image_size),
+            engine=engine,
+            threads=threads or os.cpu_count() or 1,
+            seed=seed,
+        ),
+        geo=options.geo_options(**geo),
+    )
+    area = options.open_area(area_folder)
+    with area.locked(), show.Live() as live:
+        if add:
+            extend(area, list(inputs), wanted, live)
+        else:
+            reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
+    show.verdict(area)

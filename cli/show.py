@@ -1,0 +1,227 @@
+"""What the stages of an area found, as tables and sentences."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager
+from typing import Any
+
+from cli import console
+from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, StageRecord
+from spn_data.pipeline.frames import Plan
+from spn_data.telemetry.track import TelemetrySummary
+
+
+class Live:
+    """Shows stages while they are made: progress on a terminal, tables when one is done."""
+
+    def __init__(self) -> None:
+        self._bars: AbstractContextManager[Any] | None = None
+        self._progress: Any = None
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._bars is not None:
+            self._bars.__exit__(None, None, None)
+            self._bars = None
+
+    def progress(self, step: str, done: int, total: int) -> None:
+        if self._bars is None:
+            self._bars = console.progress()
+            self._progress = self._bars.__enter__()
+        self._progress(step, done, total)
+
+    def planned(self, found: Plan) -> None:
+        rows = []
+        for source in found.sources:
+            beside = ", ".join(path.name for path in source.telemetry) or "none beside it"
+            what = (
+                f"{len(source.parts)} photos" if source.kind == "photos" else _files(source.parts)
+            )
+            rows.append((source.sequence, what, beside))
+        console.table("Sources", rows, ("sequence", "from", "telemetry"))
+        if found.ignored:
+            shown = ", ".join(f"{path} ({why})" for path, why in found.ignored[:8])
+            more = f" and {len(found.ignored) - 8} more" if len(found.ignored) > 8 else ""
+            console.note(f"ignored: {shown}{more}")
+        cost = found.cost
+        console.out.print(
+            f"Choosing frames will take about {duration(cost.seconds)} and {cost.disk_bytes / 1e6:.0f} MB "
+            f"for about {cost.chosen} frames of {cost.candidates}.\n"
+        )
+
+    def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None:
+        self._close()
+        if summary is None:
+            console.note(f"{sequence}: no telemetry.")
+            return
+        heights = [
+            *(["above take-off"] if summary.has_rel_alt else []),
+            *([f"absolute (reference: {summary.abs_reference})"] if summary.has_abs_alt else []),
+        ]
+        rate = f"{summary.rate_hz:.3g} fixes/s" if math.isfinite(summary.rate_hz) else "no rate"
+        gaps = f"{len(summary.gaps)} gaps" if summary.gaps else "no gap"
+        console.out.print(
+            f"{sequence}: {summary.kind}, {summary.with_fix} of {summary.records} records with a fix, "
+            f"{rate}, {gaps}; heights {' and '.join(heights) or 'unknown'}; "
+            f"gimbal {'known' if summary.has_gimbal else 'unknown'}."
+        )
+        for note in summary.notes:
+            console.note(f"{sequence}: {note}")
+
+    def stage(self, record: StageRecord) -> None:
+        self._close()
+        {FRAMES: frames, MODEL: model, GEO: georegistration}[record.stage](record)
+
+
+def frames(record: StageRecord) -> None:
+    counts = record.counts
+    console.table(
+        f"{FRAMES}: chosen frames",
+        [
+            ("chosen", f"{counts['chosen']} of {counts['candidates']} images"),
+            ("sequences", str(counts["sequences"])),
+            ("with a fix", str(counts["with_fix"])),
+            *([("unreadable", str(counts["unreadable"]))] if counts["unreadable"] else []),
+            _time(record),
+        ],
+    )
+    _notes(record)
+
+
+def model(record: StageRecord) -> None:
+    counts = record.counts
+    console.table(
+        f"{MODEL}: reconstruction",
+        [
+            ("registered", f"{counts['registered']} of {counts['frames']} frames in one model"),
+            ("mean reprojection error", f"{counts['mean_error_px']:.2f} px"),
+            ("points", f"{counts['points']} seen {counts['observations']} times"),
+            ("pairs", f"{counts['pairs_verified']} verified of {counts['pairs_tried']} tried"),
+            *(
+                (f"camera {key}", f"{camera['focal_px']:.1f} px, {camera['fov_deg']:.1f} deg wide")
+                for key, camera in counts["cameras"].items()
+            ),
+            _time(record),
+        ],
+    )
+    _notes(record)
+
+
+def georegistration(record: StageRecord) -> None:
+    c = record.counts
+    lat, lon, alt = c["origin"]
+    console.table(
+        f"{GEO}: place in the world",
+        [
+            ("fixes", f"{c['fixes']} of {c['frames']} frames, {c['outliers']} of them outliers"),
+            (
+                "residuals",
+                f"{_m(c['horizontal_rmse_m'])} horizontal, {_m(c['vertical_rmse_m'])} vertical (RMSE)",
+            ),
+            ("CE90, LE90", f"{_m(c['ce90_m'])}, {_m(c['le90_m'])}"),
+            (
+                "held out",
+                f"{_m(c['held_out_horizontal_rmse_m'])} horizontal, {_m(c['held_out_vertical_rmse_m'])} "
+                f"vertical (RMSE over {c['held_out_blocks']} blocks of time)",
+            ),
+            (
+                "uncertainty (1 sigma)",
+                f"{_m(c['sigma_horizontal_m'])} horizontal, {_m(c['sigma_vertical_m'])} vertical, "
+                f"tilt {_of(c['sigma_tilt_deg'], '.2f')} deg, "
+                f"heading {_of(c['sigma_heading_deg'], '.2f')} deg, "
+                f"scale {_of(c['sigma_scale'], '.3%')}",
+            ),
+            ("from", ", ".join(c["observations"])),
+            ("origin", f"{lat:.6f}, {lon:.6f}, height {alt:.2f} m ({c['height_reference']})"),
+            _time(record),
+        ],
+    )
+    _notes(record)
+
+
+def status(area: Area) -> None:
+    """Every stage: made when, of what, stale or not."""
+    rows = []
+    for stage in STAGES:
+        if not area.has(stage):
+            state = (
+                "unfinished: the same command goes on"
+                if area.partial(stage).exists()
+                else "missing"
+            )
+            rows.append((stage, state, "", ""))
+            continue
+        record = area.record(stage)
+        reason = area.stale_because(stage)
+        state = f"stale: {reason}" if reason else "complete"
+        rows.append((stage, state, _summary(record), record.finished))
+    console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
+    verdict(area)
+
+
+def verdict(area: Area) -> None:
+    """One sentence on how far the poses can be trusted."""
+    if not area.has(MODEL):
+        console.out.print("There is no model yet: spn-data reconstruct makes it.")
+        return
+    counts = area.record(MODEL).counts
+    share = counts["registered"] / counts["frames"]
+    sentence = f"{counts['registered']} of {counts['frames']} frames ({share:.1%}) have a pose"
+    if area.has(GEO) and area.stale_because(GEO) is None:
+        c = area.record(GEO).counts
+        sentence += (
+            f" in {area.folder(GEO)}; the whole model may lie {_m(_twice(c['sigma_horizontal_m']))} "
+            f"beside and {_m(_twice(c['sigma_vertical_m']))} above or below its true place (2 sigma)."
+        )
+    else:
+        sentence += f" in {area.folder(MODEL)}, in units of the model: lengths there are no metres."
+    console.out.print(sentence)
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _summary(record: StageRecord) -> str:
+    c = record.counts
+    if record.stage == FRAMES:
+        return f"{c['chosen']} frames of {c['sequences']} sequences"
+    if record.stage == MODEL:
+        return f"{c['registered']} of {c['frames']} frames, {c['points']} points"
+    return f"{_m(c['horizontal_rmse_m'])} horizontal, {_m(c['vertical_rmse_m'])} vertical residual (RMSE)"
+
+
+def _notes(record: StageRecord) -> None:
+    for note in record.notes:
+        console.note(note)
+
+
+def _time(record: StageRecord) -> tuple[str, str]:
+    steps = ", ".join(f"{name} {duration(s)}" for name, s in record.seconds.items() if s >= 1)
+    total, cpu = sum(record.seconds.values()), sum(record.cpu_seconds.values())
+    return "time", f"{duration(total)} ({cpu:.0f} s of CPU){f': {steps}' if steps else ''}"
+
+
+def _files(parts: tuple[Any, ...]) -> str:
+    return parts[0].name if len(parts) == 1 else f"{parts[0].name} and {len(parts) - 1} more parts"
+
+
+def _m(value: float | None) -> str:
+    return _of(value, ".2f") + " m"
+
+
+def _of(value: float | None, form: str) -> str:
+    return "unknown" if value is None else format(value, form)
+
+
+def _twice(value: float | None) -> float | None:
+    return None if value is None else 2 * value

@@ -1,0 +1,46 @@
+"""What `spn-data simulate` does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from cli import console
+from spn_data.simulate.gnss import GnssOptions
+from spn_data.simulate.presets import MappingPaths
+from spn_data.simulate.presets import preset as named
+from spn_data.simulate.produce import simulate
+
+
+def run(
+    out: Path,
+    preset: str,
+    seed: int,
+    *,
+    only: tuple[str, ...],
+    mapping_paths: str,
+    rtk: bool,
+    no_gimbal: bool,
+    time_offset_s: float,
+    readout_s: float,
+    area_factor: float,
+    length_factor: float,
+) -> None:
+    """Render into a new folder and say what lies where."""
+    base = named(preset, seed=seed)
+    options = replace(
+        base,
+        only=only,
+        mapping_paths=MappingPaths(mapping_paths),
+        gnss=GnssOptions.rtk() if rtk else base.gnss,
+        gimbal_angles=not no_gimbal,
+        time_offset_s=time_offset_s,
+        readout_s=readout_s,
+        area_factor=area_factor,
+        length_factor=length_factor,
+    )
+    with console.progress() as progress:
+        simulate(out, options, lambda done, total: progress("rendering", done, total))
+    lens = options.mapping_lens.fov_deg
+    console.out.print(f"{out}: videos in mapping/ and evaluation/, exact truth in truth/.")
+    console.out.print(f"Next: spn-data reconstruct {out / 'mapping'} --area AREA --fov {lens:g}")

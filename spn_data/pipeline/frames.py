@@ -1,0 +1,292 @@
+"""Stage 1-frames: videos and photos with telemetry to chosen frames."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spn_data.area import FRAMES, Area, StageRecord, content_fingerprint, read_json, write_json
+from spn_data.camera import Camera
+from spn_data.candidates import Candidates, analyse, frames_of
+from spn_data.errors import InputError
+from spn_data.extraction import Cost, check_space, estimate_cost, extract_chosen
+from spn_data.frames import Frames, read_frames, write_frames
+from spn_data.measurement import Measurements
+from spn_data.photos import PhotoHeaders, load_mask
+from spn_data.pipeline.telemetry import telemetry_of
+from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
+from spn_data.sources import Source, SourceKind, discover
+from spn_data.telemetry.table import write_track
+from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
+from spn_data.timing import Progress, Stopwatch
+
+# Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
+_GUESSED_FOCAL_SHARE = 0.7
+_DIAGONAL_35MM = 43.267
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesOptions:
+    """How frames are made from sources."""
+
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    fov_deg: Mapping[str, float] = field(
+        default_factory=dict
+    )  # horizontal, by sequence; "*" for all
+    mask: str | None = None  # an image, or a folder of <sequence>.png
+    any_telemetry: bool = False  # also telemetry whose length does not fit the video's
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What lies before the user, ahead of any work."""
+
+    sources: tuple[Source, ...]
+    ignored: tuple[tuple[Path, str], ...]
+    cost: Cost
+
+
+def plan(inputs: list[Path], options: FramesOptions, taken: set[str]) -> Plan:
+    """Sources of all inputs, with names that neither each other nor `taken` have."""
+    sources: list[Source] = []
+    ignored: list[tuple[Path, str]] = []
+    names = {name.lower() for name in taken}
+    for path in inputs:
+        found = discover(path)
+        ignored += found.ignored
+        for source in found.sources:
+            name, number = source.sequence, 2
+            while name.lower() in names:
+                name, number = f"{source.sequence}-{number}", number + 1
+            names.add(name.lower())
+            sources.append(replace(source, sequence=name))
+    return Plan(
+        tuple(sources),
+        tuple(ignored),
+        estimate_cost(sources, target_count=options.selection.target_count),
+    )
+
+
+def fingerprints(sources: tuple[Source, ...]) -> dict[str, str]:
+    """Content fingerprint of every file of the sources, by sequence and name."""
+    return {
+        f"{source.sequence}/{path.name}": content_fingerprint(path)
+        for source in sources
+        for path in (*source.parts, *source.telemetry)
+    }
+
+
+def choose_frames(
+    area: Area,
+    found: Plan,
+    options: FramesOptions,
+    progress: Progress,
+    *,
+    extend: Area | None = None,
+    overwrite: bool = False,
+    tell: Callable[[str, TelemetrySummary | None], None] = lambda *_: None,
+) -> StageRecord:
+    """Choose and write frames of the sources; `tell` hears each source's telemetry as it is read.
+
+    extend : the area whose frames are kept and come first.
+    """
+    inputs = fingerprints(found.sources)
+    if extend is not None:
+        inputs = {**extend.record(FRAMES).inputs, **inputs}
+    work = area.begin(FRAMES, asdict(options), inputs, overwrite=overwrite)
+    if isinstance(work, StageRecord):
+        return work
+    check_space(work.path, found.cost.disk_bytes)
+    stopwatch = Stopwatch()
+    notes: list[str] = []
+    (work.path / "telemetry").mkdir(exist_ok=True)
+    (work.path / "masks").mkdir(exist_ok=True)
+    cameras: dict[str, dict[str, object]] = {}
+    kept: list[Frames] = []
+    if extend is not None:
+        kept, cameras = _take_over(extend, work.path)
+    candidates, tracks = [], []
+    for source in found.sources:
+        with stopwatch.step("analysis"):
+            measured = _analyse_once(source, work.path / "analysis", found.cost, progress)
+        track = telemetry_of(source, measured, any_telemetry=options.any_telemetry)
+        check_usable(measured.measured, options.selection, source.parts[0].name)
+        tell(source.sequence, None if track is None else summarize(track))
+        notes += measured.notes
+        candidates.append(measured)
+        tracks.append(track)
+    _check_some_fit(candidates)
+    choices = _choose(candidates, tracks, options.selection)
+    parts = []
+    done_before = 0
+    total = sum(int(choice.chosen.sum()) for choice in choices)
+    for one, track, choice in zip(candidates, tracks, choices, strict=True):
+        frames = frames_of(one, choice)
+        if track is not None:
+            frames = frames.with_telemetry(track.at(frames.time_s))
+            write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)
+        cameras.update(_start_cameras(frames, one.photos, options.fov_deg))
+        _write_mask(options.mask, frames, work.path / "masks")
+        with stopwatch.step("frames"):
+            extract_chosen(
+                one.source,
+                frames,
+                work.path / one.source.sequence,
+                progress=lambda n, before=done_before: progress("frames", before + n, total),  # type: ignore[misc]
+            )
+        done_before += int(choice.chosen.sum())
+        parts.append(frames)
+    frames = Frames.concatenate([*kept, *parts])
+    write_frames(work.path / "frames.csv", frames)
+    write_json(work.path / "cameras.json", {"version": 1, "cameras": cameras})
+    shutil.rmtree(work.path / "analysis", ignore_errors=True)
+    return work.finish(
+        counts={
+            "candidates": len(frames),
+            "chosen": int(frames.chosen.sum()),
+            "sequences": len(np.unique(frames.sequences)),
+            "with_fix": int((frames.has_fix & frames.chosen).sum()),
+            "unreadable": int((frames.status == "unreadable").sum()),
+        },
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+        notes=tuple(notes),
+    )
+
+
+def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict[str, object]]]:
+    """The frames of an area, linked rather than copied where the disk allows."""
+    folder = extend.folder(FRAMES)
+    frames = read_frames(folder / "frames.csv")
+    chosen = [folder / name for name in frames.names[frames.chosen].tolist()]
+    others = [*(folder / "telemetry").glob("*.csv"), *(folder / "masks").glob("*.png")]
+    for path in [*chosen, *others]:
+        link = target / path.relative_to(folder)
+        link.parent.mkdir(exist_ok=True)
+        if not link.exists():
+            try:
+                os.link(path, link)
+            except OSError:  # a disk without hard links
+                shutil.copy2(path, link)
+    return [frames], dict(read_json(folder / "cameras.json")["cameras"])
+
+
+def _analyse_once(source: Source, folder: Path, cost: Cost, progress: Progress) -> Candidates:
+    """Measurements of a source; those of videos are kept, so that an interrupted run has them."""
+    path = folder / f"{source.sequence}.npz"
+    step = f"analysis {source.sequence}"
+    if source.kind is SourceKind.VIDEO and path.exists():
+        with np.load(path, allow_pickle=False) as stored:
+            measured = Measurements(**{f.name: stored[f.name] for f in fields(Measurements)})
+            starts, notes = stored["part_start_s"], stored["notes"]
+        return Candidates(
+            source, measured, tuple(starts.tolist()), None, None, tuple(notes.tolist())
+        )
+    total = cost.candidates if source.kind is SourceKind.VIDEO else len(source.parts)
+    found = analyse(source, progress=lambda done: progress(step, done, max(done, total)))
+    if source.kind is SourceKind.VIDEO:
+        folder.mkdir(exist_ok=True)
+        temporary = path.with_name("part.npz")
+        np.savez(
+            temporary,
+            part_start_s=np.array(found.part_start_s),
+            notes=np.array(found.notes, dtype=np.str_),
+            **{f.name: getattr(found.measured, f.name) for f in fields(Measurements)},
+        )
+        temporary.replace(path)
+    return found
+
+
+def _choose(
+    candidates: list[Candidates], tracks: list[Telemetry | None], options: SelectionOptions
+) -> list[Choice]:
+    positions = []
+    for one, track in zip(candidates, tracks, strict=True):
+        positions.append(None if track is None else _positions(track.at(one.measured.time_s)))
+    videos = [k for k, one in enumerate(candidates) if one.source.kind is SourceKind.VIDEO]
+    chosen = dict(
+        zip(
+            videos,
+            choose_all([(candidates[k].measured, positions[k]) for k in videos], options),
+            strict=True,
+        )
+    )
+    return [
+        chosen[k] if k in chosen else choose_photos(one.measured, options, position_m=positions[k])
+        for k, one in enumerate(candidates)
+    ]
+
+
+def _positions(rows: Telemetry) -> np.ndarray:
+    """(N, 2) metres east and north of the first fix, good for distances; NaN where unknown."""
+    if not rows.has_fix.any():
+        return np.full((len(rows), 2), np.nan)
+    lat, lon = np.deg2rad(rows.lat_lon_deg).T
+    lat_0, lon_0 = lat[rows.has_fix][0], lon[rows.has_fix][0]
+    radius_m = 6_371_000.0
+    return np.column_stack([(lon - lon_0) * np.cos(lat_0), lat - lat_0]) * radius_m
+
+
+def _check_some_fit(candidates: list[Candidates]) -> None:
+    if sum(int(one.measured.readable.sum()) for one in candidates) < 3:
+        raise InputError("fewer than three images can be read, a model needs more")
+
+
+def _start_cameras(
+    frames: Frames, photos: PhotoHeaders | None, fov_deg: Mapping[str, float]
+) -> dict[str, dict[str, object]]:
+    """Start intrinsics of each camera of one source: the user's, the photo's own, or a guess."""
+    cameras = {}
+    sequence = str(frames.sequences[0])
+    fov = fov_deg.get(sequence, fov_deg.get("*"))
+    for key in np.unique(frames.cameras[frames.width > 0]).tolist():
+        row = int(np.flatnonzero((frames.cameras == key) & (frames.width > 0))[0])
+        width, height = int(frames.width[row]), int(frames.height[row])
+        focal_px = None if photos is None else _photo_focal_px(photos, row, width, height)
+        source = "photo metadata"
+        if fov is not None:
+            focal_px = Camera.from_horizontal_fov(width, height, fov).focal_px[0]
+            source = f"horizontal field of view of {fov:g} deg, as given"
+        known = focal_px is not None
+        if focal_px is None:
+            focal_px, source = _GUESSED_FOCAL_SHARE * max(width, height), "guess"
+        cameras[key] = {
+            "model": "SIMPLE_RADIAL",
+            "width": width,
+            "height": height,
+            "params": [focal_px, width / 2, height / 2, 0.0],
+            "focal_is_known": known,
+            "source": source,
+        }
+    return cameras
+
+
+def _photo_focal_px(photos: PhotoHeaders, row: int, width: int, height: int) -> float | None:
+    """From the 35-mm equivalent, which compares diagonals (CIPA DCG-001)."""
+    metadata = photos.metadata[row]
+    if metadata is None or not metadata.focal_35mm > 0:
+        return None
+    return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(width, height))
+
+
+def _write_mask(given: str | None, frames: Frames, folder: Path) -> None:
+    """The source's mask at its size, where one is given."""
+    if given is None:
+        return
+    sequence = str(frames.sequences[0])
+    path = Path(given)
+    if path.is_dir():
+        path = path / f"{sequence}.png"
+        if not path.exists():
+            return
+    row = int(np.flatnonzero(frames.width > 0)[0])
+    usable = load_mask(path, int(frames.width[row]), int(frames.height[row]))
+    ok, data = cv2.imencode(".png", usable.astype(np.uint8) * 255)
+    assert ok
+    (folder / f"{sequence}.png").write_bytes(data.tobytes())

@@ -1,0 +1,149 @@
+"""Stage 3-geo: the model in East-North-Up metres, and how far to trust that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spn_data.area import FRAMES, GEO, MODEL, Area, StageRecord, write_json
+from spn_data.colmap.model import Scene, read_scene, write_transformed
+from spn_data.errors import GeometryError
+from spn_data.frames import Frames, read_frames
+from spn_data.georegister.observe import align_telemetry
+from spn_data.georegister.offset import TimeOffset, estimate_time_offset
+from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.register import georegister as fit
+from spn_data.georegister.result import GeoFit
+from spn_data.telemetry.table import read_track
+from spn_data.telemetry.track import Telemetry
+from spn_data.timing import Progress, Stopwatch
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoStageOptions:
+    """How the model is put into the world."""
+
+    fit: GeoregisterOptions = field(default_factory=GeoregisterOptions)
+    # Added to the telemetry's times, by sequence ("*" for all); a sequence not named here is estimated.
+    time_offset_s: Mapping[str, float] = field(default_factory=dict)
+
+
+def has_fixes(area: Area) -> bool:
+    """Any telemetry of the area's frames holds a position."""
+    return any(track.has_fix.any() for track in read_tracks(area).values())
+
+
+def read_tracks(area: Area) -> dict[str, Telemetry]:
+    """Telemetry of each sequence, as it was read, by sequence."""
+    folder = area.folder(FRAMES) / "telemetry"
+    return {path.stem: read_track(path) for path in sorted(folder.glob("*.csv"))}
+
+
+def georegister(
+    area: Area, options: GeoStageOptions, progress: Progress, *, overwrite: bool = False
+) -> StageRecord:
+    """Put the area's model into East-North-Up metres.
+
+    Raises GeometryError where telemetry does not determine the answer.
+    """
+    work = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
+    if isinstance(work, StageRecord):
+        return work
+    stopwatch = Stopwatch()
+    tracks = read_tracks(area)
+    if not any(track.has_fix.any() for track in tracks.values()):
+        raise GeometryError(
+            f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model)"
+        )
+    scene = read_scene(area.folder(MODEL))
+    frames = registered_frames(area, scene)
+    with stopwatch.step("time offset"):
+        offsets = _time_offsets(scene, frames, tracks, options, progress)
+    shifted = {
+        name: track.shifted(offsets[name].applied_s if name in offsets else 0.0)
+        for name, track in tracks.items()
+    }
+    with stopwatch.step("fit"):
+        telemetry = align_telemetry(shifted, frames.sequences.tolist(), frames.time_s)
+        result = fit(scene.poses, telemetry, frames.sequences.tolist(), frames.time_s, options.fit)
+    with stopwatch.step("write"):
+        write_transformed(area.folder(MODEL), work.path, result.world_from_model)
+        write_json(
+            work.path / "geo.json",
+            {
+                **result.to_json(),
+                "frames": list(scene.names),
+                "time_offsets": {name: asdict(offset) for name, offset in offsets.items()},
+            },
+        )
+    return work.finish(
+        counts=_counts(result),
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+        notes=(*(o.tell(name) for name, o in offsets.items()), *result.notes),
+    )
+
+
+def registered_frames(area: Area, scene: Scene) -> Frames:
+    """Rows of frames.csv of the scene's images, in the scene's order."""
+    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    row = {name: k for k, name in enumerate(frames.names.tolist())}
+    return frames.select(np.array([row[name] for name in scene.names], dtype=np.int64))
+
+
+def _time_offsets(
+    scene: Scene,
+    frames: Frames,
+    tracks: Mapping[str, Telemetry],
+    options: GeoStageOptions,
+    progress: Progress,
+) -> dict[str, TimeOffset]:
+    """What is added to each flight's telemetry times: given, else estimated. Photos carry their own."""
+    offsets: dict[str, TimeOffset] = {}
+    moving = [name for name, track in tracks.items() if track.kind != "exif"]
+    for k, name in enumerate(moving):
+        progress("time offset", k, len(moving))
+        given = options.time_offset_s.get(name, options.time_offset_s.get("*"))
+        mine = frames.sequences == name
+        if given is not None:
+            offsets[name] = TimeOffset(given, 0.0)
+        elif mine.any():
+            offsets[name] = estimate_time_offset(
+                scene.poses[mine], frames.time_s[mine], tracks[name], options.fit
+            )
+    if moving:
+        progress("time offset", len(moving), len(moving))
+    return offsets
+
+
+def _counts(result: GeoFit) -> dict[str, Any]:
+    summary, stated = result.summary, result.uncertainty
+    return {
+        "frames": summary.frames,
+        "fixes": summary.fixes,
+        "outliers": summary.outliers,
+        "effective_fixes": _rounded(summary.effective_fixes),
+        "horizontal_rmse_m": _rounded(summary.horizontal_rmse_m),
+        "vertical_rmse_m": _rounded(summary.vertical_rmse_m),
+        "ce90_m": _rounded(summary.ce90_m),
+        "le90_m": _rounded(summary.le90_m),
+        "held_out_horizontal_rmse_m": _rounded(result.held_out_blocks.horizontal_rmse_m),
+        "held_out_vertical_rmse_m": _rounded(result.held_out_blocks.vertical_rmse_m),
+        "held_out_blocks": result.held_out_blocks.folds,
+        "sigma_horizontal_m": _rounded(stated.horizontal_m),
+        "sigma_vertical_m": _rounded(stated.vertical_m),
+        "sigma_tilt_deg": _rounded(stated.tilt_deg),
+        "sigma_heading_deg": _rounded(stated.heading_deg),
+        "sigma_scale": _rounded(stated.scale, 6),
+        "observations": list(result.observations),
+        "height_reference": result.height_reference.value,
+        "origin": [result.origin.lat_deg, result.origin.lon_deg, result.origin.alt_m],
+    }
+
+
+def _rounded(value: float, digits: int = 4) -> float | None:
+    """A figure for stage.json; None where there is none."""
+    return round(float(value), digits) if np.isfinite(value) else None
