@@ -10,6 +10,7 @@ from spn_data.errors import InputError
 from spn_data.frames import FrameStatus
 from spn_data.measurement import Measurements
 
+_UNKNOWN_HEIGHT_M = 100.0
 # Positions in the image at which motion is measured, in shares of its width about the centre.
 _GRID = np.array([[x, y, 1.0] for y in (-0.2, 0.0, 0.2) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)])
 
@@ -18,13 +19,16 @@ _GRID = np.array([[x, y, 1.0] for y in (-0.2, 0.0, 0.2) for x in (-0.4, -0.2, 0.
 class SelectionOptions:
     """How frames are chosen."""
 
-    motion_share: float = 0.08  # motion of the image between chosen frames, as a share of its width
+    motion_share: float = 0.10  # motion of the image between chosen frames, as a share of its width
     window: float = (
         0.35  # the sharpest is taken within this part of motion_share before and after it
     )
     min_spacing_s: float = 0.3  # chosen frames are never closer in time
     max_spacing_s: float = 4.0  # nor further apart, though the image stands still
-    max_distance_m: float = 10.0  # nor further apart by the telemetry, where it is known
+    max_distance_m: float = 3.0  # nor further apart by the telemetry, where it is known ...
+    max_distance_share: float = (
+        0.1  # ... or this share of the height above take-off, if that is more
+    )
     blur_ratio: float = (
         0.75  # a frame is blurred below this share of its neighbours' median sharpness
     )
@@ -86,7 +90,10 @@ def check_usable(measured: Measurements, options: SelectionOptions, name: str) -
 def choose(
     measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
 ) -> Choice:
-    """Which frames of a video are used, and why; position_m (N, 2 or 3) metres, NaN where unknown.
+    """Which frames of a video are used, and why.
+
+    position_m : (N, 3) by the telemetry: east, north and height above take-off; NaN where unknown. An
+    unknown height is taken as 100 m, so that distance adds few frames.
 
     From each chosen frame, the next is the sharpest whose motion is near `motion_share`. Where the image
     stands still it is the sharpest before `max_spacing_s`. A passage without a sharp frame still gives its
@@ -137,6 +144,7 @@ def choose_all(
             motion_share=options.motion_share * factor,
             max_spacing_s=max(options.max_spacing_s * factor, options.min_spacing_s),
             max_distance_m=options.max_distance_m * factor,
+            max_distance_share=options.max_distance_share * factor,
         )
         return [choose(m, these, position_m=p) for m, p in sources]
 
@@ -159,7 +167,10 @@ def choose_all(
 def choose_photos(
     measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
 ) -> Choice:
-    """All readable photos but those that repeat the one chosen before: same place, image unmoved."""
+    """All readable photos but those that repeat the one chosen before: same place, image unmoved.
+
+    position_m : (N, 3) as for `choose`.
+    """
     n = len(measured)
     status = np.full(n, str(FrameStatus.CHOSEN), dtype="U10")
     reason = np.full(n, "chosen: photo", dtype=object)
@@ -173,10 +184,10 @@ def choose_photos(
             continue
         if last is not None:
             share = _displacement(total)
-            motion_px[row] = share * measured.width[row]
+            motion_px[row] = share * measured.width[row] if np.isfinite(share) else np.nan
             apart = np.nan
             if position_m is not None:
-                apart = float(np.linalg.norm(position_m[row] - position_m[last]))
+                apart = float(np.linalg.norm(position_m[row, :2] - position_m[last, :2]))
             if share < options.still_share and not apart > options.still_m:
                 status[row] = FrameStatus.SKIPPED
                 reason[row] = f"skipped: the photo before, {motion_px[row]:.1f} px apart"
@@ -190,13 +201,13 @@ class _Ahead:
     """The frames after the one chosen last, as far as the next must be chosen.
 
     first : position of the first of them; elapsed_s, motion (shares of the width, inf beyond a break of the
-    image), distance_m (NaN unknown) : (K,) since the frame chosen last.
+    image), distance (NaN unknown, 1 at the greatest that is allowed) : (K,) since the frame chosen last.
     """
 
     first: int
     elapsed_s: np.ndarray
     motion: np.ndarray
-    distance_m: np.ndarray
+    distance: np.ndarray
     at_start: bool
 
 
@@ -249,7 +260,12 @@ class _Passage:
             motion[i] = _displacement(total)
         distance = np.full(stop - first, np.nan)
         if self.position_m is not None:
-            distance = np.linalg.norm(self.position_m[first:stop] - self.position_m[origin], axis=1)
+            apart = self.position_m[first:stop] - self.position_m[origin]
+            height = np.nan_to_num(self.position_m[first:stop, 2], nan=_UNKNOWN_HEIGHT_M)
+            limit_m = np.maximum(
+                self.options.max_distance_m, self.options.max_distance_share * height
+            )
+            distance = np.linalg.norm(apart[:, :2], axis=1) / limit_m
         elapsed = self.time_s[first:stop] - self.time_s[origin]
         return _Ahead(first, elapsed, motion, distance, last is None)
 
@@ -261,7 +277,7 @@ class _Passage:
         near = self._between(ahead, 1 - self.options.window, 1 + self.options.window)
         if len(near) == 0:
             return near, near
-        return near, np.union1d(near, self._between(ahead, 0.4, 1.8))
+        return near, np.union1d(near, self._between(ahead, 0.4, 2.5))
 
     def _between(self, ahead: _Ahead, low: float, high: float) -> np.ndarray:
         options = self.options
@@ -274,7 +290,7 @@ class _Passage:
         farthest_s = options.max_spacing_s
         due = (
             (ahead.motion >= low * options.motion_share)
-            | (ahead.distance_m >= low * options.max_distance_m)
+            | (ahead.distance >= min(low, 1))
             | (ahead.elapsed_s >= min(low, 1) * farthest_s)
         ) & (ahead.elapsed_s >= options.min_spacing_s - 1e-9)
         if not due.any():
@@ -282,9 +298,7 @@ class _Passage:
         start = int(np.argmax(due))
         # Where the image moves too fast for the shortest spacing, a few frames still compete.
         grace_s = ahead.elapsed_s[start] + 0.5 * options.min_spacing_s
-        over = (ahead.motion > high * options.motion_share) | (
-            ahead.distance_m > max(high, 1) * options.max_distance_m
-        )
+        over = (ahead.motion > high * options.motion_share) | (ahead.distance > high)
         over &= ahead.elapsed_s > grace_s
         over[: start + 1] = False
         stop = int(np.argmax(over)) if over.any() else len(over)
