@@ -212,7 +212,7 @@ class _Flight:
             weight[problem.kind, problem.frame] = weights
             state = state.moved(solution.step[:-1])
             offset_s += float(np.clip(solution.step[-1], -1.0, 1.0))
-            if abs(offset_s) > limit_s:
+            if not abs(offset_s) <= limit_s:
                 return None
             problem = Problem.build(centers, rotations, self.fixes(offset_s), level, self.options)
         linear = self._linear(problem, state)

@@ -13,7 +13,9 @@ from spn_data.georegister.options import GeoregisterOptions
 from spn_data.pose import Similarity, quats_from_rotations, rotations_from_vectors
 
 SHARED = 7  # parameters: centre (3), rotation vector in the world (3), logarithm of scale
-_FREE_HEIGHT_M = 1e3  # sigma of a vertical offset that nothing is known of
+_FREE_HEIGHT_M = 1e3  # sigma of a height that nothing is known of
+# Of rotation and scale about their present values: pulls nowhere, keeps a straight line's equations solvable.
+_WEAK_PRECISION = 1e-2
 
 
 class Kind(IntEnum):
@@ -167,7 +169,7 @@ class Problem:
         bias = np.sqrt(1 / bias_weight) * self.options.gimbal_bias_deg
         precision = np.concatenate(
             [
-                np.zeros(SHARED),
+                np.array([0.0, 0.0, 0.0, *[_WEAK_PRECISION] * 4]),
                 1 / offset_sigma_m**2,
                 1 / np.repeat(bias, 3) ** 2,
                 np.full(f, 1 / self.options.level_camera_sigma_deg**2),

@@ -1,0 +1,354 @@
+"""Georegistration judged as a method: many draws of GNSS and gimbal errors on one reconstruction.
+
+    python benchmarks/georegister.py [--draws 200] [--seed 1] [--json OUT]
+    python benchmarks/georegister.py --area AREA --flights FLIGHTS
+
+Without an area, the model is the simulator's exact poses with 1 cm and 0.03 degrees of noise, in another
+gauge. With one, its reconstruction is taken, FLIGHTS being what `spn-data simulate` wrote; the draws replace
+its telemetry. The oracle is the plain least-squares similarity of the true centres to the same fixes without
+bursts. Errors are against the truth, nothing aligned.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.errors import GeometryError
+from spn_data.georegister import (
+    GeoFit,
+    GeoregisterOptions,
+    align_telemetry,
+    estimate_time_offset,
+    georegister,
+    georegistration_errors,
+)
+from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
+from spn_data.simulate.flight import FlightPath, simulate_paths, simulate_telemetry
+from spn_data.simulate.gnss import GnssOptions
+from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset
+from spn_data.telemetry.track import Telemetry
+
+FRAMES_PER_S = 1.2
+MODEL_SIGMA_M = 0.01
+MODEL_SIGMA_DEG = 0.03
+FIGURES = ("position_m", "horizontal_m", "vertical_m", "tilt_deg", "heading_deg", "scale")
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A reconstruction with its truth: N frames of some flights."""
+
+    paths: dict[str, FlightPath]
+    sequence: list[str]
+    time_s: np.ndarray
+    poses: Poses
+    true: Poses
+    world_from_model: Similarity
+
+
+def simulated_model(options: SimulateOptions) -> Model:
+    """The simulator's own poses of about `FRAMES_PER_S` frames, a little off, in a gauge of their own."""
+    paths = {n: p for n, p in simulate_paths(options).items() if p.role == "mapping"}
+    rng = np.random.default_rng([options.seed, 77])
+    sequence: list[str] = []
+    times, centers, rotations = [], [], []
+    for name, path in paths.items():
+        count = int(path.time_s[-1] * FRAMES_PER_S)
+        chosen = np.sort(rng.choice(len(path.time_s), count, replace=False))
+        sequence += [name] * count
+        times.append(path.time_s[chosen])
+        centers.append(path.poses.centers[chosen])
+        rotations.append(path.poses.rotations[chosen])
+    true = Poses.from_rotations(np.concatenate(centers), np.concatenate(rotations))
+    n = len(true)
+    shake = np.deg2rad(MODEL_SIGMA_DEG) * rng.standard_normal((n, 3))
+    near = Poses.from_rotations(
+        true.centers + MODEL_SIGMA_M * rng.standard_normal((n, 3)),
+        rotations_from_vectors(shake) @ true.rotations,
+    )
+    turn = rotations_from_vectors(rng.standard_normal(3))
+    model_from_world = Similarity(float(np.exp(rng.normal())), turn, 10 * rng.standard_normal(3))
+    return Model(
+        paths,
+        sequence,
+        np.concatenate(times),
+        model_from_world.apply_to_poses(near),
+        true,
+        model_from_world.inverse(),
+    )
+
+
+def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptions]:
+    """A real reconstruction of simulated flights, and the options that these were made with."""
+    from spn_data.area import FRAMES, MODEL, Area
+    from spn_data.colmap.model import read_scene
+    from spn_data.frames import read_frames
+
+    made = json.loads((flights / "truth" / "options.json").read_text(encoding="utf-8"))
+    options = replace(
+        preset(made["preset"], seed=made["seed"]),
+        fps=made["fps"],
+        area_factor=made["area_factor"],
+        length_factor=made["length_factor"],
+        mapping_paths=MappingPaths(made["mapping_paths"]),
+    )
+    paths = {n: p for n, p in simulate_paths(options).items() if p.role == "mapping"}
+    folder = Area(area)
+    scene = read_scene(folder.folder(MODEL))
+    frames = read_frames(folder.folder(FRAMES) / "frames.csv")
+    row = {name: k for k, name in enumerate(frames.names.tolist())}
+    frames = frames.select(np.array([row[name] for name in scene.names]))
+    sequence = frames.sequences.tolist()
+    picked = [
+        paths[s].poses[i : i + 1]
+        for s, i in zip(sequence, frames.video_frame.tolist(), strict=True)
+    ]
+    true = Poses(
+        np.concatenate([p.centers for p in picked]), np.concatenate([p.quats_wxyz for p in picked])
+    )
+    world_from_model = Similarity.fit(scene.poses.centers, true.centers)
+    return Model(paths, sequence, frames.time_s, scene.poses, true, world_from_model), options
+
+
+def read_as_written(path: FlightPath, options: SimulateOptions, sigma_m: float | None) -> Telemetry:
+    """Telemetry of a draw, rounded as in the subtitle file."""
+    drawn = simulate_telemetry(path, options)
+    return Telemetry.from_columns(
+        drawn.time_s,
+        lat_lon_deg=np.round(drawn.lat_lon_deg, 6) if sigma_m is None else drawn.lat_lon_deg,
+        rel_alt_m=np.round(drawn.rel_alt_m, 3),
+        gimbal_deg=np.round(drawn.gimbal_deg, 1),
+        sigma_m=None if sigma_m is None else np.full((len(drawn.time_s), 3), sigma_m),
+        kind="dji-srt",
+    )
+
+
+def fixes_of_draw(
+    model: Model, options: SimulateOptions, sigma_m: float | None
+) -> tuple[Telemetry, Telemetry]:
+    """Telemetry of the frames, and the same without bursts."""
+    calm = replace(options, gnss=replace(options.gnss, burst_interval_s=float("inf")))
+    both = []
+    for o in (options, calm):
+        tracks = {name: read_as_written(path, o, sigma_m) for name, path in model.paths.items()}
+        both.append(align_telemetry(tracks, model.sequence, model.time_s))
+    return both[0], both[1]
+
+
+def judge(fit: GeoFit, model: Model, options: SimulateOptions, calm: Telemetry) -> dict[str, Any]:
+    """Errors of a fit and of the oracle, and how many sigma the fit is off by its own statement."""
+    # The truth's zero in the fit's frame: both have the same axes within the courtyard.
+    true_origin = np.array([[options.origin.lat_deg, options.origin.lon_deg, 0.0]])
+    shift = fit.origin.enu_from_wgs84(true_origin)[0] * [1, 1, 0]
+    true = Similarity(
+        model.world_from_model.scale,
+        model.world_from_model.rotation,
+        model.world_from_model.translation + shift,
+    )
+    errors = georegistration_errors(fit.world_from_model, true, model.poses.centers)
+    fixes = fit.origin.enu_from_wgs84(np.column_stack([calm.lat_lon_deg, calm.rel_alt_m]))
+    oracle = Similarity.fit(model.true.centers + shift, fixes)
+    oracle_errors = georegistration_errors(
+        oracle, Similarity.identity(), model.true.centers + shift
+    )
+    stated = fit.uncertainty
+    middle = fit.world_from_model.inverse().apply(stated.middle_m)
+    off = np.concatenate(
+        [
+            stated.middle_m - true.apply(middle),
+            rotation_vectors(fit.world_from_model.rotation @ true.rotation.T),
+            [np.log(fit.world_from_model.scale / true.scale)],
+        ]
+    )
+    names = ("east", "north", "up", "tilt_east", "tilt_north", "heading", "scale")
+    sigmas = dict(zip(names, off / np.sqrt(np.diag(stated.covariance)), strict=True))
+    sigmas["horizontal"] = float(np.hypot(off[0], off[1]) / stated.horizontal_m)
+    sigmas["tilt"] = errors.tilt_deg / stated.tilt_deg
+    spread = np.sqrt(
+        np.trace(
+            stated.of_points(fit.world_from_model.apply(model.poses.centers)), axis1=1, axis2=2
+        )
+    )
+    sigmas["frames"] = errors.position_m / float(np.sqrt(np.mean(spread**2)))
+    return {
+        "errors": {name: abs(getattr(errors, name)) for name in FIGURES},
+        "oracle": {name: abs(getattr(oracle_errors, name)) for name in FIGURES},
+        "sigmas": {name: float(abs(value)) for name, value in sigmas.items()},
+        "stated": {
+            name: getattr(stated, name)
+            for name in ("horizontal_m", "vertical_m", "tilt_deg", "heading_deg", "scale")
+        },
+        "outliers": fit.summary.outliers,
+        "held_out_m": fit.held_out_blocks.horizontal_rmse_m,
+        "in_sample_m": fit.summary.horizontal_rmse_m,
+        "noise_m": fit.noise_m,
+    }
+
+
+def draw_many(
+    model: Model,
+    options: SimulateOptions,
+    draws: int,
+    sigma_m: float | None = None,
+    fit_options: GeoregisterOptions | None = None,
+) -> dict[str, Any]:
+    """Judgements of all draws; those refused are counted apart."""
+    judged, refused = [], []
+    begin = time.perf_counter()
+    for k in range(draws):
+        drawn = replace(options, seed=100_000 + k)
+        telemetry, calm = fixes_of_draw(model, drawn, sigma_m)
+        try:
+            fit = georegister(model.poses, telemetry, model.sequence, model.time_s, fit_options)
+        except GeometryError as error:
+            refused.append(str(error))
+            continue
+        judged.append(judge(fit, model, drawn, calm))
+    return {
+        "draws": draws,
+        "frames": len(model.poses),
+        "refused": len(refused),
+        "refusals": sorted(set(refused))[:3],
+        "seconds_per_draw": (time.perf_counter() - begin) / draws,
+        **_distributions(judged),
+    }
+
+
+def _distributions(judged: list[dict[str, Any]]) -> dict[str, Any]:
+    if not judged:
+        return {}
+    figures: dict[str, Any] = {}
+    for who in ("errors", "oracle", "stated"):
+        figures[who] = {
+            name: _quantiles(np.array([j[who][name] for j in judged])) for name in judged[0][who]
+        }
+    figures["within_2_sigma"] = {
+        name: float(np.mean([j["sigmas"][name] <= 2 for j in judged]))
+        for name in judged[0]["sigmas"]
+    }
+    tilt = np.array([j["errors"]["tilt_deg"] for j in judged])
+    figures["tilt_at_most_0.7_deg"] = float(np.mean(tilt <= 0.7))
+    figures["outliers"] = _quantiles(np.array([j["outliers"] for j in judged]))
+    for name in ("held_out_m", "in_sample_m"):
+        figures[name] = _quantiles(np.array([j[name] for j in judged]))
+    figures["noise_m"] = {
+        name: np.median([j["noise_m"][name] for j in judged], axis=0).tolist()
+        for name in judged[0]["noise_m"]
+    }
+    return figures
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float]:
+    levels = {"p5": 0.05, "median": 0.5, "p95": 0.95, "max": 1.0}
+    return {name: float(np.quantile(values, q)) for name, q in levels.items()}
+
+
+def draw_offsets(
+    model: Model, options: SimulateOptions, draws: int, offset_s: float
+) -> dict[str, Any]:
+    """Errors of the estimated time offset, flight by flight."""
+    errors, sigmas, reasons = [], [], []
+    sequence = np.array(model.sequence)
+    for k in range(draws):
+        drawn = replace(options, seed=200_000 + k)
+        for name, path in model.paths.items():
+            track = read_as_written(path, drawn, None).shifted(-offset_s)
+            mine = sequence == name
+            found = estimate_time_offset(model.poses[mine], model.time_s[mine], track)
+            if found.offset_s is None:
+                reasons.append(found.reason)
+            else:
+                errors.append(abs(found.offset_s - offset_s))
+                sigmas.append(errors[-1] / found.sigma_s)
+    figures: dict[str, Any] = {
+        "flights": len(errors) + len(reasons),
+        "undetermined": len(reasons),
+        "reasons": sorted(set(reasons))[:3],
+    }
+    if errors:
+        figures["error_s"] = _quantiles(np.array(errors))
+        figures["within_0.1_s"] = float(np.mean(np.array(errors) <= 0.1))
+        figures["within_2_sigma"] = float(np.mean(np.array(sigmas) <= 2))
+    return figures
+
+
+def show(title: str, figures: dict[str, Any]) -> None:
+    """Print the distributions of one case."""
+    print(f"\n{title}: {figures['draws']} draws, {figures['frames']} frames, "
+          f"{figures['refused']} refused, {figures['seconds_per_draw']:.2f} s a draw")  # fmt: skip
+    for text in figures["refusals"]:
+        print(f"  refused: {text}")
+    if "errors" not in figures:
+        return
+    print(f"  {'':14}{'median':>10}{'p95':>10}{'max':>10}   oracle {'median':>8}{'p95':>9}")
+    for name in FIGURES:
+        ours, oracle = figures["errors"][name], figures["oracle"][name]
+        print(
+            f"  {name:14}{ours['median']:10.4f}{ours['p95']:10.4f}{ours['max']:10.4f}"
+            f"          {oracle['median']:8.4f}{oracle['p95']:9.4f}"
+        )
+    stated = {name: f"{q['median']:.4g}" for name, q in figures["stated"].items()}
+    inside = {name: f"{share:.1%}" for name, share in figures["within_2_sigma"].items()}
+    print(f"  stated (median): {stated}")
+    print(f"  within 2 sigma: {inside}")
+    print(f"  tilt at most 0.7 deg: {figures['tilt_at_most_0.7_deg']:.1%} of draws")
+    print(f"  residual {figures['in_sample_m']['median']:.2f} m, held out "
+          f"{figures['held_out_m']['median']:.2f} m; noise {figures['noise_m']}")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1, help="of the flights' paths")
+    parser.add_argument("--cases", nargs="*", help="only these (default all)")
+    parser.add_argument("--area", type=Path)
+    parser.add_argument("--flights", type=Path)
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    args = parser.parse_args()
+    if args.area is not None:
+        model, options = reconstructed_model(args.area, args.flights)
+    else:
+        options = preset("standard", seed=args.seed)
+        model = simulated_model(options)
+    rtk = replace(options, gnss=GnssOptions.rtk())
+    no_gimbal = replace(options, gimbal_angles=False)
+    straight = replace(options, mapping_paths=MappingPaths.STRAIGHT)
+    straight_no_gimbal = replace(straight, gimbal_angles=False)
+    cases: dict[str, Callable[[], dict[str, Any]]] = {
+        "standard": lambda: draw_many(model, options, args.draws),
+        "rtk": lambda: draw_many(model, rtk, args.draws, 0.03),
+        "no gimbal": lambda: draw_many(model, no_gimbal, args.draws),
+        "straight": lambda: draw_many(simulated_model(straight), straight, args.draws),
+        "straight, no gimbal": lambda: draw_many(
+            simulated_model(straight_no_gimbal), straight_no_gimbal, args.draws
+        ),
+    }
+    figures: dict[str, Any] = {}
+    for name, case in cases.items():
+        if not args.cases or name in args.cases:
+            figures[name] = case()
+            show(name, figures[name])
+    offset_draws = max(1, args.draws // 8)
+    for name, drawn, source in (
+        ("time offset", options, model),
+        ("time offset, no gimbal", no_gimbal, model),
+        ("time offset, straight, no gimbal", straight_no_gimbal, None),
+    ):
+        if not args.cases or name in args.cases:
+            source = source or simulated_model(drawn)
+            figures[name] = draw_offsets(source, drawn, offset_draws, 0.4)
+            print(f"\n{name}: {json.dumps(figures[name], indent=1)}")
+    if args.json is not None:
+        args.json.write_text(json.dumps(figures, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
