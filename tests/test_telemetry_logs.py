@@ -259,7 +259,7 @@ def test_unusable_csv_is_refused(tmp_path, text, message):
     assert "\n" not in str(error.value)
 
 
-def video(path, records, codec, *, first_frame=0):
+def video(path, records, codec, *, first_frame=0, box=b""):
     """A tiny video whose subtitle track of `codec` holds (seconds, text) records; none for None."""
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mpeg4", rate=10)
@@ -273,7 +273,8 @@ def video(path, records, codec, *, first_frame=0):
         out.mux(stream.encode(None))
         for seconds, text in records:
             data = text.encode()
-            packet = av.Packet(len(data).to_bytes(2, "big") + data if codec == "mov_text" else data)
+            sized = len(data).to_bytes(2, "big") + data + box
+            packet = av.Packet(sized if codec == "mov_text" else data)
             packet.stream, packet.time_base = track, Fraction(1, 1000)
             packet.pts = packet.dts = int(seconds * 1000)
             packet.duration = 100
@@ -293,6 +294,12 @@ def test_subtitle_track_of_a_video(tmp_path, name, codec):
     np.testing.assert_allclose(t.lat_lon_deg, [(50.5, -8.25)] * 5)
     np.testing.assert_allclose(t.rel_alt_m, np.arange(5))
     assert t.source.endswith(name)
+
+
+def test_style_boxes_after_the_text_are_cut_off(tmp_path):
+    """What follows the text in an MP4 subtitle sample is binary and no telemetry."""
+    path = video(tmp_path / "a.mp4", RECORDS, "mov_text", box=b"\0\0\0\x20styl [latitude: x]")
+    assert len(read_subtitles(path)) == 5
 
 
 def test_subtitle_track_counts_from_the_first_frame(tmp_path):

@@ -205,6 +205,7 @@ def test_mixed_references_are_unknown():
         ({piexif.GPSIFD.GPSLatitude: ((99, 1), (0, 1), (0, 1))}, None, "no position on Earth"),
         ({piexif.GPSIFD.GPSLatitude: ((9, 0), (0, 1), (0, 1))}, None, ""),
         ({piexif.GPSIFD.GPSLatitudeRef: "?"}, None, ""),
+        ({piexif.GPSIFD.GPSLatitude: ((9, 1), (400, 1), (0, 1))}, None, ""),
         ({piexif.GPSIFD.GPSLatitude: ((0, 1),) * 3, piexif.GPSIFD.GPSLongitude: ((0, 1),) * 3}, None, ""),
     ],
 )  # fmt: skip
@@ -214,6 +215,8 @@ def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
     assert found.width == 40
     assert math.isnan(found.lat_deg) == bool(gps)
     assert [words in note for note in found.notes] == ([True] if words else [])
+    together = telemetry_of_photos([found, found], ["x", "y"]).notes
+    assert any("damaged metadata: 2, the first x: " in note for note in together) == bool(words)
 
 
 def test_unset_clock_and_strange_orientation(tmp_path):

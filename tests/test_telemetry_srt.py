@@ -157,7 +157,8 @@ P4_RTK = (
          (39.906217, 116.391305), 91.2, (NAN, NAN, NAN)),
         ("GPS(39.9,16.4,69.800) BAROMETER:-3.5M", (39.9, 16.4), -3.5, (NAN, NAN, NAN)),
         ("HOME(E: 120.0, S: 20.0)\nGPS(W: 120.5, S: 20.25, 001.01m)", (-20.25, -120.5), NAN, (NAN,) * 3),
-        ("HOME(149.0,-20.0)\nGPS(49.5,-20.5,16)", (-20.5, 49.5), NAN, (NAN, NAN, NAN)),
+        # HOME settles the order, against the height that stands third.
+        ("HOME(149.0,-20.0)\nGPS(49.5,-20.5,16.5)", (-20.5, 49.5), NAN, (NAN, NAN, NAN)),
         ("[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 1.5 abs_alt: 2.5]",
          (NAN, NAN), 1.5, (NAN, NAN, NAN)),
         ("[latitude: 0.000000] [longitude: 8.5]", (0.0, 8.5), NAN, (NAN, NAN, NAN)),
@@ -184,6 +185,13 @@ def test_layout_does_not_matter(tmp_path, encoding):
             found, [(1.0, 50.5, 8.25, 12.5, 160.25), (2.5, 50.6, 8.25, 12.5, 160.25)]
         )
         assert t.notes == ("the coordinates are rounded to steps of 1112 m",)
+
+
+def test_lines_are_counted_as_an_editor_counts_them(tmp_path):
+    """In a file with CRLF the line in a message is the one that an editor shows."""
+    path = tmp_path / "a.srt"
+    path.write_bytes((record(KEYED) + record("GPS(x,1,2)")).replace("\n", "\r\n").encode())
+    assert any("the first at line 6: GPS is 'x'" in note for note in read_dji_srt(path).notes)
 
 
 def times_of(starts):

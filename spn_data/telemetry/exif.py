@@ -95,11 +95,13 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         ) as error:
             reason = getattr(error, "strerror", None) or "it is no JPEG, PNG or TIFF, or is damaged"
             raise InputError(f"cannot be read as a photo: {reason}", path=path) from error
-    notes += [
-        f"EXIF: {str(w.message).splitlines()[0][:200]}"
-        for w in caught
-        if not issubclass(w.category, Image.DecompressionBombWarning)
+    damage = [
+        str(warning.message).splitlines()[0][:200]
+        for warning in caught
+        if not issubclass(warning.category, Image.DecompressionBombWarning)
     ]
+    if damage:
+        notes.append(f"damaged EXIF: {damage[0]}")
     orientation = number(main.get(_ORIENTATION))
     local_s, utc_s = _times(main, exif, xmp)
     lat, lon = _position(gps, xmp, notes)
@@ -143,9 +145,12 @@ def telemetry_of_photos(
     names = [photo.path.name for photo in photos] if names is None else names
     if len(names) != len(photos):
         raise ValueError(f"{len(names)} names for {len(photos)} photos")
-    notes = [
-        f"{name}: {note}" for name, photo in zip(names, photos, strict=True) for note in photo.notes
-    ]
+    damaged = [(name, p.notes[0]) for name, p in zip(names, photos, strict=True) if p.notes]
+    notes = []
+    if damaged:
+        notes.append(
+            f"photos with damaged metadata: {len(damaged)}, the first {': '.join(damaged[0])}"
+        )
     utc_s = np.array([photo.utc_s for photo in photos])
     is_local = not np.isfinite(utc_s).all()
     if is_local:
@@ -248,6 +253,8 @@ def _degrees(gps: Mapping[int, Any], tag: int, negative: str) -> float:
     if not isinstance(parts, tuple) or len(parts) != 3 or letter not in ("N", "S", "E", "W"):
         return NAN
     degrees, minutes, seconds = (number(part) for part in parts)
+    if not (0 <= minutes <= 60 and 0 <= seconds <= 60):
+        return NAN
     size = degrees + minutes / 60 + seconds / 3600
     return -size if letter == negative else size
 

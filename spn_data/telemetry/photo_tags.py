@@ -16,28 +16,17 @@ NAN = float("nan")
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 
 
-# What Pillow raises on damaged tags, which it decodes when they are asked for.
-_DAMAGE = (OSError, SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, struct.error)
-
-
 def exif_tags(
     image: Image.Image, notes: list[str]
 ) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
-    """The main, the EXIF and the GPS tags, without those that are damaged."""
+    """The main, the EXIF and the GPS tags; empty where they are damaged beyond reading."""
     try:
         main = image.getexif()
-        tables = [main, main.get_ifd(_EXIF_IFD), main.get_ifd(_GPS_IFD)]
-    except _DAMAGE as error:
+        # Pillow decodes a tag when it is asked for: here, where damage is caught.
+        return dict(main), dict(main.get_ifd(_EXIF_IFD)), dict(main.get_ifd(_GPS_IFD))
+    except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error) as error:
         notes.append(f"damaged EXIF left out ({error})")
         return {}, {}, {}
-    known: list[dict[int, Any]] = [{}, {}, {}]
-    for table, values in zip(tables, known, strict=True):
-        for tag in table:
-            try:
-                values[tag] = table[tag]
-            except _DAMAGE:
-                notes.append(f"damaged EXIF tag {tag} left out")
-    return known[0], known[1], known[2]
 
 
 def xmp_properties(image: Image.Image, notes: list[str]) -> dict[str, str]:
