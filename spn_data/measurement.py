@@ -177,9 +177,9 @@ def _affine_step(
 
 
 _LK = {
-    "winSize": (15, 15),
+    "winSize": (11, 11),
     "maxLevel": 3,
-    "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.05),
+    "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05),
 }
 
 

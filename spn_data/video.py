@@ -258,10 +258,9 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[Any, int]]:
 
 def _conclude(report: DecodeReport) -> None:
     if report.lost_packets:
-        report.notes.append(
-            f"{report.lost_packets} damaged packets passed over; "
-            f"{report.damaged_frames} frames after them show their traces"
-        )
+        report.notes.append(f"{report.lost_packets} damaged packets were passed over")
+    if report.damaged_frames:
+        report.notes.append(f"{report.damaged_frames} frames show traces of damage in the file")
     if report.out_of_order:
         report.notes.append(f"{report.out_of_order} frames dropped whose timestamps did not rise")
     missing = report.expected_frames - report.frames - report.out_of_order
@@ -361,7 +360,7 @@ def _notes(frame: Any, aspect: Fraction) -> tuple[str, ...]:
     notes = []
     if aspect != 1:
         notes.append(
-            f"pixels are {aspect.numerator}:{aspect.denominator}; frames are stretched to square ones"
+            f"pixels of {aspect.numerator}:{aspect.denominator} are stretched to square ones"
         )
     if int(frame.color_trc) in (16, 18):
         notes.append("high dynamic range (HDR) is converted to 8 bits without tone mapping")
