@@ -174,7 +174,7 @@ def _map(
     models = run_mapping(
         job,
         log=work / "mapping.log",
-        progress=lambda registered: progress("mapping", registered, n),
+        progress=lambda registered: progress("mapping", min(registered, n), n),
     )
     done.write_text(json.dumps([model.name for model in models]))
     return models

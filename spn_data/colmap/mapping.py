@@ -20,7 +20,7 @@ class MappingJob:
 
     database: str
     images: str  # folder, for the points' colours
-    output: str  # an existing folder; sub-models are written to 0, 1, ... in it
+    output: str  # an existing folder; sub-models are written to model-0, model-1, ... in it
     snapshots: str  # an existing folder
     engine: str = "incremental"  # or "global"
     threads: int = -1
@@ -104,8 +104,14 @@ def _map(job: MappingJob) -> None:
         models = pycolmap.global_mapping(job.database, job.images, job.output, options)
     else:
         models = _map_incrementally(job)
-    largest_first = sorted(models, key=lambda i: (-models[i].num_reg_images(), i))
-    child.send({"models": [f"{job.output}/{i}" for i in largest_first]})
+    # The mapper's own names depend on whether it went on from a model.
+    folders = []
+    for rank, i in enumerate(sorted(models, key=lambda i: (-models[i].num_reg_images(), i))):
+        folder = Path(job.output) / f"model-{rank}"
+        folder.mkdir(exist_ok=True)
+        models[i].write(str(folder))
+        folders.append(str(folder))
+    child.send({"models": folders})
 
 
 def _map_incrementally(job: MappingJob) -> dict[int, Any]:
