@@ -76,10 +76,10 @@ def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
     def rng(name: str) -> np.random.Generator:
         return flight_rng(options, name, 0)
 
-    if options.mapping_paths is MappingPaths.NADIR:
+    if options.mapping_paths == MappingPaths.NADIR:
         motion, duration_s = nadir_lines(rng("nadir"), half_m, options.length_factor)
         add("nadir", "mapping", motion, duration_s)
-    elif options.mapping_paths is MappingPaths.STRAIGHT:
+    elif options.mapping_paths == MappingPaths.STRAIGHT:
         motion, duration_s = straight_line(rng("straight"), half_m, options.length_factor)
         add("straight", "mapping", motion, duration_s)
     else:
@@ -99,7 +99,7 @@ def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
         add("flight2", "mapping", motion, 60 * side)
     motion = courtyard_loop(
         rng("medium"), half_m, duration_s=30 * side, margin_m=7.2, laps=0.5 * laps, turn=1,
-        offsets_deg=[(0.0, 40.0), (1.0, 28.0)], height_m=(2.2, 7.5), pitch_deg=(-9.0, 13.0),
+        offsets_deg=[(0.0, 40.0), (1.0, 28.0)], height_m=(2.5, 6.0), pitch_deg=(-9.0, 13.0),
     )  # fmt: skip
     add("medium", "evaluation", motion, 30 * side)
     motion = courtyard_loop(

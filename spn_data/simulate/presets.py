@@ -83,6 +83,10 @@ class SimulateOptions:
             raise InputError("fps, area factor and length factor must be above zero")
         if not 0 <= self.blur_share <= 1:
             raise InputError(f"blur share {self.blur_share} lies outside 0 to 1")
+        if abs(self.time_offset_s) > 5:
+            raise InputError(f"time offset {self.time_offset_s} s is beyond 5 s either way")
+        if self.area_factor > 16:
+            raise InputError(f"area factor {self.area_factor} is beyond 16")
 
     @property
     def scene(self) -> SceneOptions:

@@ -42,8 +42,8 @@ class Builder:
         resolution: float,
         name: str = "",
     ) -> None:
-        # Textures stay within what OpenCV's remap can address.
-        resolution = min(resolution, 30000 / max(size_m))
+        # Textures stay within what OpenCV's remap can address, and within memory for large areas.
+        resolution = min(resolution, 30000 / max(size_m), (40e6 / (size_m[0] * size_m[1])) ** 0.5)
         self.canvases[texture] = (
             painter,
             Canvas(name=name or texture, size_m=size_m, texels_per_m=resolution, seed=self.seed),
