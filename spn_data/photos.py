@@ -18,7 +18,7 @@ from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
 MAX_PHOTO_PIXELS = 500_000_000
 _MAX_ASPECT_ERROR = 0.01  # by which a mask's shape may differ from the image's
-_FORMATS = ("JPEG", "MPO", "PNG", "TIFF")
+_FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG opens MPO as well
 _ORIENTATION = 0x0112
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -133,6 +133,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 def _upright(image: Image.Image) -> Image.Image:
     """Turned as EXIF says; as stored where the EXIF is damaged, which `read_photo` tells."""
+    image.load()  # Pillow turns a TIFF itself when it is loaded, and then reports no orientation
     try:
         orientation = image.getexif().get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):

@@ -111,12 +111,12 @@ def discover(
         named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
         beside = named or (tuple(free) if len(free) == 1 else ())
         sources.append(Source(name, SourceKind.PHOTOS, photos, beside))
-    if not sources:
-        raise InputError(_nothing_found(folder, ignored), path=folder)
     used = {t for s in sources for t in s.telemetry}
     for path in by_kind["telemetry"]:
         if path not in used and folder.is_dir():
             ignored.append((path, "telemetry without a video or photo folder of the same name"))
+    if not sources:
+        raise InputError(_nothing_found(folder, ignored), path=folder)
     ignored.sort()
     return Sources(tuple(sources), tuple((p.relative_to(root), why) for p, why in ignored))
 

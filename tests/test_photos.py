@@ -1,0 +1,139 @@
+"""Photos: upright, in 8 bits, one bad one among good ones, and masks."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spn_data.errors import InputError
+from spn_data.photos import decode_photo, decode_photo_gray, load_mask, read_headers
+
+
+def marked_photo(width: int = 64, height: int = 48) -> np.ndarray:
+    """Dark RGB with a green upper-left quarter."""
+    image = np.full((height, width, 3), (120, 30, 30), np.uint8)
+    image[: height // 2, : width // 2] = (0, 255, 0)
+    return image
+
+
+def save(path: Path, array: np.ndarray, orientation: int = 1) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(array).save(path, exif=exif)
+    return path
+
+
+# EXIF orientation -> size upright, and where the stored upper-left corner goes (right, lower).
+UPRIGHT = {
+    1: ((64, 48), (0, 0)),
+    2: ((64, 48), (1, 0)),
+    3: ((64, 48), (1, 1)),
+    4: ((64, 48), (0, 1)),
+    5: ((48, 64), (0, 0)),
+    6: ((48, 64), (1, 0)),
+    7: ((48, 64), (1, 1)),
+    8: ((48, 64), (0, 1)),
+}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("orientation", sorted(UPRIGHT))
+def test_photos_stand_upright(tmp_path: Path, orientation: int, suffix: str) -> None:
+    """All eight EXIF orientations in three formats, in colour, grey and header."""
+    path = save(tmp_path / f"a{suffix}", marked_photo(), orientation)
+    (width, height), (right, lower) = UPRIGHT[orientation]
+    image = decode_photo(path)
+    gray = decode_photo_gray(path, max_width=640)
+    assert image.shape == (height, width, 3)
+    assert gray.shape == (height, width)
+    np.testing.assert_array_equal(read_headers([path]).sizes, [[width, height]])
+    y, x = (5 + lower * (height - 11), 5 + right * (width - 11))
+    np.testing.assert_allclose(image[y, x], (0, 255, 0), atol=8)  # BGR
+    assert gray[y, x] > 140 > gray[height - 1 - y, width - 1 - x]
+
+
+def test_one_unreadable_photo_does_not_stop_the_others(tmp_path: Path) -> None:
+    """Text, an empty file and a damaged header are told; a truncated one shows when decoded."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (200, 300, 3), dtype=np.uint8)
+    good = [save(tmp_path / f"{name}.jpg", noise) for name in "abc"]
+    text = tmp_path / "text.jpg"
+    text.write_text("no photo")
+    empty = tmp_path / "empty.jpg"
+    empty.touch()
+    good[1].write_bytes(good[1].read_bytes()[:9000])
+    headers = read_headers([good[0], text, empty, good[1], good[2]])
+    assert [m is not None for m in headers.metadata] == [True, False, False, True, True]
+    assert [bool(p) for p in headers.problem] == [False, True, True, False, False]
+    assert headers.problem[1].startswith("cannot be read as a photo")
+    assert headers.sizes.tolist() == [[300, 200], [0, 0], [0, 0], [300, 200], [300, 200]]
+    for decoder in (decode_photo, lambda p: decode_photo_gray(p, max_width=100)):
+        with pytest.raises(InputError, match="cannot be read as an image: it is truncated"):
+            decoder(good[1])
+        decoder(good[2])
+
+
+def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
+    """16 bits lose their lower half; floating point has no known range and is refused."""
+    deep = np.full((10, 20), 0x8F12, np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    assert decode_photo(tmp_path / "deep.png")[0, 0].tolist() == [0x8F] * 3
+    Image.fromarray(np.full((10, 20), 21.5, np.float32)).save(tmp_path / "thermal.tif")
+    with pytest.raises(InputError, match=r"thermal\.tif: pixels of kind 'F'"):
+        decode_photo(tmp_path / "thermal.tif")
+
+
+def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
+    """A PNG of 40,000 x 40,000 pixels, as it says."""
+    path = tmp_path / "bomb.png"
+    header = b"IHDR" + struct.pack(">IIBBBBB", 40_000, 40_000, 8, 0, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + b"\0\0\0\x10IDAT" + bytes(20))
+    assert read_headers([path]).problem[0].startswith("cannot be read as a photo")
+    for decoder in (decode_photo, lambda p: decode_photo_gray(p, max_width=100)):
+        with pytest.raises(InputError, match="cannot be read as an image"):
+            decoder(path)
+
+
+def test_lenses_are_told_apart(shared_data: Path) -> None:
+    """The two passes are one lens at one size; the other set another."""
+    first = sorted((shared_data / "photos-two-passes").glob("*.JPG"))[:3]
+    second = sorted((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))[:2]
+    lens = read_headers([*first, *second]).lens
+    assert len(set(lens[:3])) == len(set(lens[3:])) == 1
+    assert lens[0] != lens[3]
+
+
+def test_grey_is_reduced_for_measuring(shared_data: Path) -> None:
+    """Half of 2000 x 1125 or less, never enlarged."""
+    path = min((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))
+    assert decode_photo_gray(path, max_width=640).shape == (360, 640)
+    assert decode_photo_gray(path, max_width=9000).shape == (1125, 2000)
+
+
+def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
+    """White is used; the same shape is resized without blending; another shape is refused."""
+    mask = np.zeros((90, 160), np.uint8)
+    mask[:45] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    same = load_mask(tmp_path / "mask.png", 160, 90)
+    assert (same.dtype, int(same.sum())) == (np.dtype(bool), 45 * 160)
+    large = load_mask(tmp_path / "mask.png", 1280, 720)
+    assert large[:360].all()
+    assert not large[360:].any()
+    with pytest.raises(
+        InputError, match=r"mask\.png: a mask of 160x90 does not fit images of 640x480"
+    ):
+        load_mask(tmp_path / "mask.png", 640, 480)
+
+
+def test_a_black_mask_is_refused(tmp_path: Path) -> None:
+    """Inverted or empty masks would leave nothing, without a word."""
+    Image.fromarray(np.zeros((90, 160), np.uint8)).save(tmp_path / "mask.png")
+    with pytest.raises(InputError, match="black all over: white is what may be used"):
+        load_mask(tmp_path / "mask.png", 160, 90)
