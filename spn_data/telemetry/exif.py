@@ -85,6 +85,8 @@ def read_photo(path: Path | str) -> PhotoMetadata:
             with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
                 width, height = image.size
                 main, exif, gps = exif_tags(image, notes)
+                if image.format == "TIFF" and number(main.get(_ORIENTATION)) in (5, 6, 7, 8):
+                    width, height = height, width  # Pillow tells the size of a TIFF once turned
                 xmp = xmp_properties(image, notes)
         except (
             OSError,
