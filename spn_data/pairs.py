@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -22,6 +22,15 @@ class PairOptions:
     appearance_neighbors: int = 10  # most similar frames that time does not pair already
     words: int = 64  # of the vocabulary that appearance is described with
     seed: int = 0
+
+    def wider(self) -> PairOptions:
+        """Three times as many neighbours of each kind."""
+        return replace(
+            self,
+            overlap=self.overlap * 3,
+            spatial_neighbors=self.spatial_neighbors * 3,
+            appearance_neighbors=self.appearance_neighbors * 3,
+        )
 
 
 def choose_pairs(

@@ -30,7 +30,7 @@ class ReconstructOptions:
     refine_principal_point: bool = False
     threads: int = 2  # of the mapper, and worker processes before it
     seed: int = 0
-    enough_share: float = 0.9  # registered, below which all is matched again, more widely
+    enough_share: float = 0.95  # registered, below which all is tried again with more features
     usable_share: float = 0.1  # registered, below which there is no model
 
 
@@ -46,13 +46,7 @@ class Attempt:
 
 
 def attempts(options: ReconstructOptions) -> list[Attempt]:
-    """From the options as they are to wider pairs and then more features."""
-    wide = replace(
-        options.pairs,
-        overlap=options.pairs.overlap * 3,
-        spatial_neighbors=options.pairs.spatial_neighbors * 3,
-        appearance_neighbors=options.pairs.appearance_neighbors * 3,
-    )
+    """The options as they are, and then more features on wider pairs."""
     more = replace(
         options.features,
         max_features=options.features.max_features * 2,
@@ -60,8 +54,9 @@ def attempts(options: ReconstructOptions) -> list[Attempt]:
     )
     return [
         Attempt("first", "", "database.db", options.features, options.pairs),
-        Attempt("wide", "pairs three times as wide", "database.db", options.features, wide),
-        Attempt("dense", "twice the features, wide pairs", "database-dense.db", more, wide),
+        Attempt(
+            "dense", "more features, wider pairs", "database-dense.db", more, options.pairs.wider()
+        ),
     ]
 
 
@@ -190,7 +185,7 @@ def _second_chance(
     stopwatch: Stopwatch,
 ) -> Path:
     """The model, grown by frames that only wider pairs connect: sub-models join it that way too."""
-    wide = attempts(options)[1].pairs
+    wide = attempt.pairs.wider()
     registered = set(read_scene(model).names)
     with MapDatabase.open(work / attempt.database) as database:
         with stopwatch.step("pairs"):
