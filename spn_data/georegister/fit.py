@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.georegister.noise import Levels, Solution, improve_levels, solve, student_weights
+from spn_data.georegister.noise import Levels, Solution, improve_levels, solve, robust_weights
 from spn_data.georegister.problem import SHARED, Problem, State
 
 _ROUNDS = 40
@@ -72,7 +72,7 @@ def iterate(
             levels = improve_levels(problem.chains, levels, weights, linear)
         solution = solve(problem.chains, levels, weights, linear)
         state = state.moved(solution.step)
-        weights, distance = student_weights(problem.chains, levels, solution.white)
+        weights, distance = robust_weights(problem.chains, levels, solution.white)
         bias_weight = _bias_weights(state, problem.options.gimbal_bias_deg)
     assert solution is not None
     return Estimate(

@@ -14,6 +14,9 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 # Two observations of one chain are never treated as closer than this part of the correlation time.
 _MIN_STEP = 1e-3
+# White errors that are no part of the normal distribution: their share, and how far they reach in sigma.
+_OUTLIERS = 0.03
+_OUTLIER_WIDTH = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ class Chains:
         precision[1, :-1] += rho**2 / innovation[1:]
         precision[0, 1:] = -rho / innovation[1:]
         _, twin = np.unique(twin[order], return_inverse=True)
-        sizes = np.bincount(twin) if len(twin) else np.zeros(0, dtype=np.int64)
+        sizes = np.bincount(twin).astype(np.float64)
         return cls(group[order], unit[order], twin, sizes, precision, np.log(innovation)), order
 
     def part(self, mask: np.ndarray) -> Chains:
@@ -193,24 +196,27 @@ def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -
     return Solution(step, information, white_var * (inverse[:, -1] - inverse[:, :-1] @ step))
 
 
-def student_weights(
-    chains: Chains, levels: Levels, white: np.ndarray, freedom: float = 4.0
+def robust_weights(
+    chains: Chains, levels: Levels, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (M,) of a Student t distribution on the white parts (M,), and their distances in sigma (M,).
+    """Weights (M,) of the white parts (M,) under a contaminated normal, and their distances in sigma (M,).
 
-    Twins (east and north of one fix) have one distance, the root of their mean square.
+    A white error is normal, or, in a share `_OUTLIERS`, anything up to `_OUTLIER_WIDTH` sigma (Tukey 1960);
+    each outlier has a variance of its own, so that it says nothing of the others'. Twins (east and north of
+    one fix) are judged by their common distance, the root of their mean square.
     """
-    standard = white / (np.exp(levels.log_white)[chains.group] * chains.unit)
-    square = np.bincount(chains.twin, standard**2, minlength=len(chains.twin_sizes))
-    weights = (freedom + chains.twin_sizes) / (freedom + square)
-    distance = np.sqrt(square / chains.twin_sizes)
-    return weights[chains.twin], distance[chains.twin]
+    square = _squares(chains, levels, white)
+    # A huge distance is as sure an outlier as one of 50 sigma.
+    normal = np.exp(-np.minimum(square, 2500.0) / 2)
+    good = normal / (normal + _OUTLIERS * _OUTLIER_WIDTH**-chains.twin_sizes)
+    weights = good + (1 - good) * chains.twin_sizes / (chains.twin_sizes + square)
+    return weights[chains.twin], np.sqrt(square / chains.twin_sizes)[chains.twin]
 
 
 def robust_cost(
-    chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray, freedom: float = 4.0
+    chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray
 ) -> float:
-    """Half of -2 log likelihood of residuals (M,) with Student t white noise, at its weights (M,).
+    """Negative logarithm of the density of residuals (M,) under a contaminated normal, at its weights (M,).
 
     The bias is at its most probable course rather than integrated out: good for comparing fits of one flight.
     """
@@ -218,10 +224,16 @@ def robust_cost(
     sigma = np.exp(levels.log_white)[chains.group] * chains.unit
     white = sigma**2 / weights * inverse[:, 0]
     bias_cost = residual @ inverse[:, 0] - (weights * (white / sigma) ** 2).sum()
-    square = np.bincount(chains.twin, (white / sigma) ** 2, minlength=len(chains.twin_sizes))
-    tails = ((freedom + chains.twin_sizes) * np.log1p(square / freedom)).sum()
+    square = _squares(chains, levels, white)
+    tails = -np.log(np.exp(-square / 2) + _OUTLIERS * _OUTLIER_WIDTH**-chains.twin_sizes)
     _, log_det = inverse_times(chains, levels, np.ones_like(weights), residual[:, None])
-    return 0.5 * float(bias_cost + tails + log_det)
+    return float(0.5 * bias_cost + tails.sum() + 0.5 * log_det)
+
+
+def _squares(chains: Chains, levels: Levels, white: np.ndarray) -> np.ndarray:
+    """Squared distances in sigma of each set of twins."""
+    standard = white / (np.exp(levels.log_white)[chains.group] * chains.unit)
+    return np.bincount(chains.twin, standard**2, minlength=len(chains.twin_sizes))
 
 
 def improve_levels(

@@ -13,7 +13,7 @@ from spn_data.georegister.noise import (
     improve_levels,
     robust_cost,
     solve,
-    student_weights,
+    robust_weights,
 )
 from spn_data.georegister.observe import Fixes, observe
 from spn_data.georegister.options import GeoregisterOptions
@@ -208,7 +208,7 @@ class _Flight:
             if k >= 4:
                 levels = improve_levels(problem.chains, levels, weights, linear)
             solution = solve(problem.chains, levels, weights, linear)
-            weights, _ = student_weights(problem.chains, levels, solution.white)
+            weights, _ = robust_weights(problem.chains, levels, solution.white)
             weight[problem.kind, problem.frame] = weights
             state = state.moved(solution.step[:-1])
             offset_s += float(np.clip(solution.step[-1], -1.0, 1.0))

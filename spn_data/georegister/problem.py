@@ -34,8 +34,8 @@ class Kind(IntEnum):
 # Consumer GNSS: nearly all of the stated sigma is slow bias, and its short-term noise a tenth to a half.
 # Differential fixes: mostly white. Gimbal, in degrees: drift beside the flight's constant bias, and noise.
 _TABLE = [
-    (0.9, 0.5, 0.2, 0.8),  # horizontal
-    (0.9, 0.5, 0.2, 0.8),  # vertical
+    (0.97, 0.4, 0.1, 1.0),  # horizontal
+    (0.97, 0.4, 0.1, 1.0),  # vertical
     (0.4, 1.0, 0.8, 0.6),  # horizontal, differential
     (0.4, 1.0, 0.8, 0.6),  # vertical, differential
     (0.05, 0.7, 0.15, 0.8),  # gimbal
