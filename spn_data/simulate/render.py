@@ -243,17 +243,20 @@ class Renderer:
         """Colours (n, 3) along rays (n, 2) of the nearest among faces (face, level, mirror level)."""
         nearest = np.zeros(len(rays), np.float32)
         winner = np.full(len(rays), -1, np.int16)
+        across = np.ascontiguousarray(rays.T)
         for j, ((face, _, _), covers) in enumerate(zip(keys, covered, strict=True)):
             forms = face_from_ray[face, 2:]
             if not covers:
                 edges = self._edges[face, : self._edge_counts[face]] @ face_from_ray[face]
                 forms = np.concatenate([forms, edges])
-            values = forms[:, :2].astype(np.float32) @ rays.T + forms[:, 2:].astype(np.float32)
+            forms = forms.astype(np.float32)
+            values = forms[:, :2] @ across
+            values += forms[:, 2:]
             closer = values[0] > nearest
             if not covers:
                 closer &= values[1:].min(axis=0) >= -_EDGE_TOLERANCE
             np.copyto(nearest, values[0], where=closer)
-            winner[closer] = j
+            np.copyto(winner, j, where=closer)
         colours = np.empty((len(rays), 3), np.uint8)
         colours[winner < 0] = HAZE_RGB
         for j, key in enumerate(keys):
