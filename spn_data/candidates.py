@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from spn_data.sources import Source, SourceKind, safe_name
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_data.telemetry.track import Telemetry
 
+_CACHE_VERSION = 1  # raised whenever measuring changes
 _ZOOM_CHANGE = 0.02  # relative change of focal length that makes another camera
 
 
@@ -38,15 +40,31 @@ class Candidates:
 
 
 def analyse(
-    source: Source, *, threads: int = 0, progress: Callable[[int], None] | None = None
+    source: Source,
+    *,
+    threads: int = 0,
+    progress: Callable[[int], None] | None = None,
+    cache: Path | None = None,
 ) -> Candidates:
-    """Measures every image of a source once, at a reduced size; `progress` hears how many are done."""
+    """Measures every image of a source once, at a reduced size; `progress` hears how many are done.
+
+    cache : a file (.npz) in which a video's measurements are kept: where it exists and the video's files
+    have the same names, sizes and times of change, nothing is decoded.
+    """
     if source.kind is SourceKind.PHOTOS:
         return _analyse_photos(source, progress)
+    known = _read_cache(cache, source) if cache is not None else None
+    if known is not None:
+        if progress is not None:
+            progress(len(known.measured))
+        return known
     starts: list[float] = []
     notes: list[str] = []
     measured = measure(_video_images(source, threads, starts, notes), progress=progress)
-    return Candidates(source, measured, tuple(starts), None, None, tuple(notes))
+    candidates = Candidates(source, measured, tuple(starts), None, None, tuple(notes))
+    if cache is not None:
+        _write_cache(cache, candidates)
+    return candidates
 
 
 def frames_of(candidates: Candidates, choice: Choice, *, focal: np.ndarray | None = None) -> Frames:
@@ -166,6 +184,40 @@ def _spread(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Teleme
         telemetry.source,
         telemetry.notes,
     )
+
+
+def _identity(source: Source) -> str:
+    """What the measurements of a video depend on."""
+    files = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in source.parts]
+    return f"{_CACHE_VERSION} {MEASURE_WIDTH} {files!r}"
+
+
+def _write_cache(path: Path, candidates: Candidates) -> None:
+    measured = candidates.measured
+    columns = {f.name: getattr(measured, f.name) for f in fields(measured)}
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            identity=np.array(_identity(candidates.source)),
+            part_start_s=np.array(candidates.part_start_s),
+            notes=np.array(candidates.notes, dtype=np.str_),
+            **columns,
+        )
+    temporary.replace(path)
+
+
+def _read_cache(path: Path, source: Source) -> Candidates | None:
+    """None where the cache is absent, damaged or of other files: then they are measured again."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            if str(data["identity"]) != _identity(source):
+                return None
+            measured = Measurements(**{f.name: data[f.name] for f in fields(Measurements)})
+            starts, notes = data["part_start_s"].tolist(), data["notes"].tolist()
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return Candidates(source, measured, tuple(starts), None, None, tuple(notes))
 
 
 def _camera_runs(measured: Measurements, focal: np.ndarray | None) -> list[object]:

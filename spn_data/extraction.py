@@ -19,10 +19,11 @@ from spn_data.sources import Source, SourceKind
 
 JPEG_QUALITY = 95
 
-# Measured on two cores with H.264 of 0.4 to 2 megapixels and JPEGs of 0.5 to 2.3 megapixels.
-DECODE_S_PER_MEGAPIXEL = 0.006
-ENCODE_S_PER_MEGAPIXEL = 0.03
-BYTES_PER_PIXEL = 0.8  # JPEG of quality 95; sharp foliage takes most
+# Measured with videos of 0.4 to 2.5 megapixels on two cores: decoding takes 0.007 (H.264 of usual bit
+# rate) to 0.012 CPU seconds a megapixel (noisy H.264, H.265), and JPEG files 0.3 to 0.65 bytes a pixel.
+DECODE_S_PER_MEGAPIXEL = 0.007
+ENCODE_S_PER_MEGAPIXEL = 0.015
+BYTES_PER_PIXEL = 0.6
 CHOSEN_PER_S = 1.3  # of video, where no target is given
 
 
@@ -54,8 +55,11 @@ def extract_chosen(
     targets = {int(r): folder / frames.names[r].split("/")[1] for r in rows}
     missing = {r: path for r, path in targets.items() if not path.exists()}
     pixels = sum(int(frames.width[r]) * int(frames.height[r]) for r in missing)
+    needed = int(pixels * BYTES_PER_PIXEL)
+    if source.kind is SourceKind.PHOTOS:
+        needed = max(needed, sum(part.stat().st_size for part in source.parts))
+    check_space(folder, needed)
     folder.mkdir(parents=True, exist_ok=True)
-    check_space(folder, int(pixels * BYTES_PER_PIXEL))
     done = len(targets) - len(missing)
     if progress is not None:
         progress(done)
@@ -80,16 +84,16 @@ def estimate_cost(
 ) -> Cost:
     """Time and disk for measuring, choosing and writing the frames of sources, from headers alone.
 
-    The number of frames that motion will choose is not known before; without a target it is taken as
-    `chosen_per_s`. Rough: within a factor of two on H.264; slower for H.265.
+    The number of frames that motion will choose is not known before; without a target (of all videos) it is
+    taken as `chosen_per_s`. Photos count whole, as they are. Rough: within a factor of two.
     """
     candidates, chosen, chosen_megapixels, seconds = 0, 0.0, 0.0, 0.0
+    photos, photo_bytes = 0, 0
     for source in sources:
         if source.kind is SourceKind.PHOTOS:
-            megapixels = read_headers(source.parts).sizes.prod(axis=1).sum() / 1e6
-            candidates += len(source.parts)
-            chosen += len(source.parts)
-            chosen_megapixels += megapixels
+            megapixels = float(read_headers(source.parts).sizes.prod(axis=1).sum()) / 1e6
+            photos += len(source.parts)
+            photo_bytes += sum(part.stat().st_size for part in source.parts)
             seconds += megapixels * DECODE_S_PER_MEGAPIXEL
             continue
         for part in source.parts:
@@ -106,7 +110,8 @@ def estimate_cost(
         chosen_megapixels *= target_count / chosen
         chosen = target_count
     seconds += chosen_megapixels * ENCODE_S_PER_MEGAPIXEL
-    return Cost(candidates, round(chosen), seconds, int(chosen_megapixels * 1e6 * BYTES_PER_PIXEL))
+    disk_bytes = photo_bytes + int(chosen_megapixels * 1e6 * BYTES_PER_PIXEL)
+    return Cost(candidates + photos, round(chosen) + photos, seconds, disk_bytes)
 
 
 def check_space(folder: Path, needed_bytes: int) -> None:

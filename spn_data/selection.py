@@ -36,9 +36,7 @@ class SelectionOptions:
     min_sharpness: float = 1.0  # grey levels; a source whose best frames stay below it is unusable
     still_share: float = 0.005  # photos that moved less, at one place, are the same photo twice
     still_m: float = 0.5  # and lie nearer than this by their telemetry
-    target_count: int | None = (
-        None  # frames wanted of all sources; scales motion_share and max_spacing_s
-    )
+    target_count: int | None = None  # frames wanted of all videos; scales motion, time, distance
 
 
 @dataclass(frozen=True, eq=False)
