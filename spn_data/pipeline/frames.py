@@ -224,13 +224,14 @@ def _choose(
 
 
 def _positions(rows: Telemetry) -> np.ndarray:
-    """(N, 2) metres east and north of the first fix, good for distances; NaN where unknown."""
+    """(N, 3) metres east and north of the first fix and above take-off, good for distances; NaN: unknown."""
     if not rows.has_fix.any():
-        return np.full((len(rows), 2), np.nan)
+        return np.full((len(rows), 3), np.nan)
     lat, lon = np.deg2rad(rows.lat_lon_deg).T
     lat_0, lon_0 = lat[rows.has_fix][0], lon[rows.has_fix][0]
     radius_m = 6_371_000.0
-    return np.column_stack([(lon - lon_0) * np.cos(lat_0), lat - lat_0]) * radius_m
+    east, north = radius_m * (lon - lon_0) * np.cos(lat_0), radius_m * (lat - lat_0)
+    return np.column_stack([east, north, rows.rel_alt_m])
 
 
 def _check_some_fit(candidates: list[Candidates]) -> None:
