@@ -87,6 +87,17 @@ def test_blurred_frames_are_avoided_and_say_so() -> None:
     assert choice.chosen.sum() > 50
 
 
+def test_a_sharp_frame_a_little_further_is_preferred_to_a_blurred_one() -> None:
+    """All frames at 0.65 to 1.35 of the wanted motion are blurred: one at 1.7 is taken instead."""
+    sharpness = np.full(60, 10.0)
+    sharpness[24:37] = 4.0
+    choice = choose(measured(np.full(60, 0.01), sharpness), replace(DEFAULT, neighbours_s=5.0))
+    assert choice.chosen[21:24].any()
+    assert not choice.chosen[24:37].any()
+    after = np.flatnonzero(choice.chosen[37:])[0] + 37
+    assert choice.reason[after].endswith("all nearer the wanted place are blurred")
+
+
 def test_sharpness_is_judged_beside_neighbours_not_in_total() -> None:
     """A passage over lawn at a fifth of the walls' sharpness is not taken for blurred."""
     sharpness = np.where(np.arange(300) < 150, 20.0, 4.0)
@@ -225,6 +236,8 @@ def test_sharpness_falls_with_blur_and_along_one_direction_alone() -> None:
     defocused = sharpness_of(cv2.GaussianBlur(image, (0, 0), 3))
     assert defocused < motion < 0.6 * sharp
     assert sharpness_of(np.full((200, 300), 90, np.uint8)) == 0
+    # Stripes have no detail along themselves: nothing tells blur along them.
+    assert sharpness_of(np.tile(np.array([[0, 0, 90, 90]], np.uint8), (200, 75))) == 0
     # One column brighter by 4 levels: second differences 4, -8, 4 along x, none along y.
     assert sharpness_of(np.pad([[4]], ((2, 2), (2, 2))).astype(np.uint8)) == pytest.approx(
         np.sqrt(6 * 16 * (1 + 4 + 1)) / 4 / 5
