@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.georegister.noise import Levels, Solution, improve_levels, solve, robust_weights
+from spn_data.georegister.noise import Levels, Solution, improve_levels, robust_weights, solve
 from spn_data.georegister.problem import SHARED, Problem, State
 
 _ROUNDS = 40
 _SAME_PLACE_SIGMAS = 3.0
 _FREE_OFFSET_M = 1e3
-_FIXED_OFFSET_M = 1e-4
+FIXED_OFFSET_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +95,15 @@ def estimate(problem: Problem, state: State, inlier: np.ndarray) -> Estimate:
     f = len(state.offsets_m)
     levels = problem.levels()
     first = _first_flight_with_heights(problem)
-    fixed = np.full(f, _FIXED_OFFSET_M)
+    fixed = np.full(f, FIXED_OFFSET_M)
     if not problem.fixes.free_heights or f == 1 or not problem.fixes.has_heights:
         return iterate(problem, _without_offsets(state), inlier, fixed, levels)
     tied = np.full(f, problem.options.same_takeoff_sigma_m)
-    tied[first] = _FIXED_OFFSET_M
+    tied[first] = FIXED_OFFSET_M
     if problem.options.same_takeoff is True:
         return iterate(problem, _without_offsets(state), inlier, tied, levels)
     free = np.full(f, _FREE_OFFSET_M)
-    free[first] = _FIXED_OFFSET_M
+    free[first] = FIXED_OFFSET_M
     shifted = _from_first(state, first)
     result = iterate(problem, shifted, inlier, free, levels, rounds=_ROUNDS // 2)
     if problem.options.same_takeoff is None:

@@ -213,9 +213,7 @@ def robust_weights(
     return weights[chains.twin], np.sqrt(square / chains.twin_sizes)[chains.twin]
 
 
-def robust_cost(
-    chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray
-) -> float:
+def robust_cost(chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray) -> float:
     """Negative logarithm of the density of residuals (M,) under a contaminated normal, at its weights (M,).
 
     The bias is at its most probable course rather than integrated out: good for comparing fits of one flight.

@@ -12,8 +12,8 @@ from spn_data.georegister.noise import (
     Linear,
     improve_levels,
     robust_cost,
-    solve,
     robust_weights,
+    solve,
 )
 from spn_data.georegister.observe import Fixes, observe
 from spn_data.georegister.options import GeoregisterOptions

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.georegister.crossval import HeldOut, cross_validate, time_blocks
-from spn_data.georegister.fit import Estimate, estimate
+from spn_data.georegister.fit import FIXED_OFFSET_M, Estimate, estimate
 from spn_data.georegister.gravity import Gravity, gravity_from_gimbal, level_up
 from spn_data.georegister.observe import Fixes, observe
 from spn_data.georegister.options import GeoregisterOptions
@@ -127,7 +127,8 @@ def _fit_of(
         world_from_model,
         fixes.origin,
         {
-            name: float(offset)
+            # The flight that the others count from is held at zero by a tight prior.
+            name: 0.0 if result.offset_sigma_m[f] <= FIXED_OFFSET_M else float(offset)
             for f, (name, offset) in enumerate(zip(fixes.flights, state.offsets_m, strict=True))
             if np.isfinite(fixes.enu_m[fixes.flight == f, 2]).any()
         },
