@@ -15,11 +15,11 @@ from spn_data.matching import unit_descriptors
 class PairOptions:
     """How pairs are chosen."""
 
-    overlap: int = 8  # following frames of the same sequence
-    far_steps: int = 3  # further ones at 2, 4, 8, ... times the overlap
-    spatial_neighbors: int = 12  # nearest frames by GNSS
+    overlap: int = 6  # following frames of the same sequence
+    far_steps: int = 2  # further ones at 2, 4, ... times the overlap
+    spatial_neighbors: int = 8  # nearest frames by GNSS
     spatial_max_m: float = 60.0  # beyond which no frame is a neighbour
-    appearance_neighbors: int = 10  # most similar frames that time does not pair already
+    appearance_neighbors: int = 6  # most similar frames that time does not pair already
     words: int = 64  # of the vocabulary that appearance is described with
     seed: int = 0
 

@@ -26,7 +26,7 @@ class ReconstructOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     engine: str = "incremental"  # or "global"
-    camera_model: str = "OPENCV"  # of the last bundle adjustments
+    camera_model: str = "RADIAL"  # of the last bundle adjustments
     refine_principal_point: bool = False
     threads: int = 2  # of the mapper, and worker processes before it
     seed: int = 0
@@ -164,6 +164,7 @@ def _map(
         threads=options.threads,
         seed=options.seed,
         snapshot_every=max(3, n // 10),
+        min_model_size=10 if n >= 30 else 3,
         start_from="" if snapshot is None else str(snapshot),
     )
     models = run_mapping(

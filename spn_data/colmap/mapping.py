@@ -123,8 +123,11 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
         snapshot_path=job.snapshots,
         snapshot_frames_freq=job.snapshot_every,
     )
-    # A model of few images is a failure to report, not a result to keep.
-    options.min_model_size = 3
+    options.min_model_size = job.min_model_size
+    # A last bundle adjustment follows in `refine`: those on the way need not be many, nor converge.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.35
+    options.ba_global_max_refinements = 2
+    options.ba_global_max_num_iterations = 30
     registered = 0
     if job.start_from:
         registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
