@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +25,8 @@ from spn_data.timing import Progress
 
 out = Console(highlight=False)
 _PLAIN_EVERY_S = 20.0
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+_KEPT = ". What is done is kept: make room, and the same command goes on"
 
 
 class Group(click.Group):
@@ -44,9 +48,13 @@ class Group(click.Group):
             )
             ctx.exit(130)
         except OSError as error:
-            if ctx.params.get("verbose") or error.filename is None:
+            # Without a file's name it is our mistake, but where a disk refused what was written.
+            if ctx.params.get("verbose") or (error.filename is None and error.errno not in _DISK):
                 raise
-            raise click.ClickException(f"{error.filename}: {error.strerror}") from error
+            where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+            raise click.ClickException(
+                f"{where}{error.strerror}{_KEPT if error.errno in _DISK else ''}"
+            ) from error
 
 
 @contextmanager

@@ -52,7 +52,7 @@ def run(
     area = options.open_area(area_folder)
     with area.locked(), show.Live() as live:
         if add:
-            extend(area, list(inputs), wanted, live)
+            extend(area, list(inputs), wanted, live, overwrite=overwrite)
         else:
             reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
     show.verdict(area)

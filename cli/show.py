@@ -8,6 +8,7 @@ from typing import Any
 
 from cli import console
 from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, StageRecord
+from spn_data.errors import StageError
 from spn_data.pipeline.frames import Plan
 from spn_data.telemetry.track import TelemetrySummary
 
@@ -78,6 +79,12 @@ class Live:
         self._close()
         {FRAMES: frames, MODEL: model, GEO: georegistration}[record.stage](record)
 
+    def unchanged(self, record: StageRecord) -> None:
+        self._close()
+        console.out.print(
+            f"{record.stage}: unchanged since {record.finished} ({_summary(record)})."
+        )
+
 
 def frames(record: StageRecord) -> None:
     counts = record.counts
@@ -146,7 +153,11 @@ def georegistration(record: StageRecord) -> None:
 
 
 def status(area: Area) -> None:
-    """Every stage: made when, of what, stale or not."""
+    """Every stage: made when, of what, stale or not. Raises StageError where no stage was begun."""
+    if not any(area.has(stage) or area.partial(stage).exists() for stage in STAGES):
+        raise StageError(
+            f"{area.root.resolve()} is no area: spn-data reconstruct VIDEO --area ... makes one"
+        )
     rows = []
     for stage in STAGES:
         if not area.has(stage):
@@ -160,8 +171,12 @@ def status(area: Area) -> None:
         record = area.record(stage)
         reason = area.stale_because(stage)
         state = f"stale: {reason}" if reason else "complete"
+        if area.partial(stage).exists():
+            state += "; making it anew is unfinished"
         rows.append((stage, state, _summary(record), record.finished))
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
+    if area.has_unfinished_addition():
+        console.note("an addition is unfinished: the same command with --add goes on.")
     verdict(area)
 
 

@@ -26,8 +26,16 @@ FRAMES, MODEL, GEO = "1-frames", "2-model", "3-geo"
 STAGES = (FRAMES, MODEL, GEO)
 UPSTREAM: dict[str, tuple[str, ...]] = {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL)}
 
+# What only unfinished work holds: it is removed once the stage's record stands.
+SCRATCH: dict[str, tuple[str, ...]] = {
+    FRAMES: (".analysis",),
+    MODEL: ("mapping-*", "database-*", "refined"),
+    GEO: (),
+}
+
 _FACTS = "area.toml"
 _RECORD = "stage.json"
+_STARTED = "started.json"
 _LOCK = ".lock"
 _NEXT = ".next"
 _READY = "ready"
@@ -106,17 +114,21 @@ class StageWork:
         self._area.put_in_place(record.stage, self.path)
         return record
 
+    def discard(self) -> None:
+        """Leave nothing of it, where the work came to no result and going on would gain nothing."""
+        shutil.rmtree(self.path)
+
+
+class InUseError(StageError):
+    """Raised when another process is changing the area."""
+
 
 class Area:
     """A folder that `reconstruct` fills stage by stage."""
 
     def __init__(self, root: Path):
         self.root = root
-        if (root / _NEXT / _READY).exists():
-            self._take_next()
-        for stage in STAGES:  # a kill between two renames
-            if self._old(stage).exists() and not self.folder(stage).exists():
-                self._old(stage).rename(self.folder(stage))
+        self._finish_exchange()
         self.facts = self._read_facts()
 
     def folder(self, stage: str) -> Path:
@@ -187,7 +199,7 @@ class Area:
                     "--overwrite makes it anew, another --area leaves it"
                 )
         path = self.partial(stage)
-        started = path / "started.json"
+        started = path / _STARTED
         resumed = started.exists()
         if resumed:
             found = _read_record(started)
@@ -199,6 +211,9 @@ class Area:
                     )
                 shutil.rmtree(path)
                 resumed = False
+            elif (path / _RECORD).exists():  # a kill while scratch files were removed
+                self.put_in_place(stage, path)
+                return self.record(stage)
         if not resumed:
             shutil.rmtree(path, ignore_errors=True)
             _make_folder(path)
@@ -207,11 +222,14 @@ class Area:
 
     def put_in_place(self, stage: str, path: Path) -> None:
         """Rename a complete folder to the stage's name; a kill at any moment loses neither version."""
-        (path / "started.json").unlink(missing_ok=True)
+        for pattern in SCRATCH[stage]:
+            for scratch in path.glob(pattern):
+                shutil.rmtree(scratch) if scratch.is_dir() else scratch.unlink()
         shutil.rmtree(self._old(stage), ignore_errors=True)
         if self.has(stage):
             self.folder(stage).rename(self._old(stage))
         path.rename(self.folder(stage))
+        (self.folder(stage) / _STARTED).unlink(missing_ok=True)
         shutil.rmtree(self._old(stage), ignore_errors=True)
 
     @contextmanager
@@ -226,10 +244,28 @@ class Area:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise StageError(f"{self.root} is in use by another spn-data") from error
+                raise InUseError(f"{self.root} is in use by another spn-data") from error
             yield
 
+    def _finish_exchange(self) -> None:
+        """Complete the renames that a killed process left half-way; not those of one that still runs."""
+        exchanging = (self.root / _NEXT / _READY).exists()
+        moved = [s for s in STAGES if self._old(s).exists() and not self.folder(s).exists()]
+        if not exchanging and not moved:
+            return
+        try:
+            with self.locked():
+                for stage in STAGES:
+                    if self._old(stage).exists() and not self.folder(stage).exists():
+                        self._old(stage).rename(self.folder(stage))
+                if (self.root / _NEXT / _READY).exists():
+                    self._take_next()
+        except InUseError:
+            return
+
     def write_facts(self, facts: Facts) -> None:
+        if facts == self.facts and (self.root / _FACTS).exists():
+            return
         text = tomli_w.dumps({"version": VERSION, "sources": list(facts.sources)})
         _write_atomically(self.root / _FACTS, text)
         self.facts = facts
@@ -248,6 +284,13 @@ class Area:
     def next_area(self) -> Area:
         """An area inside this one in which its next version is made, whole, before it replaces this."""
         return Area(self.root / _NEXT)
+
+    def has_unfinished_addition(self) -> bool:
+        return (self.root / _NEXT).exists()
+
+    def drop_next(self) -> None:
+        """Throw away what an unfinished addition has made."""
+        shutil.rmtree(self.root / _NEXT, ignore_errors=True)
 
     def take_next(self) -> None:
         """Replace the stages by those of the next version, all or none."""
@@ -325,9 +368,8 @@ def _check_version(path: Path, found: int) -> None:
 
 def _difference(found: StageRecord, wanted: StageRecord) -> str:
     """In words, what two records are made of that differs."""
-    for name, value in wanted.options.items():
-        if name not in found.options or found.options[name] != value:
-            return f"was made with {name} = {found.options.get(name)!r}, now {value!r}"
+    for name, before, now in _changed_options(found.options, wanted.options):
+        return f"was made with {name} = {before!r}, now {now!r}"
     new = sorted(set(wanted.inputs) - set(found.inputs))
     gone = sorted(set(found.inputs) - set(wanted.inputs))
     changed = sorted(
@@ -344,6 +386,18 @@ def _difference(found: StageRecord, wanted: StageRecord) -> str:
     return "was made from an earlier " + " and ".join(
         name for name in wanted.upstream if wanted.upstream[name] != found.upstream.get(name)
     )
+
+
+def _changed_options(
+    found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """(name, value before, value now) of each option that differs, those in groups as `group.name`."""
+    for name in dict.fromkeys((*wanted, *found)):
+        before, now = found.get(name), wanted.get(name)
+        if isinstance(before, Mapping) and isinstance(now, Mapping):
+            yield from _changed_options(before, now, f"{prefix}{name}.")
+        elif before != now:
+            yield prefix + name, before, now
 
 
 def _make_folder(path: Path) -> None:

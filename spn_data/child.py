@@ -20,13 +20,13 @@ from typing import Any
 from spn_data.errors import StageError
 
 Event = dict[str, Any]
-STOP_WAIT_S = 60  # what a child gets to write a last snapshot
+STOP_WAIT_S = 5  # what a child gets to end by itself
 
 
 def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event], None]) -> None:
     """Run `python -m module` with job on its standard input, and hand each event to on_event.
 
-    The child's standard error goes to `log`. Raises StageError, with the end of the log, where the
+    The child's standard error goes to `log`. Raises StageError, with the log's last line, where the
     child ends otherwise than well.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,10 @@ def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event],
             child.stdout.close()
     if code != 0:
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
-        raise StageError(f"{module} {how}; the end of {log}:\n{_tail(log)}")
+        raise StageError(
+            f"{module.rpartition('.')[2]} {how}. What was done before is kept: the same command goes on. "
+            f"{log} ends in: {_last_line(log)}"
+        )
 
 
 def _stop(child: subprocess.Popen[str]) -> None:
@@ -68,8 +71,9 @@ def _stop(child: subprocess.Popen[str]) -> None:
         child.wait()
 
 
-def _tail(log: Path) -> str:
-    return "\n".join(log.read_text(errors="replace").splitlines()[-8:])
+def _last_line(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    return next((line for line in reversed(lines) if line), "nothing")
 
 
 def read_job() -> Event:

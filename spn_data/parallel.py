@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import Any
 
 from spn_data.errors import SpnError
@@ -61,6 +62,7 @@ def _run_until_broken(
 ) -> bool:
     """True when all of pending is done; False when the pool broke, with the batches in flight in died."""
     running: dict[Future[Any], tuple[str, tuple[Any, ...]]] = {}
+    others = set(multiprocessing.active_children())
     with _pool(workers) as pool:
         try:
             exhausted = False
@@ -71,7 +73,8 @@ def _run_until_broken(
                         exhausted = True
                         break
                     try:
-                        running[pool.submit(function, *batch[1])] = batch
+                        with _no_interrupt():
+                            running[pool.submit(function, *batch[1])] = batch
                     except BrokenProcessPool:
                         died.append(batch)
                         raise
@@ -88,9 +91,22 @@ def _run_until_broken(
                     died.append(batch)
             return False
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # What they compute is not wanted any more, and nobody shall wait for it.
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+            pool.shutdown(wait=True, cancel_futures=True)
             raise
     return True
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Hold SIGINT back. Processes started meanwhile never see it, not even while they load."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -98,6 +114,8 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     # Spawned processes inherit the environment, and BLAS reads its limit when it loads.
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
+    # Started with the first worker, it would lift the mask of `_no_interrupt`.
+    resource_tracker.ensure_running()
     try:
         with ProcessPoolExecutor(
             workers,
@@ -118,7 +136,6 @@ def _prepare_worker(parent_pid: int) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     exit_with_parent(parent_pid)
 
 

@@ -126,7 +126,7 @@ def test_the_next_version_replaces_all_stages_or_none(tmp_path: Path, killed_aft
         following.folder(stage).rename(area.folder(stage))
     reopened = Area(tmp_path)
     assert [content(reopened, stage) for stage in (FRAMES, MODEL, GEO)] == ["new"] * 3
-    assert sorted(p.name for p in tmp_path.iterdir()) == [FRAMES, MODEL, GEO]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", FRAMES, MODEL, GEO]
 
 
 def test_an_area_of_a_newer_version_is_refused(tmp_path: Path) -> None:

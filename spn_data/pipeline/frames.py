@@ -29,6 +29,8 @@ from spn_data.timing import Progress, Stopwatch
 # Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
 _GUESSED_FOCAL_SHARE = 0.7
 _DIAGONAL_35MM = 43.267
+# Names beside the folders of the sequences.
+_RESERVED = ("telemetry", "masks", "frames.csv", "cameras.json", "stage.json", "started.json")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,20 +54,37 @@ class Plan:
     cost: Cost
 
 
-def plan(inputs: list[Path], options: FramesOptions, taken: set[str]) -> Plan:
-    """Sources of all inputs, with names that neither each other nor `taken` have."""
+def plan(inputs: list[Path], options: FramesOptions, *, extended: Area | None = None) -> Plan:
+    """Sources of all inputs, with names that no two of them and none of the area to extend have.
+
+    Sources whose every file is in that area are ignored; InputError where there are no others.
+    """
     sources: list[Source] = []
     ignored: list[tuple[Path, str]] = []
-    names = {name.lower() for name in taken}
+    names = set(_RESERVED)
+    held: set[str] = set()
+    if extended is not None:
+        frames = read_frames(extended.folder(FRAMES) / "frames.csv")
+        names |= {name.lower() for name in np.unique(frames.sequences).tolist()}
+        held = set(extended.record(FRAMES).inputs.values())
     for path in inputs:
         found = discover(path)
         ignored += found.ignored
         for source in found.sources:
+            known = [part for part in source.parts if content_fingerprint(part) in held]
+            if len(known) == len(source.parts):
+                ignored += [(part, "already in the area") for part in known]
+                continue
             name, number = source.sequence, 2
             while name.lower() in names:
                 name, number = f"{source.sequence}-{number}", number + 1
             names.add(name.lower())
             sources.append(replace(source, sequence=name))
+    if not sources:
+        raise InputError(
+            "nothing to add: what it holds is already in the area",
+            path=", ".join(str(path) for path in inputs),
+        )
     return Plan(
         tuple(sources),
         tuple(ignored),
@@ -73,13 +92,30 @@ def plan(inputs: list[Path], options: FramesOptions, taken: set[str]) -> Plan:
     )
 
 
-def fingerprints(sources: tuple[Source, ...]) -> dict[str, str]:
-    """Content fingerprint of every file of the sources, by sequence and name."""
-    return {
+def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:
+    """Content fingerprint of every file of the sources, by sequence and name, and of their masks."""
+    files = {
         f"{source.sequence}/{path.name}": content_fingerprint(path)
         for source in sources
         for path in (*source.parts, *source.telemetry)
     }
+    return files | {f"{name}/mask": content_fingerprint(path) for name, path in masks.items()}
+
+
+def masks_of(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:
+    """The mask of each sequence that has one. InputError where a folder of masks has none of them."""
+    if given is None:
+        return {}
+    path = Path(given)
+    if not path.is_dir():
+        return {source.sequence: path for source in sources}
+    files = {source.sequence: path / f"{source.sequence}.png" for source in sources}
+    found = {name: file for name, file in files.items() if file.exists()}
+    if not found:
+        raise InputError(
+            f"holds no mask: none of {', '.join(f.name for f in files.values())}", path=path
+        )
+    return found
 
 
 def choose_frames(
@@ -96,10 +132,13 @@ def choose_frames(
 
     extend : the area whose frames are kept and come first.
     """
-    inputs = fingerprints(found.sources)
+    masks = masks_of(found.sources, options.mask)
+    inputs = fingerprints(found.sources, masks)
     if extend is not None:
         inputs = {**extend.record(FRAMES).inputs, **inputs}
-    work = area.begin(FRAMES, asdict(options), inputs, overwrite=overwrite)
+    # Masks count by their content, wherever they lie.
+    made_with = asdict(replace(options, mask=None))
+    work = area.begin(FRAMES, made_with, inputs, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
     check_space(work.path, found.cost.disk_bytes)
@@ -114,7 +153,7 @@ def choose_frames(
     candidates, tracks = [], []
     for source in found.sources:
         with stopwatch.step("analysis"):
-            measured = _analyse_once(source, work.path / "analysis", found.cost, progress)
+            measured = _analyse_once(source, work.path / ".analysis", found.cost, progress)
         track = telemetry_of(source, measured, any_telemetry=options.any_telemetry)
         check_usable(measured.measured, options.selection, source.parts[0].name)
         tell(source.sequence, None if track is None else summarize(track))
@@ -132,7 +171,10 @@ def choose_frames(
             frames = frames.with_telemetry(track.at(frames.time_s))
             write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)
         cameras.update(_start_cameras(frames, one.photos, options.fov_deg))
-        _write_mask(options.mask, frames, work.path / "masks")
+        if one.source.sequence in masks:
+            _write_mask(masks[one.source.sequence], frames, work.path / "masks")
+        elif masks:
+            notes.append(f"{one.source.sequence}: no mask of that name")
         with stopwatch.step("frames"):
             extract_chosen(
                 one.source,
@@ -145,7 +187,6 @@ def choose_frames(
     frames = Frames.concatenate([*kept, *parts])
     write_frames(work.path / "frames.csv", frames)
     write_json(work.path / "cameras.json", {"version": 1, "cameras": cameras})
-    shutil.rmtree(work.path / "analysis", ignore_errors=True)
     return work.finish(
         counts={
             "candidates": len(frames),
@@ -173,7 +214,9 @@ def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict
             try:
                 os.link(path, link)
             except OSError:  # a disk without hard links
-                shutil.copy2(path, link)
+                copy = link.with_name(f"{link.name}.part")
+                shutil.copy2(path, copy)
+                copy.replace(link)
     return [frames], dict(read_json(folder / "cameras.json")["cameras"])
 
 
@@ -276,18 +319,10 @@ def _photo_focal_px(photos: PhotoHeaders, row: int, width: int, height: int) -> 
     return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(width, height))
 
 
-def _write_mask(given: str | None, frames: Frames, folder: Path) -> None:
-    """The source's mask at its size, where one is given."""
-    if given is None:
-        return
-    sequence = str(frames.sequences[0])
-    path = Path(given)
-    if path.is_dir():
-        path = path / f"{sequence}.png"
-        if not path.exists():
-            return
+def _write_mask(path: Path, frames: Frames, folder: Path) -> None:
+    """The source's mask at its size."""
     row = int(np.flatnonzero(frames.width > 0)[0])
     usable = load_mask(path, int(frames.width[row]), int(frames.height[row]))
     ok, data = cv2.imencode(".png", usable.astype(np.uint8) * 255)
     assert ok
-    (folder / f"{sequence}.png").write_bytes(data.tobytes())
+    (folder / f"{frames.sequences[0]}.png").write_bytes(data.tobytes())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, GEO, MODEL, Area, StageRecord, write_json
+from spn_data.area import FRAMES, GEO, MODEL, Area, StageRecord, StageWork, write_json
 from spn_data.colmap.model import Scene, read_scene, write_transformed
 from spn_data.errors import GeometryError
 from spn_data.frames import Frames, read_frames
@@ -52,6 +52,16 @@ def georegister(
     work = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
+    try:
+        return _georegister(area, work, options, progress)
+    except GeometryError:
+        work.discard()  # nothing in it is worth going on from
+        raise
+
+
+def _georegister(
+    area: Area, work: StageWork, options: GeoStageOptions, progress: Progress
+) -> StageRecord:
     stopwatch = Stopwatch()
     tracks = read_tracks(area)
     if not any(track.has_fix.any() for track in tracks.values()):

@@ -41,31 +41,38 @@ def build_model(
     work = area.begin(MODEL, made_of, {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
-    if extend is not None and not (work.path / DATABASE).exists():
-        _take_over(extend, work)
+    notes = () if extend is None else _take_over(extend, work)
     frames = read_frames(area.folder(FRAMES) / "frames.csv")
     chosen = frames.select(frames.chosen)
     stopwatch = Stopwatch()
     result = reconstruct(frames_to_map(area, chosen), work.path, options, progress, stopwatch)
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     write_registration(work.path / REGISTRATION, result.registrations)
-    _keep_only_results(work.path, result)
+    _name_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
-        notes=(*result.attempts, *passages),
+        notes=(*notes, *result.attempts, *passages),
     )
 
 
-def _take_over(extend: Area, work: StageWork) -> None:
-    """Features and matches of an area, where they were made with the same options."""
+def _take_over(extend: Area, work: StageWork) -> tuple[str, ...]:
+    """Features and matches of an area, where they were made with the same options; else a note on it."""
     before = extend.record(MODEL).made_of["options"]
     now = work.record.made_of["options"]
-    if all(before[name] == now[name] for name in ("features", "matching")):
+    for group in ("features", "matching"):
+        for name, value in now[group].items():
+            if before[group].get(name) != value:
+                return (
+                    f"features and matches are made anew: the area's were made with {name} = "
+                    f"{before[group].get(name)!r}, now {value!r}",
+                )
+    if not (work.path / DATABASE).exists():
         copied = work.path / "copied.db"
         shutil.copyfile(extend.folder(MODEL) / DATABASE, copied)
         copied.rename(work.path / DATABASE)
+    return ()
 
 
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
@@ -125,17 +132,13 @@ def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
             writer.writerow([*cells, row.observations, error])
 
 
-def _keep_only_results(work: Path, result: ReconstructResult) -> None:
-    """What an interrupted run would have gone on from has done its duty."""
+def _name_results(work: Path, result: ReconstructResult) -> None:
+    """The results under their names; what an interrupted run goes on from stays until the stage is done."""
     if result.database != work / DATABASE:
         (work / DATABASE).unlink()
         result.database.rename(work / DATABASE)
     for path in result.model.iterdir():
         path.rename(work / path.name)
-    result.model.rmdir()
-    for pattern in ("mapping-*", "database-*"):
-        for path in work.glob(pattern):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _counts(result: ReconstructResult, chosen: Frames) -> dict[str, object]:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from spn_data.area import FRAMES, GEO, MODEL, Area, Facts, StageRecord, read_json
+from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, Facts, StageRecord, read_json
 from spn_data.errors import GeometryError, StageError
-from spn_data.frames import read_frames
 from spn_data.georegister.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
 from spn_data.pipeline.geo import GeoStageOptions, georegister, has_fixes
@@ -37,6 +36,8 @@ class Watcher(Protocol):
 
     def stage(self, record: StageRecord) -> None: ...
 
+    def unchanged(self, record: StageRecord) -> None: ...
+
 
 def reconstruct(
     area: Area, inputs: list[Path], options: Options, watcher: Watcher, *, overwrite: bool = False
@@ -46,14 +47,18 @@ def reconstruct(
     Without telemetry there is no stage 3-geo. Raises StageError where telemetry does not determine the
     place in the world; the model stands then all the same.
     """
-    _stages(area, inputs, options, watcher, overwrite=overwrite, extended=None)
-    area.write_facts(Facts(sources=tuple(str(path) for path in inputs)))
+    found = plan(inputs, options.frames)
+    _stages(area, found, inputs, options, watcher, overwrite=overwrite, extended=None)
 
 
-def add(area: Area, inputs: list[Path], options: Options, watcher: Watcher) -> None:
+def add(
+    area: Area, inputs: list[Path], options: Options, watcher: Watcher, *, overwrite: bool = False
+) -> None:
     """Extend the area by the inputs; it stays as it is until its next version is complete.
 
-    Frames, features and matches are taken over, the origin is kept, the map is made anew.
+    Frames, features and matches are taken over, the origin is kept, the map is made anew. Sources that the
+    area holds already are passed over; InputError where there are no others. overwrite : starts anew where
+    another addition is unfinished.
     """
     for stage in (FRAMES, MODEL):
         if not area.has(stage):
@@ -62,14 +67,17 @@ def add(area: Area, inputs: list[Path], options: Options, watcher: Watcher) -> N
         origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
         fit = replace(options.geo.fit, origin=origin)
         options = replace(options, geo=replace(options.geo, fit=fit))
+    found = plan(inputs, options.frames, extended=area)
+    if overwrite:
+        area.drop_next()
     following = area.next_area()
-    _stages(following, inputs, options, watcher, overwrite=False, extended=area)
-    following.write_facts(Facts(sources=(*area.facts.sources, *(str(path) for path in inputs))))
+    _stages(following, found, inputs, options, watcher, overwrite=False, extended=area)
     area.take_next()
 
 
 def _stages(
     area: Area,
+    found: Plan,
     inputs: list[Path],
     options: Options,
     watcher: Watcher,
@@ -77,31 +85,31 @@ def _stages(
     overwrite: bool,
     extended: Area | None,
 ) -> None:
-    taken: set[str] = set()
-    if extended is not None:
-        frames = read_frames(extended.folder(FRAMES) / "frames.csv")
-        taken = set(frames.sequences.tolist())
-    found = plan(inputs, options.frames, taken)
+    def tell(record: StageRecord, before: StageRecord | None) -> None:
+        (watcher.unchanged if record == before else watcher.stage)(record)
+
     watcher.planned(found)
-    watcher.stage(
-        choose_frames(
-            area,
-            found,
-            options.frames,
-            watcher.progress,
-            extend=extended,
-            overwrite=overwrite,
-            tell=watcher.telemetry,
-        )
+    before = {stage: area.record(stage) for stage in STAGES if area.has(stage)}
+    frames = choose_frames(
+        area,
+        found,
+        options.frames,
+        watcher.progress,
+        extend=extended,
+        overwrite=overwrite,
+        tell=watcher.telemetry,
     )
-    watcher.stage(
-        build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
-    )
+    earlier = () if extended is None else extended.facts.sources
+    area.write_facts(Facts(sources=(*earlier, *(str(path) for path in inputs))))
+    tell(frames, before.get(FRAMES))
+    model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
+    tell(model, before.get(MODEL))
     if not has_fixes(area):
         return
     try:
-        watcher.stage(georegister(area, options.geo, watcher.progress, overwrite=overwrite))
+        geo = georegister(area, options.geo, watcher.progress, overwrite=overwrite)
     except GeometryError as error:
         raise StageError(
             f"{area.folder(MODEL)} is complete, but its place in the world is refused: {error}"
         ) from error
+    tell(geo, before.get(GEO))
