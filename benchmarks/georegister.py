@@ -30,6 +30,7 @@ from spn_data.georegister import (
     georegister,
     georegistration_errors,
 )
+from spn_data.georegister.uncertainty import radius_sigma
 from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
 from spn_data.simulate.flight import FlightPath, simulate_paths, simulate_telemetry
 from spn_data.simulate.gnss import GnssOptions
@@ -172,12 +173,9 @@ def judge(fit: GeoFit, model: Model, options: SimulateOptions, calm: Telemetry) 
     sigmas = dict(zip(names, off / np.sqrt(np.diag(stated.covariance)), strict=True))
     sigmas["horizontal"] = float(np.hypot(off[0], off[1]) / stated.horizontal_m)
     sigmas["tilt"] = errors.tilt_deg / stated.tilt_deg
-    spread = np.sqrt(
-        np.trace(
-            stated.of_points(fit.world_from_model.apply(model.poses.centers)), axis1=1, axis2=2
-        )
-    )
-    sigmas["frames"] = errors.position_m / float(np.sqrt(np.mean(spread**2)))
+    world = fit.world_from_model.apply(model.poses.centers)
+    frame_m = np.linalg.norm(world - true.apply(model.poses.centers), axis=1)
+    radius_m = np.array([radius_sigma(c) for c in stated.of_points(world)])
     return {
         "errors": {name: abs(getattr(errors, name)) for name in FIGURES},
         "oracle": {name: abs(getattr(oracle_errors, name)) for name in FIGURES},
@@ -186,6 +184,7 @@ def judge(fit: GeoFit, model: Model, options: SimulateOptions, calm: Telemetry) 
             name: getattr(stated, name)
             for name in ("horizontal_m", "vertical_m", "tilt_deg", "heading_deg", "scale")
         },
+        "frames_within": float(np.mean(frame_m <= 2 * radius_m)),
         "outliers": fit.summary.outliers,
         "held_out_m": fit.held_out_blocks.horizontal_rmse_m,
         "in_sample_m": fit.summary.horizontal_rmse_m,
@@ -234,6 +233,7 @@ def _distributions(judged: list[dict[str, Any]]) -> dict[str, Any]:
         name: float(np.mean([j["sigmas"][name] <= 2 for j in judged]))
         for name in judged[0]["sigmas"]
     }
+    figures["within_2_sigma"]["frames"] = float(np.mean([j["frames_within"] for j in judged]))
     tilt = np.array([j["errors"]["tilt_deg"] for j in judged])
     figures["tilt_at_most_0.7_deg"] = float(np.mean(tilt <= 0.7))
     figures["outliers"] = _quantiles(np.array([j["outliers"] for j in judged]))

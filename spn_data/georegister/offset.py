@@ -28,6 +28,7 @@ _NO_OFFSET_M = 1e-4  # a flight alone has no vertical offset to another
 _WEAK_PRECISION = 1e-4  # of the time offset: keeps the equations solvable where nothing tells it
 # Two offsets whose costs differ by less than this are both possible (nine is three sigma).
 _AMBIGUOUS_COST = 9.0
+_LARGE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,8 @@ class OffsetOptions:
     """Where an offset is looked for, and when it counts as found."""
 
     max_offset_s: float = 5.0
-    max_sigma_s: float = 0.1  # an offset known worse than this is called undetermined
+    max_sigma_s: float = 0.1  # an offset known worse than this is called undetermined,
+    large_sigma_s: float = 0.3  # or than this where it is five sigma from zero: better than none
     step_s: float = 0.1  # of the first search
 
 
@@ -76,7 +78,8 @@ def estimate_time_offset(
 
     Positions and, where known, gimbal angles are fitted together with the offset as one more unknown, under
     errors that are correlated in time: what a drifting GNSS bias could as well explain does not count as
-    information. The result is undetermined where that leaves more than `max_sigma_s`.
+    information. The result is undetermined where that leaves more than `max_sigma_s`, and where two offsets
+    fit alike. Offsets of up to a quarter of the flight are looked for.
     """
     options = options or GeoregisterOptions()
     search = search or OffsetOptions()
@@ -108,7 +111,8 @@ def estimate_time_offset(
     if not found:
         return _undetermined(f"the best one lies outside {window_s:.1f} s")
     best = min(found, key=lambda f: f.cost)
-    if best.sigma_s > search.max_sigma_s:
+    large = abs(best.offset_s) > _LARGE_SIGMAS * best.sigma_s
+    if best.sigma_s > (search.large_sigma_s if large else search.max_sigma_s):
         return TimeOffset(
             None, best.sigma_s, "the flight's motion is too even, or too small against its errors"
         )
