@@ -76,14 +76,16 @@ def test_truth_is_that_of_the_paths_and_its_times_are_the_videos(flights: Path) 
     """Truth read back equals the exact path to a micrometre; times equal the container's."""
     for name, path in simulate_paths(TINY).items():
         truth = read_truth(flights / "truth", name)
-        np.testing.assert_allclose(truth.poses.centers, path.poses.centers, atol=1e-8)
-        np.testing.assert_allclose(truth.poses.quats_wxyz, path.poses.quats_wxyz, atol=1e-11)
+        np.testing.assert_allclose(truth.poses.centers, path.poses.centers, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            truth.poses.quats_wxyz, path.poses.quats_wxyz, rtol=0, atol=1e-11
+        )
         np.testing.assert_array_equal(truth.blurred, path.blurred)
         assert truth.camera.model == "RADIAL"
         np.testing.assert_array_equal(truth.camera.params, path.camera.params)
         assert truth.origin == TINY.origin
         times, pixels = decoded(flights / path.role / f"{name}.mp4")
-        np.testing.assert_allclose(times, truth.time_s, atol=1e-6)
+        np.testing.assert_allclose(times, truth.time_s, rtol=0, atol=1e-6)
         assert pixels.shape[1:] == (90, 160, 3)
         assert 60 < pixels.mean() < 190
         assert pixels.std() > 20
@@ -101,14 +103,14 @@ def test_srt_says_what_the_telemetry_says_to_its_last_digit(flights: Path) -> No
     text = (flights / "mapping" / "flight1.SRT").read_text(encoding="utf-8")
     said = np.array([[float(value) for value in match] for match in pattern.findall(text)])
     assert len(said) == len(path.time_s)
-    np.testing.assert_allclose(said[:, :2], expected.lat_lon_deg, atol=0.51e-6)
-    np.testing.assert_allclose(said[:, 2], expected.rel_alt_m, atol=0.51e-3)
-    np.testing.assert_allclose(said[:, 3], expected.abs_alt_m, atol=0.51e-3)
+    np.testing.assert_allclose(said[:, :2], expected.lat_lon_deg, rtol=0, atol=0.51e-6)
+    np.testing.assert_allclose(said[:, 2], expected.rel_alt_m, rtol=0, atol=0.51e-3)
+    np.testing.assert_allclose(said[:, 3], expected.abs_alt_m, rtol=0, atol=0.51e-3)
     turn = (said[:, 4:] - expected.gimbal_deg + 180.0) % 360.0 - 180.0
     assert np.abs(turn).max() < 0.051
     cues = re.findall(r"(\d\d):(\d\d):(\d\d),(\d{3}) -->", text)
     starts = [int(h) * 3600 + int(m) * 60 + int(s) + int(ms) / 1000 for h, m, s, ms in cues]
-    np.testing.assert_allclose(starts, path.time_s, atol=0.0006)
+    np.testing.assert_allclose(starts, path.time_s, rtol=0, atol=0.0006)
 
 
 def test_same_options_give_the_same_bytes_whatever_renders_them(
