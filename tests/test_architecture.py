@@ -1,0 +1,228 @@
+"""The rules of docs/architecture.md, read from the source itself."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("spn_data", "spn_model", "cli")
+MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+NAMES = [path.relative_to(ROOT).as_posix() for path in MODULES]
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Full names of all that a module imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            assert node.module is not None
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _importers(library: str) -> set[str]:
+    """Modules of ours that import a library or anything in it."""
+    return {
+        name
+        for name, path in zip(NAMES, MODULES, strict=True)
+        if any(full == library or full.startswith(f"{library}.") for full in _imports(path))
+    }
+
+
+def _outside(names: set[str], *folders: str) -> set[str]:
+    return {name for name in names if not name.startswith(folders)}
+
+
+def test_the_packages_are_found():
+    """The rules below are about real files."""
+    assert len(NAMES) > 50
+    assert "spn_data/pose.py" in NAMES
+
+
+def test_pycolmap_is_imported_in_one_place():
+    """pycolmap is imported by spn_data/colmap/__init__.py and by nothing else."""
+    assert _importers("pycolmap") == {"spn_data/colmap/__init__.py"}
+
+
+def test_only_colmap_knows_pycolmaps_objects():
+    """The module object that spn_data.colmap passes on is used inside that package alone."""
+    assert _outside(_importers("spn_data.colmap.pycolmap"), "spn_data/colmap/") == set()
+
+
+def test_pyav_stays_with_video():
+    """PyAV is imported where videos are decoded, encoded, or searched for subtitles."""
+    assert _importers("av") == {
+        "spn_data/video.py",
+        "spn_data/telemetry/subtitles.py",
+        "spn_data/simulate/video_out.py",
+    }
+
+
+@pytest.mark.parametrize("library", ["click", "rich"])
+def test_the_terminal_belongs_to_cli(library):
+    """Only cli/ imports click and rich."""
+    found = _importers(library)
+    assert found
+    assert _outside(found, "cli/") == set()
+
+
+@pytest.mark.parametrize("library", ["torch", "spn_model", "cli"])
+def test_spn_data_stands_alone(library):
+    """spn_data imports no torch, no network and no command line."""
+    assert {n for n in _importers(library) if n.startswith("spn_data/")} == set()
+
+
+def test_spn_model_knows_no_command_line():
+    """spn_model does not import cli, nor pycolmap by any way."""
+    found = _importers("cli") | _importers("pycolmap") | _importers("spn_data.colmap")
+    assert {n for n in found if n.startswith("spn_model/")} == set()
+
+
+def test_only_the_pipeline_and_cli_know_the_area():
+    """File names of the user's area are no business of value, format and engine modules."""
+    assert _outside(_importers("spn_data.area"), "spn_data/pipeline/", "cli/") == set()
+
+
+def test_only_cli_knows_the_pipeline():
+    """Nothing below the pipeline calls it."""
+    assert _outside(_importers("spn_data.pipeline"), "spn_data/pipeline/", "cli/") == set()
+
+
+@pytest.mark.parametrize("name", ["errors", "pose", "camera", "geodesy"])
+def test_value_modules_know_values_only(name):
+    """A value module imports errors and other value modules of ours, nothing else."""
+    ours = {full for full in _imports(ROOT / "spn_data" / f"{name}.py") if full.startswith("spn_")}
+    allowed = ("spn_data.errors.", "spn_data.pose.", "spn_data.camera.", "spn_data.geodesy.")
+    assert {full for full in ours if not full.startswith(allowed)} == set()
+
+
+def test_the_library_never_prints():
+    """spn_data and spn_model speak through return values, progress and errors."""
+    found = [
+        f"{name}:{node.lineno}"
+        for name, path in zip(NAMES, MODULES, strict=True)
+        if not name.startswith("cli/")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in ("print", "input", "exit", "breakpoint")
+    ]
+    assert found == []
+
+
+def test_nothing_is_pickled():
+    """Stored files can't carry code: pickle and its relatives are not used."""
+    for library in ("pickle", "shelve", "joblib", "dill"):
+        assert _importers(library) == set()
+
+
+def test_xml_goes_through_defusedxml():
+    """XML from outside is never given to the standard parsers; their exceptions may be named."""
+    for name, path in zip(NAMES, MODULES, strict=True):
+        found = {full for full in _imports(path) if full.split(".")[0] in ("xml", "lxml")}
+        allowed = {"xml.etree.ElementTree.ParseError", "xml.etree.ElementTree.Element"}
+        assert found <= allowed, name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_module_is_long(name):
+    """A module has at most 400 lines; one that grows past it has a second subject."""
+    assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= 400
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_module_says_what_it_is(name):
+    """A module with code begins with a docstring."""
+    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
+    assert not tree.body or ast.get_docstring(tree)
+
+
+def test_the_list_of_modules_is_complete():
+    """docs/architecture.md names every module of the tree in its folder, and none that is not there."""
+    listed: set[str] = set()
+    folder = ""
+    for line in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines():
+        if found := re.match(r"((?:spn_data|spn_model|cli)/(?:\w+/)?)(?:\s|$)", line):
+            folder = found[1]
+        elif found := re.match(r"  ((?:\w+\.py ?)+)", line):
+            listed |= {folder + name for name in found[1].split()}
+    assert listed == {name for name in NAMES if not name.endswith("__init__.py")}
+
+
+def _run(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("command", ["data", "model"])
+def test_help_is_quick(command):
+    """--help of a command loads none of the heavy libraries."""
+    heavy = ("torch", "pycolmap", "cv2", "av", "scipy")
+    loaded = _run(
+        "import sys\n"
+        f"from cli.{command} import main\n"
+        "try:\n"
+        "    main(['--help'])\n"
+        "except SystemExit as end:\n"
+        "    assert end.code == 0\n"
+        f"print('LOADED', [name for name in {heavy} if name in sys.modules])"
+    )
+    assert "Usage:" in loaded
+    assert loaded.rstrip().endswith("LOADED []")
+
+
+def test_help_of_every_command_is_quick():
+    """--help of a subcommand loads neither torch nor pycolmap."""
+    loaded = _run(
+        "import sys\n"
+        "from cli.data import main\n"
+        "for name in main.commands:\n"
+        "    try:\n"
+        "        main([name, '--help'])\n"
+        "    except SystemExit as end:\n"
+        "        assert end.code == 0\n"
+        "print('LOADED', [name for name in ('torch', 'pycolmap') if name in sys.modules])"
+    )
+    assert loaded.count("Usage:") >= 4
+    assert loaded.rstrip().endswith("LOADED []")
+
+
+def test_png_can_be_written_beside_pycolmap(tmp_path):
+    """spn_data.colmap loads cv2 before pycolmap: the other order aborts the process on PNG."""
+    path = tmp_path / "image.png"
+    _run(
+        "import spn_data.colmap\n"
+        "import cv2, numpy\n"
+        f"assert cv2.imwrite({str(path)!r}, numpy.zeros((4, 4, 3), numpy.uint8))"
+    )
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def _tracked() -> list[Path]:
+    done = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, timeout=30)
+    if done.returncode != 0:
+        pytest.skip("this is no git checkout")
+    paths = [ROOT / name for name in done.stdout.decode().split("\0") if name]
+    return [path for path in paths if path.is_file()]
+
+
+def test_no_file_names_a_machine():
+    """No tracked file holds an absolute path of someone's machine."""
+    places = re.compile(rb"(?<![\w.])/(?:work|home|root|Users|mnt|tmp)/\w")
+    found = [
+        f"{path.relative_to(ROOT)}: {hit[0].decode()}"
+        for path in _tracked()
+        for hit in places.finditer(path.read_bytes())
+    ]
+    assert found == []
