@@ -189,9 +189,11 @@ def test_survey_targets_of_the_courtyard_appear_where_they_are(
 def test_detail_finer_than_a_pixel_turns_grey() -> None:
     """A chessboard floor whose cells are smaller than a pixel shows no false pattern."""
     camera = Camera.from_horizontal_fov(320, 180, 30.0)
-    cells = (np.indices((512, 512)).sum(axis=0) % 2 * 160 + 40).astype(np.uint8)
+    cells = (np.indices((720, 720)).sum(axis=0) % 2 * 160 + 40).astype(np.uint8)
     board = Texture.from_image(np.dstack([np.kron(cells, np.ones((4, 4), np.uint8))] * 3))
-    floor = Face("board", np.array([-40.0, 40, 0]), np.array([80.0, 0, 0]), np.array([0, -80.0, 0]))
+    floor = Face(
+        "board", np.array([-57.6, 57.6, 0]), np.array([115.2, 0, 0]), np.array([0, -115.2, 0])
+    )
     renderer = Renderer([floor], {"board": board}, camera)
     for heading in (0.0, 20.0, 45.0):
         # Cells of 0.16 m have 3 px at 32 m, and 0.6 px at 140 m.
