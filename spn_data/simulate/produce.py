@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -183,6 +184,8 @@ _studio: _Studio | None = (
 
 def _open_studio(options: SimulateOptions, texture_folder: Path) -> None:
     global _studio
+    # Ctrl-C reaches every process of the terminal; the parent alone answers it, and ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _studio = _Studio(options, texture_folder)
 
 
