@@ -1,0 +1,98 @@
+"""Residuals of georegistration and their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spn_data.geodesy import GeoOrigin
+from spn_data.georegister.observe import Fixes
+from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.problem import SHARED, Kind, Problem, State
+from spn_data.pose import rotations_from_angles, rotations_from_vectors
+
+ROTATION = rotations_from_vectors(np.array([0.3, 1.2, -0.5]))
+
+
+def _problem(noise: float) -> tuple[Problem, State]:
+    """Nine cameras of two flights, one straight down and one on its side, and the state that fits them."""
+    rng = np.random.default_rng(0)
+    n = 9
+    flight = np.arange(n) % 2
+    model = rng.standard_normal((n, 3))
+    angles = np.column_stack(
+        [rng.uniform(0, 360, n), rng.uniform(-60, 20, n), rng.uniform(-5, 5, n)]
+    )
+    angles[0], angles[1] = [40.0, -90.0, 0.0], [40.0, 5.0, 90.0]
+    attitude = rotations_from_angles(angles)
+    state = State(
+        ROTATION,
+        7.0,
+        np.array([3.0, -2.0, 5.0]),
+        np.array([0.0, 4.0]),
+        np.zeros((2, 3)),
+        np.zeros(2),
+    )
+    enu = 7.0 * model @ ROTATION.T + state.center - np.outer(state.offsets_m[flight], [0, 0, 1])
+    shake = rotations_from_vectors(noise * rng.standard_normal((n, 3)))
+    fixes = Fixes(
+        enu + noise * rng.standard_normal((n, 3)),
+        np.ones((n, 3)),
+        (shake @ attitude)[:, :, 2],
+        shake @ attitude,
+        flight,
+        ("a", "b"),
+        np.arange(n, dtype=np.float64),
+        np.ones(2, dtype=bool),
+        GeoOrigin(0, 0, 0),
+        True,
+        True,
+        (),
+    )
+    problem = Problem.build(
+        model, attitude @ ROTATION, fixes, np.ones(n, dtype=bool), GeoregisterOptions()
+    )
+    return problem, state
+
+
+def test_the_true_state_leaves_no_residual():
+    """Fixes, gimbal angles and heading of the model itself: zero, also straight down and on the side."""
+    problem, state = _problem(0.0)
+    residual = problem.residuals(state)
+    for kind in Kind:
+        if kind is not Kind.LEVEL:
+            assert np.abs(residual[kind]).max() < 1e-9
+    # The camera on its side looks 5 degrees up: its right is 85 below the horizon (a sine, in degrees).
+    assert residual[Kind.LEVEL][1] == pytest.approx(np.rad2deg(np.cos(np.deg2rad(5.0))))
+
+
+def test_the_jacobian_is_the_residuals_derivative():
+    """Every kind of observation against every parameter, by central differences."""
+    problem, state = _problem(1e-4)
+    linear = problem.linearise(state, np.full(2, 1e3), np.ones(2))
+    assert linear.jacobian.shape == (7 * 9, SHARED + 10)
+    h = 1e-6
+    for k in range(SHARED + 10):
+        step = np.zeros(SHARED + 10)
+        step[k] = h
+        after, before = problem.residuals(state.moved(step)), problem.residuals(state.moved(-step))
+        slope = ((after - before) / (2 * h))[problem.kind, problem.frame]
+        # To first order in the gimbal's disagreement, which the shake makes 1e-4.
+        assert -slope == pytest.approx(linear.jacobian[:, k], abs=0.02), k
+
+
+def test_observations_that_are_missing_take_no_row():
+    """A frame without a height keeps its east and north; one left out keeps nothing but its place."""
+    problem, _ = _problem(0.0)
+    enu = problem.fixes.enu_m.copy()
+    enu[2, 2] = np.nan
+    fixes = replace(problem.fixes, enu_m=enu)
+    rebuilt = Problem.build(
+        problem.model, problem.cam_from_model, fixes, problem.use_level, problem.options
+    )
+    assert sorted(rebuilt.kind[rebuilt.frame == 2]) == [k for k in Kind if k is not Kind.UP]
+    mask = np.arange(9) != 3
+    assert 3 not in rebuilt.on_frames(mask).frame
+    assert Kind.LEVEL not in rebuilt.without_level().kind
