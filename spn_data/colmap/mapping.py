@@ -26,6 +26,7 @@ class MappingJob:
     threads: int = -1
     seed: int = 0
     snapshot_every: int = 20  # registered images
+    min_model_size: int = 10  # images, below which a sub-model is dropped
     start_from: str = ""  # folder of a model to go on from
 
 
@@ -132,6 +133,9 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
     if job.start_from:
         registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
 
+    # The mapper announces an initial pair also where it goes on from a model.
+    initial = 0 if job.start_from else 2
+
     def count(new: int) -> None:
         nonlocal registered
         registered += new
@@ -145,7 +149,7 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
             job.output,
             options,
             input_path=job.start_from,
-            initial_image_pair_callback=lambda: count(2),
+            initial_image_pair_callback=lambda: count(initial),
             next_image_callback=lambda: count(1),
             cancellation_token=token,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,10 +48,40 @@ class Observations:
 
 
 def load_native(folder: Path) -> pycolmap.Reconstruction:
+    """Raises FormatError where a file is missing or cut short, which COLMAP itself passes over."""
     try:
+        _check_whole(folder / "images.bin", _end_of_image)
+        _check_whole(folder / "points3D.bin", _end_of_point)
         return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError) as error:
+    except (RuntimeError, ValueError, IndexError, OSError) as error:
         raise FormatError(f"{folder}: not a complete COLMAP model ({error})") from error
+
+
+def _check_whole(path: Path, end_of: Callable[[bytes, int], int]) -> None:
+    """ValueError unless the file holds just the number of records that its head says."""
+    data = path.read_bytes()
+    try:
+        (count,) = struct.unpack_from("<Q", data)
+        offset = 8
+        for _ in range(count):
+            offset = end_of(data, offset)
+    except (struct.error, ValueError):
+        offset = -1
+    if offset != len(data):
+        raise ValueError(f"{path.name} is cut short or damaged")
+
+
+def _end_of_image(data: bytes, offset: int) -> int:
+    """Id, pose (7 doubles), camera id, name, then 24 bytes a point."""
+    end_of_name = data.index(b"\0", offset + 64) + 1
+    (points,) = struct.unpack_from("<Q", data, end_of_name)
+    return int(end_of_name + 8 + 24 * points)
+
+
+def _end_of_point(data: bytes, offset: int) -> int:
+    """Id, position (3 doubles), colour (3 bytes), error, then 8 bytes a track element."""
+    (length,) = struct.unpack_from("<Q", data, offset + 43)
+    return int(offset + 51 + 8 * length)
 
 
 def count_registered(folder: Path) -> int:

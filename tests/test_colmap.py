@@ -1,0 +1,267 @@
+"""The COLMAP adapter on data that pycolmap synthesises with exact truth, without any image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spn_data.camera import Camera
+from spn_data.colmap import pycolmap
+from spn_data.colmap.database import DatabaseImage, MapDatabase
+from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping
+from spn_data.colmap.model import (
+    count_registered,
+    read_observations,
+    read_scene,
+    scene_of,
+    upgrade_camera,
+    write_transformed,
+)
+from spn_data.colmap.verify import VerifiedPair
+from spn_data.errors import FormatError, StageError
+from spn_data.features import Features
+from spn_data.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
+    """Folder with database.db of 20 images and 300 points, and the truth."""
+    folder = tmp_path_factory.mktemp("synthetic")
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=20, num_points3D=300
+    )
+    with pycolmap.Database.open(folder / "database.db") as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+    return folder, truth
+
+
+def job(folder: Path, target: Path, **options: object) -> MappingJob:
+    for name in ("models", "snapshots"):
+        (target / name).mkdir(parents=True, exist_ok=True)
+    return MappingJob(
+        database=str(folder / "database.db"),
+        images=str(folder),
+        output=str(target / "models"),
+        snapshots=str(target / "snapshots"),
+        threads=1,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+@pytest.fixture(scope="module")
+def mapped(synthetic: tuple[Path, pycolmap.Reconstruction]) -> Path:
+    """Folder of the model that the mapper made of it, with snapshots beside it."""
+    folder, _ = synthetic
+    (model,) = run_mapping(
+        job(folder, folder / "mapped", snapshot_every=5),
+        log=folder / "log",
+        progress=lambda _: None,
+    )
+    return model
+
+
+def test_mapping_finds_the_true_poses(
+    synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path
+) -> None:
+    true = scene_of(synthetic[1])
+    found = read_scene(mapped)
+    assert found.names == true.names
+    aligned = Similarity.fit(found.poses.centers, true.poses.centers).apply_to_poses(found.poses)
+    error, error_deg = pose_errors(aligned, true.poses)
+    assert error.max() < 1e-4
+    assert error_deg.max() < 1e-3
+
+
+def test_mapping_tells_how_many_images_are_registered(
+    synthetic: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    folder, _ = synthetic
+    heard: list[int] = []
+    run_mapping(job(folder, tmp_path), log=tmp_path / "log", progress=heard.append)
+    assert heard == list(range(2, 21)) or heard == [2, *range(3, 21)]
+
+
+def test_mapping_goes_on_from_a_snapshot(
+    synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
+) -> None:
+    folder, _ = synthetic
+    first = min((folder / "mapped" / "snapshots").iterdir(), key=lambda p: p.name)
+    assert 2 <= count_registered(first) < 20
+    heard: list[int] = []
+    (model,) = run_mapping(
+        job(folder, tmp_path, start_from=str(first)), log=tmp_path / "log", progress=heard.append
+    )
+    assert heard == list(range(count_registered(first), 21))
+    assert count_registered(model) == 20
+
+
+def test_a_half_written_snapshot_is_passed_over(mapped: Path, tmp_path: Path) -> None:
+    snapshots = mapped.parent.parent / "snapshots"
+    newest = max(snapshots.iterdir(), key=lambda p: p.name)
+    assert latest_snapshot(snapshots) == newest
+    for name, cut in ((newest.name, 0), ("9999999999999", 200)):
+        (tmp_path / name).mkdir()
+        for file in newest.iterdir():
+            data = file.read_bytes()
+            end = len(data) - cut if file.name == "points3D.bin" else len(data)
+            (tmp_path / name / file.name).write_bytes(data[:end])
+    assert latest_snapshot(tmp_path) == tmp_path / newest.name
+    assert latest_snapshot(tmp_path / "nowhere") is None
+
+
+def test_a_death_of_the_mapper_is_told_with_the_end_of_its_log(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_text("no database")
+    with pytest.raises(StageError, match=r"mapping (ended with code|was killed by)"):
+        run_mapping(job(tmp_path, tmp_path), log=tmp_path / "log", progress=lambda _: None)
+
+
+def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
+    synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
+) -> None:
+    done = refine(
+        mapped,
+        tmp_path / "refined",
+        camera_model="OPENCV",
+        refine_principal_point=False,
+        threads=1,
+        log=tmp_path / "log",
+    )
+    assert done["error_px"] < 1e-3
+    (camera,) = read_scene(tmp_path / "refined").cameras.values()
+    assert camera.model == "OPENCV"
+    assert (
+        np.abs(camera.opencv_distortion).max()
+        < 1e-4 + abs(scene_of(synthetic[1]).cameras[1].opencv_distortion).max()
+    )
+
+
+@pytest.mark.parametrize("model", ["RADIAL", "OPENCV"])
+def test_an_upgraded_camera_projects_as_before(model: str) -> None:
+    native = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=800, height=600, params=[500.0, 401, 299, -0.05]
+    )
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
+    before = native.img_from_cam(points)
+    upgrade_camera(native, model)
+    assert native.model_name == model
+    assert np.abs(native.img_from_cam(points) - before).max() < 1e-9
+
+
+def test_a_camera_is_not_downgraded() -> None:
+    native = pycolmap.Camera(model="OPENCV", width=8, height=6, params=[5.0, 5, 4, 3, 0.1, 0, 0, 0])
+    with pytest.raises(ValueError, match="cannot hold"):
+        upgrade_camera(native, "SIMPLE_RADIAL")
+
+
+def test_residuals_are_projected_minus_measured(mapped: Path) -> None:
+    """Against pycolmap's own projection of its own points."""
+    scene, seen = read_observations(mapped)
+    native = pycolmap.Reconstruction(str(mapped))
+    image = next(
+        native.images[i] for i in native.reg_image_ids() if native.images[i].name == scene.names[3]
+    )
+    expected = []
+    for point2d in image.get_observation_points2D():
+        expected.append(image.project_point(native.points3D[point2d.point3D_id].xyz) - point2d.xy)
+    assert np.abs(seen.residuals_px[seen.image_idx == 3] - expected).max() < 1e-8
+
+
+def test_a_transformed_model_is_the_model_seen_from_the_other_frame(
+    mapped: Path, tmp_path: Path
+) -> None:
+    rotation = rotations_from_vectors(np.array([[0.3, -1.2, 2.0]]))[0]
+    world_from_model = Similarity(2.5, rotation, np.array([100.0, -50.0, 7.0]))
+    write_transformed(mapped, tmp_path / "world", world_from_model)
+    before, after = read_scene(mapped), read_scene(tmp_path / "world")
+    error, error_deg = pose_errors(world_from_model.apply_to_poses(before.poses), after.poses)
+    assert error.max() < 1e-9
+    assert error_deg.max() < 1e-9
+    assert np.abs(world_from_model.apply(before.points) - after.points).max() < 1e-9
+    _, residuals = read_observations(mapped), read_observations(tmp_path / "world")[1]
+    assert np.abs(residuals.residuals_px).max() < 1e-2
+
+
+def test_poses_agree_with_pycolmaps_own_centres(mapped: Path) -> None:
+    scene = read_scene(mapped)
+    native = pycolmap.Reconstruction(str(mapped))
+    centers = {
+        native.images[i].name: native.images[i].projection_center() for i in native.reg_image_ids()
+    }
+    assert np.abs(scene.poses.centers - [centers[name] for name in scene.names]).max() < 1e-12
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated"])
+def test_a_damaged_model_is_a_format_error(mapped: Path, tmp_path: Path, damage: str) -> None:
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    if damage == "missing":
+        (tmp_path / "images.bin").unlink()
+    else:
+        data = (tmp_path / "images.bin").read_bytes()
+        (tmp_path / "images.bin").write_bytes(data[:-24])
+    with pytest.raises(FormatError, match="not a complete COLMAP model"):
+        read_scene(tmp_path)
+
+
+def features(n: int) -> Features:
+    rng = np.random.default_rng(n)
+    return Features(
+        rng.uniform(0, 100, (n, 4)).astype(np.float32),
+        rng.integers(0, 255, (n, 128)).astype(np.uint8),
+    )
+
+
+def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
+    camera = Camera.from_horizontal_fov(800, 600, 70, (0.0,))
+    images = [
+        DatabaseImage("a/1.jpg", "a"),
+        DatabaseImage("a/2.jpg", "a"),
+        DatabaseImage("b/1.jpg", "b"),
+    ]
+    none = np.zeros((0, 2), np.uint32)
+    matches = np.array([[0, 1], [2, 3]], np.uint32)
+    with MapDatabase.open(tmp_path / "db") as database:
+        database.add_images(images[:2], {"a": (camera, True)})
+        database.write_features("a/1.jpg", features(10))
+        database.write_pair(
+            VerifiedPair((1, 2), matches, matches[:1], 2, np.eye(3), np.eye(3), None)
+        )
+    with MapDatabase.open(tmp_path / "db") as database:
+        # What is there keeps its id; what is new comes behind it, with a camera of its own.
+        database.add_images(images, {"a": (camera, True), "b": (camera, False)})
+        database.write_pair(VerifiedPair((1, 3), none, none, 1, None, None, None))
+        assert database.ids == {"a/1.jpg": 1, "a/2.jpg": 2, "b/1.jpg": 3}
+        assert [database.has_features(name) for name in database.ids] == [True, False, False]
+        read = database.read_features("a/1.jpg")
+        assert np.array_equal(read.keypoints, features(10).keypoints)
+        assert np.array_equal(read.descriptors, features(10).descriptors)
+        assert [database.has_pair(p) for p in ((1, 2), (1, 3), (2, 3))] == [True, True, False]
+        assert database.verified_pairs() == {("a/1.jpg", "a/2.jpg"): 1}
+        assert database.num_pairs() == 2
+    with pycolmap.Database.open(tmp_path / "db") as native:
+        assert [i.camera_id for i in native.read_all_images()] == [1, 1, 2]
+        assert native.read_camera(1).has_prior_focal_length
+        assert not native.read_camera(2).has_prior_focal_length
+
+
+def test_a_file_that_is_no_database_is_a_format_error(tmp_path: Path) -> None:
+    (tmp_path / "db").write_text("text")
+    with (
+        pytest.raises(FormatError, match="not a COLMAP database"),
+        MapDatabase.open(tmp_path / "db"),
+    ):
+        pass
+
+
+def test_poses_survive_the_way_through_colmaps_convention() -> None:
+    rng = np.random.default_rng(0)
+    poses = Poses.from_rotations(
+        rng.normal(size=(20, 3)), rotations_from_vectors(rng.normal(size=(20, 3)))
+    )
+    again = Poses.from_cam_from_world(*poses.to_cam_from_world())
+    error, error_deg = pose_errors(again, poses)
+    assert error.max() < 1e-12
+    assert error_deg.max() < 1e-10

@@ -1,0 +1,137 @@
+"""Features and matches of images whose geometry is known exactly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from spn_data.camera import Camera
+from spn_data.colmap.verify import ImageForMatching, match_pairs
+from spn_data.features import FeatureOptions, Features, extract
+from spn_data.matching import MatchOptions, match_descriptors
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    """Blobs of many sizes (600, 800) uint8."""
+    rng = np.random.default_rng(3)
+    image = np.zeros((600, 800))
+    for sigma in (2, 4, 8):
+        layer = cv2.GaussianBlur(rng.normal(size=image.shape), (0, 0), sigma)
+        image += layer / layer.std()
+    return np.clip(128 + 40 * image, 0, 255).astype(np.uint8)
+
+
+def test_keypoints_lie_in_colmaps_pixel_frame() -> None:
+    """A blob centred on the corner of four pixels has its centre at a whole number."""
+    y, x = np.mgrid[0:200, 0:200] + 0.5
+    image = (255 * np.exp(-((x - 80) ** 2 + (y - 120) ** 2) / (2 * 6.0**2))).astype(np.uint8)
+    features = extract(image, None, FeatureOptions())
+    nearest = np.linalg.norm(features.keypoints[:, :2] - [80, 120], axis=1).min()
+    assert nearest < 0.05
+
+
+def test_a_reduced_image_gives_keypoints_in_full_size_pixels(texture: np.ndarray) -> None:
+    """Detection at half size lands where detection at full size does, to a fraction of a pixel."""
+    full = extract(texture, None, FeatureOptions(max_features=500))
+    half = extract(texture, None, FeatureOptions(max_features=500, max_image_size_px=400))
+    strong = half.keypoints[half.keypoints[:, 2] > 6, :2]
+    distance = np.linalg.norm(strong[:, None] - full.keypoints[None, :, :2], axis=2).min(axis=1)
+    assert len(strong) > 20
+    assert np.median(distance) < 0.3
+
+
+def test_no_feature_lies_where_the_mask_is_black(texture: np.ndarray) -> None:
+    mask = np.ones(texture.shape, bool)
+    mask[:, :400] = False
+    features = extract(texture, mask, FeatureOptions())
+    assert len(features) > 100
+    assert features.keypoints[:, 0].min() > 399
+
+
+def test_descriptors_have_colmaps_length_and_the_strongest_are_kept(texture: np.ndarray) -> None:
+    features = extract(texture, None, FeatureOptions(max_features=200))
+    assert len(features) == 200
+    lengths = np.linalg.norm(features.descriptors.astype(float), axis=1)
+    assert np.abs(lengths - 512).max() < 8
+
+
+def test_an_empty_image_has_no_features() -> None:
+    assert len(extract(np.full((100, 100), 128, np.uint8), None, FeatureOptions())) == 0
+
+
+def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
+    """Against a plain loop over all distances, on descriptors with near doubles."""
+    rng = np.random.default_rng(0)
+    a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
+    b = np.clip(a[:500] + rng.normal(0, 15, size=(500, 128)), 0, 255).astype(np.uint8)
+    b = np.concatenate(
+        [b, np.clip(b[:100] + rng.normal(0, 3, (100, 128)), 0, 255).astype(np.uint8)]
+    )
+    found = {tuple(m) for m in match_descriptors(a, b, MatchOptions()).tolist()}
+    ua, ub = (d / np.linalg.norm(d.astype(float), axis=1, keepdims=True) for d in (a, b))
+    distance = np.linalg.norm(ua[:, None] - ub[None], axis=2)
+    expected = set()
+    for i in range(len(a)):
+        j, second = np.argsort(distance[i])[:2]
+        if (
+            distance[:, j].argmin() == i
+            and distance[i, j] < 0.8 * distance[i, second]
+            and distance[i, j] < 0.7
+        ):
+            expected.add((i, int(j)))
+    assert len(expected) > 200
+    assert not {m for m in expected if m[0] < 100}, "doubles pass no ratio test"
+    assert len(found ^ expected) <= 2
+
+
+def test_no_feature_is_matched_twice() -> None:
+    same = np.tile(np.arange(128, dtype=np.uint8), (5, 1))
+    other = np.random.default_rng(1).integers(0, 255, (50, 128)).astype(np.uint8)
+    matches = match_descriptors(same, np.concatenate([same[:1], other]), MatchOptions())
+    assert len(np.unique(matches[:, 1])) == len(matches) <= 1
+
+
+def scene_pair(
+    rng: np.random.Generator, outliers: int, n: int = 300
+) -> tuple[Features, Features, Camera]:
+    """Two views of n points in depth, 0.3 px noise, with descriptors that also tie `outliers` wrongly."""
+    camera = Camera.from_horizontal_fov(800, 600, 70)
+    points = rng.uniform([-4, -3, 6], [4, 3, 14], size=(n, 3))
+    views = []
+    for shift in (np.zeros(3), np.array([1.0, 0.2, 0.1])):
+        views.append(camera.project(points - shift) + rng.normal(0, 0.3, (n, 2)))
+    descriptors = rng.gamma(0.5, 40, size=(n, 128)).clip(0, 255).astype(np.uint8)
+    views[1][:outliers] = rng.uniform([0, 0], [800, 600], size=(outliers, 2))
+    features = [
+        Features(np.column_stack([v, np.ones((n, 2))]).astype(np.float32), descriptors)
+        for v in views
+    ]
+    return features[0], features[1], camera
+
+
+def test_verification_keeps_the_true_matches_and_drops_the_others() -> None:
+    a, b, camera = scene_pair(np.random.default_rng(0), outliers=90)
+    images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
+    (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
+    kept = pair.inliers[:, 0]
+    assert (kept >= 90).sum() >= 205
+    assert (kept < 90).sum() <= 8  # those that happen to lie on their epipolar line
+
+
+def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -> None:
+    a, b, camera = scene_pair(np.random.default_rng(1), outliers=30, n=30)
+    images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
+    (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
+    assert len(pair.matches) == 30
+    assert len(pair.inliers) == 0
+
+
+def test_the_same_pair_is_verified_the_same_way_anywhere() -> None:
+    a, b, camera = scene_pair(np.random.default_rng(2), outliers=150)
+    images = {k: ImageForMatching(f, camera, False) for k, f in ((1, a), (2, b))}
+    (first,), (second,) = (match_pairs(images, [(1, 2)], MatchOptions()) for _ in range(2))
+    assert np.array_equal(first.inliers, second.inliers)
+    assert first.f is not None
+    assert np.array_equal(first.f, second.f)
