@@ -10,7 +10,7 @@ class SpnError(Exception):
 
 
 class InputError(SpnError):
-    """Raised when a file that the user gave cannot be used; says which file and, where it has lines, which line."""
+    """Raised when a file that the user gave cannot be used; says which file and line."""
 
     def __init__(self, message: str, *, path: Path | str | None = None, line: int | None = None):
         where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "

@@ -23,7 +23,7 @@ class HeightReference(StrEnum):
 
 
 def ecef_from_wgs84(lat_lon_alt: np.ndarray) -> np.ndarray:
-    """Earth-centred coordinates (N, 3) in metres of (latitude deg, longitude deg, ellipsoidal height m) (N, 3)."""
+    """Earth-centred metres (N, 3) of (latitude deg, longitude deg, ellipsoidal height m) (N, 3)."""
     lat, lon = np.deg2rad(lat_lon_alt[..., 0]), np.deg2rad(lat_lon_alt[..., 1])
     alt = lat_lon_alt[..., 2]
     n = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
@@ -38,7 +38,7 @@ def ecef_from_wgs84(lat_lon_alt: np.ndarray) -> np.ndarray:
 
 
 def wgs84_from_ecef(ecef: np.ndarray) -> np.ndarray:
-    """(latitude deg, longitude deg, ellipsoidal height m) (N, 3) of Earth-centred coordinates (N, 3) in metres.
+    """(latitude deg, longitude deg, ellipsoidal height m) (N, 3) of Earth-centred metres (N, 3).
 
     Fixed-point iteration on the latitude; converges to below a nanometre near the surface in six rounds.
     """
