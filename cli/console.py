@@ -19,11 +19,13 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 from rich.table import Table
+from rich.text import Text
 
 from spn_data.errors import SpnError
 from spn_data.timing import Progress
 
-out = Console(highlight=False)
+# Names of the user's files are shown as they are: brackets in them are no markup, colons no emoji.
+out = Console(highlight=False, markup=False, emoji=False)
 _PLAIN_EVERY_S = 20.0
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 _KEPT = ". What is done is kept: make room, and the same command goes on"
@@ -104,17 +106,17 @@ class _PlainProgress:
 
 def table(title: str, rows: Sequence[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
     """Rows of text; the first column is the name of what stands beside it."""
-    shown = Table(title=title, title_justify="left", show_header=bool(header), box=None)
+    shown = Table(title=Text(title), title_justify="left", show_header=bool(header), box=None)
     width = len(header or rows[0])
     for k in range(width):
         shown.add_column(
             header[k] if header else "", overflow="fold", style="bold" if k == 0 else ""
         )
     for row in rows:
-        shown.add_row(*row)
+        shown.add_row(*(Text(cell) for cell in row))
     out.print(shown)
     out.print()
 
 
 def note(text: str) -> None:
-    out.print(f"[yellow]Note:[/yellow] {text}", soft_wrap=False)
+    out.print(Text.assemble(("Note:", "yellow"), " ", text))

@@ -30,7 +30,7 @@ def main(verbose: bool) -> None:
 @click.option(
     "--spacing",
     "motion_share",
-    type=click.FloatRange(0.005, 1),
+    type=options.Finite(0.005, 1),
     default=0.08,
     show_default=True,
     help="Motion of the image between chosen frames, as a share of its width.",
@@ -50,14 +50,21 @@ def main(verbose: bool) -> None:
     show_default=True,
     help="COLMAP's mapper.",
 )
-@click.option("--max-features", default=4096, show_default=True, help="Features of an image.")
+@click.option(
+    "--max-features",
+    type=click.IntRange(50, 100_000),
+    default=4096,
+    show_default=True,
+    help="Features of an image.",
+)
 @click.option(
     "--max-image-size",
+    type=click.IntRange(64),
     default=1600,
     show_default=True,
     help="Longer side in pixels on which features are found.",
 )
-@click.option("--threads", type=click.IntRange(1), help="[default: all cores]")
+@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
 @options.seed
 @options.georegistration
 def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen: Any) -> None:
@@ -84,7 +91,7 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
 
     \b
     Example:
-        spn-data georegister --area fields/north --takeoff-alt 112.4 --overwrite
+        spn-data georegister --area fields/north --gnss-sigma 0.03 0.05 --overwrite
     """
     from cli import show
     from spn_data.pipeline.geo import georegister as stage

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,25 @@ area = click.option(
 overwrite = click.option(
     "--overwrite", is_flag=True, help="Make anew what stands already and was made otherwise."
 )
-seed = click.option("--seed", default=0, show_default=True, help="Of everything random.")
+seed = click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31 - 1),
+    default=0,
+    show_default=True,
+    help="Of everything random.",
+)
+
+
+class Finite(click.FloatRange):
+    """A number within bounds; neither infinite nor NaN, which passes any comparison."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return number
 
 
 class PerSequence(click.ParamType[tuple[str, float]]):
@@ -66,7 +85,7 @@ _GEOREGISTRATION = (
     click.option(
         "--gnss-sigma",
         "gnss_sigma_m",
-        type=(click.FloatRange(0, min_open=True), click.FloatRange(0, min_open=True)),
+        type=(Finite(0, min_open=True), Finite(0, min_open=True)),
         metavar="H V",
         help="Standard deviation of a fix in metres, horizontal (per axis) and vertical.  "
         "[default: the source's own, else that of its kind]",
@@ -91,11 +110,15 @@ _GEOREGISTRATION = (
         help="What --takeoff-alt, or absolute heights, count from.",
     ),
     click.option(
-        "--takeoff-alt", "takeoff_alt_m", type=float, help="Height of the take-off point in metres."
+        "--takeoff-alt",
+        "takeoff_alt_m",
+        type=Finite(-1000, 10_000),
+        help="Height of the take-off point in metres.",
     ),
     click.option(
         "--correlation-time",
         "correlation_time_s",
+        type=Finite(0, min_open=True),
         default=60.0,
         show_default=True,
         help="Seconds over which GNSS errors stay alike.",

@@ -231,7 +231,7 @@ def _files(parts: tuple[Any, ...]) -> str:
 
 
 def _m(value: float | None) -> str:
-    return _of(value, ".2f") + " m"
+    return "unknown" if value is None else f"{value:.2f} m"
 
 
 def _of(value: float | None, form: str) -> str:

@@ -234,7 +234,8 @@ class Area:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Only one process at a time changes an area. Creates the area's folder."""
+        """Only one process at a time changes an area. Makes the folder; removes it if it stays empty."""
+        is_new = not self.root.exists()
         _make_folder(self.root)
         try:
             handle = (self.root / _LOCK).open("w")
@@ -245,7 +246,11 @@ class Area:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise InUseError(f"{self.root} is in use by another spn-data") from error
-            yield
+            try:
+                yield
+            finally:
+                if is_new and [path.name for path in self.root.iterdir()] == [_LOCK]:
+                    shutil.rmtree(self.root)
 
     def _finish_exchange(self) -> None:
         """Complete the renames that a killed process left half-way; not those of one that still runs."""

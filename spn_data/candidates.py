@@ -155,7 +155,7 @@ def _analyse_photos(source: Source, progress: Callable[[int], None] | None) -> C
                     problem = str(error).removeprefix(f"{path}: ")
             yield GrayImage(i, 0, float(times[i]), width, height, gray, problem=problem)
 
-    measured = measure(images(), progress=progress)
+    measured = measure(images(), lost_after=1, progress=progress)
     spread = np.full(len(source.parts), -1)
     spread[known] = np.arange(len(known))
     rows = _spread(telemetry, spread, times)
@@ -178,6 +178,7 @@ def _spread(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Teleme
         column(telemetry.sigma_m),
         column(telemetry.gimbal_deg),
         column(telemetry.utc_s),
+        column(telemetry.zoom),
         telemetry.abs_reference,
         telemetry.utc_is_local,
         telemetry.kind,

@@ -13,7 +13,7 @@ _TRACK_WIDTH = 320
 _MAX_CORNERS = 150
 _MIN_TRACKS = 12
 _REDETECT_BELOW = 90
-_LOST_AFTER = 5  # images in a row that could not be tracked from the last one that could
+LOST_AFTER = 5  # images in a row that could not be tracked from the last one that could
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +66,21 @@ class GrayImage:
 
 
 def measure(
-    images: Iterable[GrayImage], *, progress: Callable[[int], None] | None = None
+    images: Iterable[GrayImage],
+    *,
+    lost_after: int = LOST_AFTER,
+    progress: Callable[[int], None] | None = None,
 ) -> Measurements:
-    """Sharpness and motion of a sequence's images; `progress` hears how many are done."""
+    """Sharpness and motion of a sequence's images; `progress` hears how many are done.
+
+    lost_after : images in a row that could not be tracked, at which motion is unknown. Below that they are
+    taken to be blurred and to stand where the one before stood: right for video, where one lasts a moment;
+    for photos it is 1.
+    """
     rows: list[GrayImage] = []
     sharpness: list[float] = []
     motions: list[np.ndarray] = []
-    tracker = _Tracker()
+    tracker = _Tracker(lost_after)
     for image in images:
         known = image.gray is not None
         sharpness.append(sharpness_of(image.gray) if image.gray is not None else np.nan)
@@ -112,7 +120,8 @@ _UNKNOWN = np.full((2, 3), np.nan)
 class _Tracker:
     """Follows corners from image to image and fits an affine map to each step."""
 
-    def __init__(self) -> None:
+    def __init__(self, lost_after: int) -> None:
+        self._lost_after = lost_after
         self._previous: np.ndarray | None = None
         self._points = np.empty((0, 1, 2), np.float32)
         self._missed = 0
@@ -135,7 +144,7 @@ class _Tracker:
         step, points = _affine_step(self._previous, small, self._points)
         if step is None:
             self._missed += 1
-            if self._missed < _LOST_AFTER:
+            if self._missed < self._lost_after:
                 return _IDENTITY
             self._restart(small)
             return _UNKNOWN

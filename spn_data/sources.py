@@ -142,6 +142,8 @@ def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
                 ignored.append((here / name, "link: name the folder that it points to instead"))
             elif name.startswith("."):
                 ignored.append((here / name, "hidden"))
+            elif (here / name / "stage.json").exists():
+                ignored.append((here / name, "made by this program"))
             elif len((here / name).relative_to(folder).parts) > _MAX_DEPTH:
                 ignored.append((here / name, f"more than {_MAX_DEPTH} folders deep"))
             else:
@@ -153,7 +155,12 @@ def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
             count += 1
             if count > _MAX_FILES:
                 raise InputError(f"holds more than {_MAX_FILES} files", path=folder)
-            if path.is_symlink():
+            if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+                shown = name.encode("unicode_escape").decode()
+                ignored.append(
+                    (here / shown, "control characters or no UTF-8 in its name: rename it")
+                )
+            elif path.is_symlink():
                 ignored.append((path, "link: name the file that it points to instead"))
             elif not path.is_file():
                 ignored.append((path, "not a regular file"))

@@ -100,7 +100,8 @@ def _stages(
         tell=watcher.telemetry,
     )
     earlier = () if extended is None else extended.facts.sources
-    area.write_facts(Facts(sources=(*earlier, *(str(path) for path in inputs))))
+    given = [str(path).encode(errors="backslashreplace").decode() for path in inputs]
+    area.write_facts(Facts(sources=(*earlier, *given)))
     tell(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
     tell(model, before.get(MODEL))
