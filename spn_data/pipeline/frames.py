@@ -166,7 +166,8 @@ def choose_frames(
     done_before = 0
     total = sum(int(choice.chosen.sum()) for choice in choices)
     for one, track, choice in zip(candidates, tracks, choices, strict=True):
-        frames = frames_of(one, choice)
+        zoom = None if track is None else track.at(one.measured.time_s).zoom
+        frames = frames_of(one, choice, focal=zoom)
         if track is not None:
             frames = frames.with_telemetry(track.at(frames.time_s))
             write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)
@@ -294,7 +295,7 @@ def _start_cameras(
         width, height = int(frames.width[row]), int(frames.height[row])
         focal_px = None if photos is None else _photo_focal_px(photos, row, width, height)
         source = "photo metadata"
-        if fov is not None:
+        if fov is not None and key == sequence:  # another zoom has another field of view
             focal_px = Camera.from_horizontal_fov(width, height, fov).focal_px[0]
             source = f"horizontal field of view of {fov:g} deg, as given"
         known = focal_px is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -49,7 +48,7 @@ def telemetry_of(
             track = read_subtitles(part)
         if track is not None:
             parts.append(track.shifted(start_s))
-    return _join(parts) if parts else None
+    return Telemetry.concatenate(parts) if parts else None
 
 
 def _check_length(track: Telemetry, candidates: Candidates, part: int, name: str) -> None:
@@ -72,18 +71,6 @@ def _on_video_clock(track: Telemetry, info: VideoInfo) -> Telemetry:
     note = "its clock is tied to the video by the video's creation time"
     moved = replace(track, time_s=track.utc_s - info.created_utc.timestamp())
     return replace(moved.select(np.isfinite(moved.time_s)), notes=(*track.notes, note))
-
-
-def _join(parts: list[Telemetry]) -> Telemetry:
-    """Tracks of the parts of one recording, one after the other; times stay increasing."""
-    columns = ("time_s", "lat_lon_deg", "rel_alt_m", "abs_alt_m", "sigma_m", "gimbal_deg", "utc_s")
-    values: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in parts]) for name in columns
-    }
-    notes = tuple(dict.fromkeys(note for p in parts for note in p.notes))
-    joined = replace(parts[0], **values, notes=notes)
-    later = np.maximum.accumulate(joined.time_s)
-    return joined.select(np.concatenate([[True], joined.time_s[1:] > later[:-1]]))
 
 
 def _of_photos(source: Source, candidates: Candidates) -> Telemetry | None:

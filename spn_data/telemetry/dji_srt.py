@@ -89,6 +89,7 @@ def telemetry_of_blocks(
         rel_alt_m=np.array([r.rel_alt_m for r in records]),
         abs_alt_m=abs_alt,
         gimbal_deg=np.array([r.gimbal_deg for r in records]),
+        zoom=np.array([r.zoom for r in records]),
         utc_s=utc,
         utc_is_local=True,
         kind="dji-srt",

@@ -18,6 +18,8 @@ _FIELD = re.compile(
     r"|difftime)\s*[:(]\s*([^\s\],;()<>]*)",
     re.IGNORECASE,
 )
+# Focal length in a unit of the model's own, and digital zoom: only their changes mean something.
+_ZOOM = re.compile(r"(?<![\w.])(focal_len|dzoom_ratio|dzoom)\s*[:(]\s*([\d.]+)", re.IGNORECASE)
 _HEIGHT = re.compile(r"(?<![\w.])H\s?[ =:]\s?([-+]?[\d.]+)\s?m(?![\w/])")
 _POSITION = re.compile(r"(?<![\w.])(GPS|RTK|HOME)\s*\(([^()]{0,120})\)", re.IGNORECASE)
 _GIMBAL = re.compile(r"(?<![\w.])G\.PRY\s*\(([^()]{0,120})\)", re.IGNORECASE)
@@ -45,6 +47,7 @@ class SrtRecord:
     abs_alt_m: float
     bare_altitude: bool  # abs_alt_m comes from [altitude: x], which does not say above what
     gimbal_deg: tuple[float, float, float]  # heading, pitch, roll
+    zoom: float  # focal length times digital zoom, in a unit of the model's own
 
 
 def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
@@ -61,6 +64,7 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
     gimbal = _GIMBAL.search(text)
     if not (values or fix or height or gimbal):
         return None
+    zooms = _ZOOM.findall(text)
     lat_lon, pair, height_third = None, None, False
     if "latitude" in values or "longitude" in values:
         lat_lon = (values.get("latitude", NAN), values.get("longitude", NAN))
@@ -91,6 +95,7 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
         abs_alt_m=values.get("abs_alt", values.get("altitude", NAN)),
         bare_altitude="altitude" in values and "abs_alt" not in values,
         gimbal_deg=(angles[0] % 360.0, angles[1], angles[2]),
+        zoom=math.prod(_number(m[1], m[0]) for m in zooms) if zooms else NAN,
     )
 
 

@@ -14,7 +14,7 @@ from spn_data.telemetry.track import Telemetry
 
 _COLUMNS = (
     "time_s,lat_deg,lon_deg,rel_alt_m,abs_alt_m,sigma_e_m,sigma_n_m,sigma_u_m,"
-    "heading_deg,pitch_deg,roll_deg,utc_s"
+    "heading_deg,pitch_deg,roll_deg,utc_s,zoom"
 )
 _MAX_BYTES = 2**30
 
@@ -38,6 +38,7 @@ def write_track(path: Path, telemetry: Telemetry) -> None:
             telemetry.sigma_m,
             telemetry.gimbal_deg,
             telemetry.utc_s,
+            telemetry.zoom,
         ]
     )
     lines = [f"# {json.dumps(about)}", _COLUMNS]
@@ -67,6 +68,7 @@ def read_track(path: Path) -> Telemetry:
             sigma_m=rows[:, 5:8],
             gimbal_deg=rows[:, 8:11],
             utc_s=rows[:, 11],
+            zoom=rows[:, 12],
         )
         return replace(
             track,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +23,7 @@ class Telemetry:
     sigma_m : (N, 3) standard deviation east, north, up that the source itself states.
     gimbal_deg : (N, 3) heading, pitch, roll of the camera (`spn_data.pose.rotations_from_angles`).
     utc_s : (N,) seconds since 1970; local time of unknown zone where `utc_is_local`.
+    zoom : (N,) focal length times digital zoom in a unit of the source's own: only its changes count.
     kind : what wrote it, such as "dji-srt", "gpx", "csv", "exif"; source : the file's name.
     notes : what the user should know of how the source was read, one sentence each.
     """
@@ -33,6 +35,7 @@ class Telemetry:
     sigma_m: np.ndarray
     gimbal_deg: np.ndarray
     utc_s: np.ndarray
+    zoom: np.ndarray
     abs_reference: HeightReference = HeightReference.UNKNOWN
     utc_is_local: bool = False
     kind: str = ""
@@ -50,6 +53,7 @@ class Telemetry:
         sigma_m: np.ndarray | None = None,
         gimbal_deg: np.ndarray | None = None,
         utc_s: np.ndarray | None = None,
+        zoom: np.ndarray | None = None,
         abs_reference: HeightReference = HeightReference.UNKNOWN,
         utc_is_local: bool = False,
         kind: str = "",
@@ -76,6 +80,7 @@ class Telemetry:
             column(sigma_m, 3),
             column(gimbal_deg, 3),
             column(utc_s),
+            column(zoom),
             abs_reference,
             utc_is_local,
             kind,
@@ -95,6 +100,20 @@ class Telemetry:
         """The records of an index or mask (N,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[index] for name in _COLUMNS}
         return replace(self, **columns)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Telemetry]) -> Telemetry:
+        """Tracks of the parts of one recording, on one clock; what is said of all is the first's.
+
+        A record that is not later than all before it is dropped.
+        """
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS
+        }
+        notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+        joined = replace(parts[0], **columns, notes=notes)
+        latest = np.maximum.accumulate(joined.time_s)
+        return joined.select(np.concatenate([[True], joined.time_s[1:] > latest[:-1]]))
 
     def shifted(self, offset_s: float) -> Telemetry:
         """The same records with `offset_s` added to their times."""
@@ -125,7 +144,16 @@ class Telemetry:
 
 
 METRES_PER_DEGREE = 111_195.0  # of latitude, on a sphere of 6371 km
-_COLUMNS = ("time_s", "lat_lon_deg", "rel_alt_m", "abs_alt_m", "sigma_m", "gimbal_deg", "utc_s")
+_COLUMNS = (
+    "time_s",
+    "lat_lon_deg",
+    "rel_alt_m",
+    "abs_alt_m",
+    "sigma_m",
+    "gimbal_deg",
+    "utc_s",
+    "zoom",
+)
 
 
 def _unwrapped(angles_deg: np.ndarray) -> np.ndarray:
