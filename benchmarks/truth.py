@@ -40,30 +40,32 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
     frames = read_frames(area.folder(FRAMES) / "frames.csv")
     chosen = frames.select(frames.chosen)
     scene = read_scene(area.folder(MODEL))
-    true = _true_of(scene, chosen, flights)
+    true = true_of_scene(scene, chosen, flights)
     world_from_model = Similarity.fit(scene.poses.centers, true.centers)
     figures: dict[str, Any] = {
         "chosen": len(chosen),
         "registered": len(scene.names),
-        "model": _errors(world_from_model.apply_to_poses(scene.poses), true),
+        "model": error_figures(world_from_model.apply_to_poses(scene.poses), true),
     }
     if area.has(GEO):
         geo = read_scene(area.folder(GEO))
         true_from_geo = Similarity.fit(geo.poses.centers, true.centers)
         up = true_from_geo.rotation[2, 2]
-        figures["georegistered"] = _errors(geo.poses, true)
+        figures["georegistered"] = error_figures(geo.poses, true)
         figures["tilt_deg"] = float(np.rad2deg(np.arccos(np.clip(up, -1, 1))))
         figures["scale_error"] = 1 / true_from_geo.scale - 1
     return figures
 
 
-def _true_of(scene: Scene, chosen: Frames, flights: Path) -> Poses:
+def true_of_scene(scene: Scene, chosen: Frames, flights: Path) -> Poses:
+    """Exact poses of a scene's images, in its order."""
     row = {name: k for k, name in enumerate(chosen.names.tolist())}
     registered = chosen.select(np.array([row[name] for name in scene.names]))
     return true_poses(registered, flights / "truth")
 
 
-def _errors(poses: Poses, true: Poses) -> dict[str, float]:
+def error_figures(poses: Poses, true: Poses) -> dict[str, float]:
+    """Quantiles of the errors of poses as they are, nothing aligned."""
     error_m, error_deg = pose_errors(poses, true)
     return {
         "position_median_m": float(np.median(error_m)),
