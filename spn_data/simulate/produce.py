@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import StageError
+from spn_data.parallel import exit_with_parent
 from spn_data.simulate.faces import Texture
 from spn_data.simulate.flight import (
     FlightPath,
@@ -132,7 +133,10 @@ class _Studio:
 
 def _open_texture(folder: Path, name: str) -> Texture:
     count = len(list(folder.glob(f"{name}.*.npy")))
-    levels = [np.load(folder / f"{name}.{k}.npy", mmap_mode="r") for k in range(count)]
+    files = [folder / f"{name}.{k}.npy" for k in range(count)]
+    # Large levels are shared between processes; each mapping holds a file open, and of these there are few.
+    modes = ["r" if file.stat().st_size > 4e6 else None for file in files]
+    levels = [np.load(file, mmap_mode=mode) for file, mode in zip(files, modes, strict=True)]
     return Texture(tuple(np.asarray(level) for level in levels))
 
 
@@ -182,10 +186,11 @@ _studio: _Studio | None = (
 )
 
 
-def _open_studio(options: SimulateOptions, texture_folder: Path) -> None:
+def _open_studio(options: SimulateOptions, texture_folder: Path, parent_pid: int) -> None:
     global _studio
     # Ctrl-C reaches every process of the terminal; the parent alone answers it, and ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    exit_with_parent(parent_pid)
     _studio = _Studio(options, texture_folder)
 
 
@@ -208,7 +213,7 @@ class _Crew:
                 workers,
                 mp_context=multiprocessing.get_context("spawn"),
                 initializer=_open_studio,
-                initargs=(options, texture_folder),
+                initargs=(options, texture_folder, os.getpid()),
             )
 
     def __enter__(self) -> _Crew:
