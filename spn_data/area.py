@@ -204,7 +204,7 @@ class Area:
         if resumed:
             found = _read_record(started)
             if found.made_of != record.made_of:
-                if not overwrite:
+                if not overwrite and _holds_work(path):
                     raise StageError(
                         f"{path} holds unfinished work and {_difference(found, record)}; "
                         "give the same options to go on, or --overwrite to start anew"
@@ -391,6 +391,11 @@ def _difference(found: StageRecord, wanted: StageRecord) -> str:
     return "was made from an earlier " + " and ".join(
         name for name in wanted.upstream if wanted.upstream[name] != found.upstream.get(name)
     )
+
+
+def _holds_work(path: Path) -> bool:
+    """Whether an unfinished stage has made any file yet."""
+    return any(p.is_file() and p.name != _STARTED for p in path.rglob("*"))
 
 
 def _changed_options(

@@ -5,6 +5,7 @@ Each write is committed at once, so that a killed run keeps all that it had.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import VerifiedPair, native_camera
-from spn_data.errors import FormatError
+from spn_data.errors import FormatError, StageError
 from spn_data.features import Features
 
 
@@ -31,20 +32,25 @@ class DatabaseImage:
 class MapDatabase:
     """An open COLMAP database whose image ids are fixed by the order of the images given first."""
 
-    def __init__(self, native: pycolmap.Database):
+    def __init__(self, native: pycolmap.Database, path: Path):
         self._native = native
+        self._path = path
         self.ids = {image.name: image.image_id for image in native.read_all_images()}
 
     @classmethod
     @contextmanager
     def open(cls, path: Path) -> Iterator[Self]:
         """Open or create."""
+        _check_room(path, 0)
         try:
             native = pycolmap.Database.open(path)
+            opened = cls(native, path)
         except (RuntimeError, ValueError) as error:
-            raise FormatError(f"{path}: not a COLMAP database ({error})") from error
+            raise FormatError(
+                f"{path}: damaged, or not a COLMAP database; remove it, and it is made anew"
+            ) from error
         try:
-            yield cls(native)
+            yield opened
         finally:
             native.close()
 
@@ -96,6 +102,7 @@ class MapDatabase:
         descriptors = pycolmap.FeatureDescriptors(
             type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
         )
+        _check_room(self._path, features.keypoints.nbytes + features.descriptors.nbytes)
         with pycolmap.DatabaseTransaction(self._native):
             self._native.write_keypoints(image_id, features.keypoints)
             self._native.write_descriptors(image_id, descriptors)
@@ -122,6 +129,7 @@ class MapDatabase:
             H=pair.h,
             inlier_matches=pair.inliers,
         )
+        _check_room(self._path, pair.matches.nbytes + pair.inliers.nbytes)
         with pycolmap.DatabaseTransaction(self._native):
             self._native.write_matches(*pair.image_ids, pair.matches)
             self._native.write_two_view_geometry(*pair.image_ids, geometry)
@@ -141,3 +149,16 @@ class MapDatabase:
                 first, second = pycolmap.pair_id_to_image_pair(pair_id)
                 counts[names[first], names[second]] = int(inliers)
         return counts
+
+
+_ROOM_BYTES = 2_000_000  # for indices, and for the journal's way into the database
+
+
+def _check_room(path: Path, size: int) -> None:
+    """Raises StageError on a full disk: COLMAP would abort the process when a transaction fails."""
+    free = shutil.disk_usage(path.parent).free
+    if free < 2 * size + _ROOM_BYTES:
+        raise StageError(
+            f"{path}: the disk is full ({free / 1e6:.1f} MB free). What is done is kept: make room, and "
+            "the same command goes on"
+        )

@@ -19,6 +19,18 @@ _LENGTH_TOLERANCE_S = 5.0
 _LENGTH_TOLERANCE = 0.1
 
 
+def check_telemetry(source: Source) -> None:
+    """Raises InputError where a file beside a video is not of its length: before hours go into the video."""
+    if source.kind is SourceKind.PHOTOS:
+        return
+    for part in source.parts:
+        for path in source.telemetry:
+            if path.stem.lower() == part.stem.lower() and path.suffix.lower() == ".srt":
+                duration_s = probe(part).duration_s
+                if np.isfinite(duration_s):
+                    _check_length(read_telemetry(path), duration_s, path.name)
+
+
 def telemetry_of(
     source: Source, candidates: Candidates, *, any_telemetry: bool = False
 ) -> Telemetry | None:
@@ -43,7 +55,8 @@ def telemetry_of(
             if files[0].suffix.lower() != ".srt":
                 track = _on_video_clock(track, info)
             elif not any_telemetry:
-                _check_length(track, candidates, index, files[0].name)
+                times = candidates.measured.time_s[candidates.measured.source_idx == index]
+                _check_length(track, float(times[-1] - times[0]), files[0].name)
         elif info.has_subtitles:
             track = read_subtitles(part)
         if track is not None:
@@ -51,9 +64,7 @@ def telemetry_of(
     return Telemetry.concatenate(parts) if parts else None
 
 
-def _check_length(track: Telemetry, candidates: Candidates, part: int, name: str) -> None:
-    times = candidates.measured.time_s[candidates.measured.source_idx == part]
-    video_s = float(times[-1] - times[0])
+def _check_length(track: Telemetry, video_s: float, name: str) -> None:
     covered_s = float(track.time_s[-1] - track.time_s[0])
     if abs(covered_s - video_s) > max(_LENGTH_TOLERANCE_S, _LENGTH_TOLERANCE * video_s):
         raise InputError(
