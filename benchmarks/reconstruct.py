@@ -298,6 +298,8 @@ def main() -> None:
             work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="benchmark-")))
         else:
             work = arguments.work.resolve()
+            if work.exists():
+                parser.error(f"--work {work} exists already: name a new folder")
             work.mkdir(parents=True)
         try:
             figures = compare(
