@@ -135,8 +135,10 @@ def _open_texture(folder: Path, name: str) -> Texture:
     count = len(list(folder.glob(f"{name}.*.npy")))
     files = [folder / f"{name}.{k}.npy" for k in range(count)]
     # Large levels are shared between processes; each mapping holds a file open, and of these there are few.
-    modes = ["r" if file.stat().st_size > 4e6 else None for file in files]
-    levels = [np.load(file, mmap_mode=mode) for file, mode in zip(files, modes, strict=True)]
+    levels = [
+        np.load(file, mmap_mode="r") if file.stat().st_size > 4e6 else np.load(file)
+        for file in files
+    ]
     return Texture(tuple(np.asarray(level) for level in levels))
 
 
