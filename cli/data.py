@@ -26,6 +26,7 @@ def main(verbose: bool) -> None:
 @click.option("--add", is_flag=True, help="Extend the area by these sources; what it has is kept.")
 @options.overwrite
 @options.fov
+@options.camera
 @click.option("--frames", "target_count", type=click.IntRange(3), help="Frames wanted in all.")
 @click.option(
     "--spacing",

@@ -67,6 +67,29 @@ class PerSequence(click.ParamType[tuple[str, float]]):
         return sequence or "*", found
 
 
+class FilePerSequence(click.ParamType[tuple[str, str]]):
+    """`FILE` for all sequences or `SEQUENCE=FILE` for one, as ("*" or the sequence, file)."""
+
+    name = "[SEQUENCE=]FILE"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, str]:
+        if isinstance(value, tuple):
+            return value
+        sequence, _, path = str(value).rpartition("=")
+        if not Path(path).is_file():
+            self.fail(f"{path!r} is no file", param, ctx)
+        return sequence or "*", path
+
+
+camera = click.option(
+    "--camera",
+    "camera_files",
+    type=FilePerSequence(),
+    multiple=True,
+    help="Calibrated camera (JSON: model, width, height, params) to start from.",
+)
 fov = click.option(
     "--fov",
     "fov_deg",

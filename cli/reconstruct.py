@@ -22,6 +22,7 @@ def run(
     add: bool,
     overwrite: bool,
     fov_deg: tuple[tuple[str, float], ...],
+    camera_files: tuple[tuple[str, str], ...],
     target_count: int | None,
     motion_share: float,
     mask: str | None,
@@ -38,6 +39,7 @@ def run(
         frames=FramesOptions(
             selection=SelectionOptions(target_count=target_count, motion_share=motion_share),
             fov_deg=dict(fov_deg),
+            camera_files=dict(camera_files),
             mask=mask,
             any_telemetry=any_telemetry,
         ),

@@ -150,10 +150,12 @@ def test_an_upgraded_camera_projects_as_before(model: str) -> None:
     assert np.abs(native.img_from_cam(points) - before).max() < 1e-9
 
 
-def test_a_camera_is_not_downgraded() -> None:
-    native = pycolmap.Camera(model="OPENCV", width=8, height=6, params=[5.0, 5, 4, 3, 0.1, 0, 0, 0])
-    with pytest.raises(ValueError, match="cannot hold"):
-        upgrade_camera(native, "SIMPLE_RADIAL")
+def test_a_camera_that_is_fuller_already_stays_as_it_is() -> None:
+    params = [5.0, 5, 4, 3, 0.1, 0, 0, 0]
+    native = pycolmap.Camera(model="OPENCV", width=8, height=6, params=params)
+    upgrade_camera(native, "RADIAL")
+    assert native.model_name == "OPENCV"
+    assert native.params.tolist() == params
 
 
 def test_residuals_are_projected_minus_measured(mapped: Path) -> None:

@@ -165,12 +165,10 @@ _DISTORTION = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "PINHOLE": 0, "SIMP
 
 
 def upgrade_camera(camera: Any, model: str) -> None:
-    """Change COLMAP's camera in place to a fuller model with the same projection."""
-    if camera.model_name == model:
-        return
+    """Change COLMAP's camera in place to a fuller model with the same projection, if it is fuller."""
     old = from_native_camera(camera)
-    if _DISTORTION[model] < _DISTORTION[old.model]:
-        raise ValueError(f"{model} cannot hold what {old.model} holds")
+    if _DISTORTION[model] <= _DISTORTION[old.model]:
+        return
     fx, fy = old.focal_px
     cx, cy = old.matrix[:2, 2]
     focals = (fx, fy) if model in ("OPENCV", "PINHOLE") else (fx,)

@@ -5,30 +5,28 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from spn_data.area import FRAMES, Area, StageRecord, content_fingerprint, read_json, write_json
-from spn_data.camera import Camera
+from spn_data.camera_file import camera_to_json, read_camera
 from spn_data.candidates import Candidates, analyse, frames_of
 from spn_data.errors import InputError
 from spn_data.extraction import Cost, check_space, estimate_cost, extract_chosen
 from spn_data.frames import Frames, read_frames, write_frames
-from spn_data.measurement import Measurements
-from spn_data.photos import PhotoHeaders, load_mask
-from spn_data.pipeline.telemetry import telemetry_of
+from spn_data.photos import load_mask
+from spn_data.pipeline.cameras import start_cameras
+from spn_data.pipeline.telemetry import check_telemetry, telemetry_of
 from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
 from spn_data.sources import Source, SourceKind, discover
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.timing import Progress, Stopwatch
+from spn_data.video import probe
 
-# Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
-_GUESSED_FOCAL_SHARE = 0.7
-_DIAGONAL_35MM = 43.267
 # Names beside the folders of the sequences.
 _RESERVED = ("telemetry", "masks", "frames.csv", "cameras.json", "stage.json", "started.json")
 
@@ -38,9 +36,9 @@ class FramesOptions:
     """How frames are made from sources."""
 
     selection: SelectionOptions = field(default_factory=SelectionOptions)
-    fov_deg: Mapping[str, float] = field(
-        default_factory=dict
-    )  # horizontal, by sequence; "*" for all
+    # Horizontal field of view, and files of whole cameras (`camera_file`), by sequence; "*" for all.
+    fov_deg: Mapping[str, float] = field(default_factory=dict)
+    camera_files: Mapping[str, str] = field(default_factory=dict)
     mask: str | None = None  # an image, or a folder of <sequence>.png
     any_telemetry: bool = False  # also telemetry whose length does not fit the video's
 
@@ -136,8 +134,15 @@ def choose_frames(
     inputs = fingerprints(found.sources, masks)
     if extend is not None:
         inputs = {**extend.record(FRAMES).inputs, **inputs}
-    # Masks count by their content, wherever they lie.
-    made_with = asdict(replace(options, mask=None))
+    for source in found.sources:
+        if not options.any_telemetry:
+            check_telemetry(source)
+        if source.sequence in masks:
+            _check_mask(masks[source.sequence], source)
+    # Masks and cameras count by their content, wherever they lie.
+    given = {name: read_camera(Path(path)) for name, path in options.camera_files.items()}
+    made_with = asdict(replace(options, mask=None, camera_files={}))
+    made_with["cameras"] = {name: camera_to_json(camera) for name, camera in given.items()}
     work = area.begin(FRAMES, made_with, inputs, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
@@ -153,7 +158,7 @@ def choose_frames(
     candidates, tracks = [], []
     for source in found.sources:
         with stopwatch.step("analysis"):
-            measured = _analyse_once(source, work.path / ".analysis", found.cost, progress)
+            measured = _analyse(source, work.path / ".analysis", found.cost, progress)
         track = telemetry_of(source, measured, any_telemetry=options.any_telemetry)
         check_usable(measured.measured, options.selection, source.parts[0].name)
         tell(source.sequence, None if track is None else summarize(track))
@@ -171,7 +176,7 @@ def choose_frames(
         if track is not None:
             frames = frames.with_telemetry(track.at(frames.time_s))
             write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)
-        cameras.update(_start_cameras(frames, one.photos, options.fov_deg))
+        cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
             _write_mask(masks[one.source.sequence], frames, work.path / "masks")
         elif masks:
@@ -221,30 +226,15 @@ def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict
     return [frames], dict(read_json(folder / "cameras.json")["cameras"])
 
 
-def _analyse_once(source: Source, folder: Path, cost: Cost, progress: Progress) -> Candidates:
+def _analyse(source: Source, folder: Path, cost: Cost, progress: Progress) -> Candidates:
     """Measurements of a source; those of videos are kept, so that an interrupted run has them."""
-    path = folder / f"{source.sequence}.npz"
     step = f"analysis {source.sequence}"
-    if source.kind is SourceKind.VIDEO and path.exists():
-        with np.load(path, allow_pickle=False) as stored:
-            measured = Measurements(**{f.name: stored[f.name] for f in fields(Measurements)})
-            starts, notes = stored["part_start_s"], stored["notes"]
-        return Candidates(
-            source, measured, tuple(starts.tolist()), None, None, tuple(notes.tolist())
-        )
     total = cost.candidates if source.kind is SourceKind.VIDEO else len(source.parts)
-    found = analyse(source, progress=lambda done: progress(step, done, max(done, total)))
-    if source.kind is SourceKind.VIDEO:
-        folder.mkdir(exist_ok=True)
-        temporary = path.with_name("part.npz")
-        np.savez(
-            temporary,
-            part_start_s=np.array(found.part_start_s),
-            notes=np.array(found.notes, dtype=np.str_),
-            **{f.name: getattr(found.measured, f.name) for f in fields(Measurements)},
-        )
-        temporary.replace(path)
-    return found
+    return analyse(
+        source,
+        cache=folder / f"{source.sequence}.npz",
+        progress=lambda done: progress(step, done, max(done, total)),
+    )
 
 
 def _choose(
@@ -283,41 +273,11 @@ def _check_some_fit(candidates: list[Candidates]) -> None:
         raise InputError("fewer than three images can be read, a model needs more")
 
 
-def _start_cameras(
-    frames: Frames, photos: PhotoHeaders | None, fov_deg: Mapping[str, float]
-) -> dict[str, dict[str, object]]:
-    """Start intrinsics of each camera of one source: the user's, the photo's own, or a guess."""
-    cameras = {}
-    sequence = str(frames.sequences[0])
-    fov = fov_deg.get(sequence, fov_deg.get("*"))
-    for key in np.unique(frames.cameras[frames.width > 0]).tolist():
-        row = int(np.flatnonzero((frames.cameras == key) & (frames.width > 0))[0])
-        width, height = int(frames.width[row]), int(frames.height[row])
-        focal_px = None if photos is None else _photo_focal_px(photos, row, width, height)
-        source = "photo metadata"
-        if fov is not None and key == sequence:  # another zoom has another field of view
-            focal_px = Camera.from_horizontal_fov(width, height, fov).focal_px[0]
-            source = f"horizontal field of view of {fov:g} deg, as given"
-        known = focal_px is not None
-        if focal_px is None:
-            focal_px, source = _GUESSED_FOCAL_SHARE * max(width, height), "guess"
-        cameras[key] = {
-            "model": "SIMPLE_RADIAL",
-            "width": width,
-            "height": height,
-            "params": [focal_px, width / 2, height / 2, 0.0],
-            "focal_is_known": known,
-            "source": source,
-        }
-    return cameras
-
-
-def _photo_focal_px(photos: PhotoHeaders, row: int, width: int, height: int) -> float | None:
-    """From the 35-mm equivalent, which compares diagonals (CIPA DCG-001)."""
-    metadata = photos.metadata[row]
-    if metadata is None or not metadata.focal_35mm > 0:
-        return None
-    return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(width, height))
+def _check_mask(path: Path, source: Source) -> None:
+    """Raises InputError where the mask does not fit, before hours are spent on the video."""
+    if source.kind is SourceKind.VIDEO:
+        info = probe(source.parts[0])
+        load_mask(path, info.width, info.height)
 
 
 def _write_mask(path: Path, frames: Frames, folder: Path) -> None:

@@ -8,14 +8,16 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from spn_data.area import FRAMES, MODEL, Area, StageRecord, StageWork, read_json
 from spn_data.camera import Camera
+from spn_data.camera_file import camera_from_json
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
-from spn_data.errors import InputError
+from spn_data.errors import FormatError
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
@@ -93,19 +95,13 @@ def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
     )
 
 
-def _start_camera(key: str, start: Mapping[str, dict[str, object]]) -> tuple[Camera, bool]:
-    if key not in start:
-        raise InputError(f"camera {key!r} of frames.csv is missing", path="cameras.json")
-    camera = start[key]
-    return (
-        Camera(
-            str(camera["model"]),
-            int(str(camera["width"])),
-            int(str(camera["height"])),
-            np.array(camera["params"], dtype=np.float64),
-        ),
-        bool(camera["focal_is_known"]),
-    )
+def _start_camera(key: str, start: Mapping[str, dict[str, Any]]) -> tuple[Camera, bool]:
+    try:
+        return camera_from_json(start[key]), bool(start[key]["focal_is_known"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"cameras.json: camera {key!r} is missing or damaged ({error})"
+        ) from error
 
 
 def rough_positions(frames: Frames) -> np.ndarray:

@@ -1,0 +1,79 @@
+"""Start intrinsics of the cameras of a source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.camera_file import camera_to_json
+from spn_data.errors import InputError
+from spn_data.frames import Frames
+from spn_data.photos import PhotoHeaders
+
+# Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
+_GUESSED_FOCAL_SHARE = 0.7
+_DIAGONAL_35MM = 43.267
+
+
+def start_cameras(
+    frames: Frames,
+    photos: PhotoHeaders | None,
+    fov_deg: Mapping[str, float],
+    given: Mapping[str, Camera],
+) -> dict[str, dict[str, Any]]:
+    """Each camera of one source, by key: the user's, by the photo's own metadata, or a guess.
+
+    What the user gives holds for the source's first camera: another zoom is another lens.
+    Raises InputError where a given camera is of another image shape.
+    """
+    cameras = {}
+    sequence = str(frames.sequences[0])
+    for key in np.unique(frames.cameras[frames.width > 0]).tolist():
+        row = int(np.flatnonzero((frames.cameras == key) & (frames.width > 0))[0])
+        width, height = int(frames.width[row]), int(frames.height[row])
+        fov = camera = None
+        if key == sequence:
+            fov = fov_deg.get(sequence, fov_deg.get("*"))
+            camera = given.get(sequence, given.get("*"))
+        focal_px = None if photos is None else _photo_focal_px(photos, row, width, height)
+        if camera is not None:
+            camera, source = _at_size(camera, width, height, sequence), "given"
+        elif fov is not None:
+            camera = Camera.from_horizontal_fov(width, height, fov, (0.0,))
+            source = f"horizontal field of view of {fov:g} deg, as given"
+        elif focal_px is not None:
+            camera, source = _simple(focal_px, width, height), "photo metadata"
+        else:
+            guess = _GUESSED_FOCAL_SHARE * max(width, height)
+            camera, source = _simple(guess, width, height), "guess"
+        cameras[key] = {
+            **camera_to_json(camera),
+            "focal_is_known": source != "guess",
+            "source": source,
+        }
+    return cameras
+
+
+def _simple(focal_px: float, width: int, height: int) -> Camera:
+    params = np.array([focal_px, width / 2, height / 2, 0.0])
+    return Camera("SIMPLE_RADIAL", width, height, params)
+
+
+def _at_size(camera: Camera, width: int, height: int, sequence: str) -> Camera:
+    if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
+        raise InputError(
+            f"the given camera is of {camera.width}x{camera.height}, the images are {width}x{height}",
+            path=sequence,
+        )
+    return camera.scaled(width, height)
+
+
+def _photo_focal_px(photos: PhotoHeaders, row: int, width: int, height: int) -> float | None:
+    """From the 35-mm equivalent, which compares diagonals (CIPA DCG-001)."""
+    metadata = photos.metadata[row]
+    if metadata is None or not metadata.focal_35mm > 0:
+        return None
+    return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(width, height))
