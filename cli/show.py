@@ -37,7 +37,7 @@ class Live:
             self._progress = self._bars.__enter__()
         self._progress(step, done, total)
 
-    def planned(self, found: Plan) -> None:
+    def planned(self, found: Plan, model_cost: tuple[float, int]) -> None:
         rows = []
         for source in found.sources:
             beside = ", ".join(path.name for path in source.telemetry) or "none beside it"
@@ -51,9 +51,11 @@ class Live:
             more = f" and {len(found.ignored) - 8} more" if len(found.ignored) > 8 else ""
             console.note(f"ignored: {shown}{more}")
         cost = found.cost
+        seconds, disk_bytes = model_cost
         console.out.print(
-            f"Choosing frames will take about {duration(cost.seconds)} and {cost.disk_bytes / 1e6:.0f} MB "
-            f"for about {cost.chosen} frames of {cost.candidates}.\n"
+            f"Expected: about {cost.chosen} frames of {cost.candidates} images; {duration(cost.seconds)} to "
+            f"choose them and {duration(seconds)} for the model; "
+            f"{(cost.disk_bytes + disk_bytes) / 1e6:.0f} MB on disk.\n"
         )
 
     def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None:

@@ -33,6 +33,7 @@ class Cost:
 
     candidates: int
     chosen: int
+    chosen_megapixels: float  # of all of them
     seconds: float
     disk_bytes: int
 
@@ -88,11 +89,12 @@ def estimate_cost(
     taken as `chosen_per_s`. Photos count whole, as they are. Rough: within a factor of two.
     """
     candidates, chosen, chosen_megapixels, seconds = 0, 0.0, 0.0, 0.0
-    photos, photo_bytes = 0, 0
+    photos, photo_bytes, photo_megapixels = 0, 0, 0.0
     for source in sources:
         if source.kind is SourceKind.PHOTOS:
             megapixels = float(read_headers(source.parts).sizes.prod(axis=1).sum()) / 1e6
             photos += len(source.parts)
+            photo_megapixels += megapixels
             photo_bytes += sum(part.stat().st_size for part in source.parts)
             seconds += megapixels * DECODE_S_PER_MEGAPIXEL
             continue
@@ -111,7 +113,13 @@ def estimate_cost(
         chosen = target_count
     seconds += chosen_megapixels * ENCODE_S_PER_MEGAPIXEL
     disk_bytes = photo_bytes + int(chosen_megapixels * 1e6 * BYTES_PER_PIXEL)
-    return Cost(candidates + photos, round(chosen) + photos, seconds, disk_bytes)
+    return Cost(
+        candidates + photos,
+        round(chosen) + photos,
+        chosen_megapixels + photo_megapixels,
+        seconds,
+        disk_bytes,
+    )
 
 
 def check_space(folder: Path, needed_bytes: int) -> None:

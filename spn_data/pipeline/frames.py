@@ -149,8 +149,8 @@ def choose_frames(
     check_space(work.path, found.cost.disk_bytes)
     stopwatch = Stopwatch()
     notes: list[str] = []
-    (work.path / "telemetry").mkdir(exist_ok=True)
-    (work.path / "masks").mkdir(exist_ok=True)
+    for name in ("telemetry", "masks", ".analysis"):
+        (work.path / name).mkdir(exist_ok=True)
     cameras: dict[str, dict[str, object]] = {}
     kept: list[Frames] = []
     if extend is not None:

@@ -12,7 +12,7 @@ from spn_data.georegister.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
 from spn_data.pipeline.geo import GeoStageOptions, georegister, has_fixes
 from spn_data.pipeline.model import build_model
-from spn_data.reconstruct import ReconstructOptions
+from spn_data.reconstruct import ReconstructOptions, estimate_model_cost
 from spn_data.telemetry.track import TelemetrySummary
 
 
@@ -30,7 +30,7 @@ class Watcher(Protocol):
 
     def progress(self, step: str, done: int, total: int) -> None: ...
 
-    def planned(self, found: Plan) -> None: ...
+    def planned(self, found: Plan, model_cost: tuple[float, int]) -> None: ...
 
     def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None: ...
 
@@ -88,7 +88,7 @@ def _stages(
     def tell(record: StageRecord, before: StageRecord | None) -> None:
         (watcher.unchanged if record == before else watcher.stage)(record)
 
-    watcher.planned(found)
+    watcher.planned(found, _model_cost(found, options.model))
     before = {stage: area.record(stage) for stage in STAGES if area.has(stage)}
     frames = choose_frames(
         area,
@@ -114,3 +114,11 @@ def _stages(
             f"{area.folder(MODEL)} is complete, but its place in the world is refused: {error}"
         ) from error
     tell(geo, before.get(GEO))
+
+
+def _model_cost(found: Plan, options: ReconstructOptions) -> tuple[float, int]:
+    """(seconds, bytes) that the model of the frames to choose is expected to take."""
+    frames = max(1, found.cost.chosen)
+    reduced = options.features.max_image_size_px**2 * 9 / 16 / 1e6
+    megapixels = min(found.cost.chosen_megapixels / frames, reduced)
+    return estimate_model_cost(frames, megapixels, options)
