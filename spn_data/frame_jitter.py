@@ -1,0 +1,64 @@
+"""Zoom, shear and stretch that each frame has for itself, as electronic stabilisation leaves them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spn_data.residual_fit import FRAME_EFFECTS, POSE, Block, Partialled, solve_spd
+
+_LENS_SIGMA = 0.02  # zoom, shear or stretch that all frames may have alike
+_MISFIT = 2.5  # times the noise: what lens model and matches leave in real models' frames, measured
+_WELL_KNOWN = (
+    1.5e-3  # sigma up to which a combination of frames' zooms, shears or stretches is used
+)
+
+
+def frame_jitter(
+    blocks: list[tuple[Block, Partialled]], readout_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scatter (3,) between frames of their own zoom, shear and stretch, and how many sigmas it is worth (3,).
+
+    Each kind is estimated beside the others, poses and points, so its errors are correlated between frames
+    and very unequal; the scatter is that of the greatest likelihood given their covariance.
+    """
+    modes: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(FRAME_EFFECTS)]
+    for block, partialled in blocks:
+        frames = len(block.frames)
+        left = partialled.residuals_px + partialled.effects[:, :, 0] * readout_s
+        variance = float(block.weights @ (left**2).sum(axis=1)) / block.degrees_of_freedom
+        readout_column = len(block.normal) - 1 - block.effects.shape[2]
+        columns = np.arange(readout_column)
+        normal = block.normal[np.ix_(columns, columns)].copy()
+        own = block.frame_columns[:, POSE:].ravel()
+        # What all frames have alike is the lens's, and weakly held here.
+        normal[own, own] += variance / _LENS_SIGMA**2
+        right = np.zeros((len(columns), len(own) + 1))
+        right[own, np.arange(len(own))] = 1
+        right[:, -1] = (
+            -block.normal[columns, -1] - readout_s * block.normal[columns, readout_column]
+        )
+        solved = solve_spd(normal, right)[own]
+        for k in range(FRAME_EFFECTS):
+            kind = np.arange(frames) * FRAME_EFFECTS + k
+            values, vectors = np.linalg.eigh(variance * solved[np.ix_(kind, kind)])
+            modes[k].append((np.maximum(values, 0.0), vectors.T @ solved[kind, -1]))
+    fits = [
+        most_likely_scatter(
+            np.concatenate([v for v, _ in of_kind]), np.concatenate([e for _, e in of_kind])
+        )
+        for of_kind in modes
+    ]
+    return np.array([f[0] for f in fits]), np.array([f[1] for f in fits])
+
+
+def most_likely_scatter(noise: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Most likely scatter beyond noise of independent values (n,) of noise variances (n,), and its sigmas."""
+    known = noise < _WELL_KNOWN**2
+    if known.sum() < max(5, len(noise) / 2):
+        return float("nan"), 0.0
+    noise, values = _MISFIT**2 * noise[known], values[known]
+    beyond = np.concatenate([[0.0], np.geomspace(1e-5, 0.1, 200)]) ** 2
+    total = noise + beyond[:, None]
+    likelihood = -0.5 * (np.log(total) + values**2 / total).sum(axis=1)
+    best = int(np.argmax(likelihood))
+    return float(np.sqrt(beyond[best])), float(np.sqrt(2 * (likelihood[best] - likelihood[0])))

@@ -1,0 +1,257 @@
+"""What else than points, poses and lens explains a model's residuals: bundle adjustment, linearised.
+
+A finished bundle adjustment has moved points, poses and lens to explain as much of an unmodelled effect
+as they can. To measure the effect it is put in beside them as another unknown of the same least squares,
+in one Gauss-Newton step: then nothing of it is lost to them (Frisch-Waugh-Lovell).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+
+from spn_data.camera import Camera
+from spn_data.colmap.model import Observations, Scene
+
+POSE = 6  # moves in the camera frame (3), then rotation vector in the camera frame
+LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2
+FRAME_EFFECTS = 3  # zoom, shear, stretch of the rows, each of one frame
+_PER_FRAME = POSE + FRAME_EFFECTS
+_RIDGE = 1e-9  # of each unknown's own information: the gauge is free, and solving must not stumble
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """M observations of F frames of one lens, linearised at the model.
+
+    frames : (F,) positions in the scene; frame : (M,) 0..F-1; weights : (M,), robust.
+    effects : (M, 2, E) displacement in px of the measured pixel by one unit of each wanted effect.
+    residuals_px : (M, 2) projected minus measured. per_frame : (M, 2, 9) and lens : (M, 2, 8), change of
+    the residual; whitened : (M, 2, 3), the same of the point, orthonormal over the point's observations.
+    point : (M,) 0..P-1; normal : (9F+8+E+1, 9F+8+E+1), weighted, points eliminated; the last E columns
+    but one are the effects, the last is the residual.
+    """
+
+    frames: np.ndarray
+    frame: np.ndarray
+    weights: np.ndarray
+    effects: np.ndarray
+    residuals_px: np.ndarray
+    per_frame: np.ndarray
+    lens: np.ndarray
+    whitened: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+
+    @property
+    def frame_columns(self) -> np.ndarray:
+        """(F, 9) columns of `normal`: pose, then zoom, shear, stretch."""
+        return np.arange(_PER_FRAME * len(self.frames)).reshape(-1, _PER_FRAME)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Of the residuals, after points and poses."""
+        return int(2 * len(self.frame) - 3 * (self.point.max() + 1) - POSE * len(self.frames))
+
+
+@dataclass(frozen=True, eq=False)
+class Partialled:
+    """Effects and residuals of a block after all that points, poses and lens explain of them.
+
+    effects : (M, 2, E); residuals_px : (M, 2); pose_per_effect : (F, 6, E), how far the poses were pushed by
+    one unit of the effect when it was not modelled.
+    """
+
+    effects: np.ndarray
+    residuals_px: np.ndarray
+    pose_per_effect: np.ndarray
+
+
+def projection_jacobians(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of pixels by points in the camera frame (M, 2, 3) and by the lens (M, 2, 8)."""
+    fx, fy = camera.focal_px
+    k1, k2, p1, p2 = camera.opencv_distortion
+    z = points_cam[:, 2]
+    x, y = points_cam[:, 0] / z, points_cam[:, 1] / z
+    r2 = x * x + y * y
+    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * (k1 + 2 * k2 * r2)
+    by_xy = np.empty((len(z), 2, 2))
+    by_xy[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    by_xy[:, 0, 1] = by_xy[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    by_xy[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    focal = np.array([fx, fy])
+    by_xy *= focal[:, None]
+    zero = np.zeros_like(x)
+    xy_by_point = np.stack(
+        [np.stack([1 / z, zero, -x / z], axis=-1), np.stack([zero, 1 / z, -y / z], axis=-1)], axis=1
+    )
+    distorted = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ],
+        axis=1,
+    )
+    one = np.ones_like(x)
+    by_lens = np.zeros((len(z), 2, LENS))
+    by_lens[:, 0, 0], by_lens[:, 1, 1] = distorted[:, 0], distorted[:, 1]
+    by_lens[:, 0, 2], by_lens[:, 1, 3] = one, one
+    by_lens[:, :, 4] = focal * np.stack([x * r2, y * r2], axis=1)
+    by_lens[:, :, 5] = focal * np.stack([x * r2 * r2, y * r2 * r2], axis=1)
+    by_lens[:, :, 6] = focal * np.stack([2 * x * y, r2 + 2 * y * y], axis=1)
+    by_lens[:, :, 7] = focal * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
+    return by_xy @ xy_by_point, by_lens
+
+
+def frame_effects(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Displacements (M, 2, 3) by zoom, shear and stretch of 1 about the image's middle.
+
+    zoom : of both axes; shear : rows move sideways with their distance below the middle; stretch : of
+    the rows' distance alone.
+    """
+    x, y = (pixels - np.array([camera.width, camera.height]) / 2).T
+    zero = np.zeros_like(x)
+    return np.stack(
+        [np.stack([x, y], axis=1), np.stack([y, zero], axis=1), np.stack([zero, y], axis=1)],
+        axis=2,
+    )
+
+
+def linearize(
+    scene: Scene,
+    seen: Observations,
+    frames: np.ndarray,
+    twists: np.ndarray,
+    trend: np.ndarray,
+    *,
+    max_observations: int,
+) -> Block | None:
+    """A block of some frames (F,) of one lens, with the effects rolling shutter (per second) and zoom trend.
+
+    twists : (F, 6) velocity of a still world in the camera frame, per second: moves, then rotation vector.
+    trend : (F,) weight of the zoom in each frame. None where too little is seen by three frames or more.
+    """
+    camera = scene.cameras[int(scene.camera_ids[frames[0]])]
+    place = np.full(len(scene.names), -1)
+    place[frames] = np.arange(len(frames))
+    rows = np.flatnonzero((place[seen.image_idx] >= 0) & np.isfinite(seen.residuals_px).all(axis=1))
+    tracks = np.bincount(seen.point_idx[rows], minlength=len(scene.points))
+    # Chosen by chance and not by length: long tracks lie in some parts of the scene only.
+    order = np.random.default_rng(0).permutation(np.flatnonzero(tracks >= 3))
+    order = order[: int(np.searchsorted(np.cumsum(tracks[order]), max_observations)) + 1]
+    position = np.full(len(scene.points), -1)
+    position[order] = np.arange(len(order))
+    rows = rows[position[seen.point_idx[rows]] >= 0]
+    if len(rows) < 20 * len(frames):
+        return None
+    frame, point = place[seen.image_idx[rows]], position[seen.point_idx[rows]]
+    poses = scene.poses[frames]
+    offsets = scene.points[seen.point_idx[rows]] - poses.centers[frame]
+    points_cam = np.einsum("mij,mj->mi", poses.rotations[frame], offsets)
+    by_point, lens = projection_jacobians(camera, points_cam)
+    pose = np.concatenate([by_point, np.cross(points_cam[:, None], by_point)], axis=2)
+    pixels = seen.pixels[rows]
+    share = pixels[:, 1] / camera.height - 0.5
+    shutter = share[:, None] * np.einsum("mij,mj->mi", pose, twists[frame])
+    own = frame_effects(camera, pixels)
+    effects = np.stack([shutter, own[:, :, 0] * trend[frame][:, None]], axis=2)
+    residuals = seen.residuals_px[rows]
+    weights = huber_weights(residuals)
+    per_frame = np.concatenate([pose, own], axis=2)
+    whitened = _whiten(by_point @ poses.rotations[frame], weights, point, len(order))
+    shared = np.concatenate([lens, effects, residuals[:, :, None]], axis=2)
+    normal = _normal(per_frame, shared, frame, len(frames), whitened, point, weights)
+    return Block(
+        frames, frame, weights, effects, residuals, per_frame, lens, whitened, point, normal
+    )
+
+
+def huber_weights(residuals_px: np.ndarray, *, beyond_sigmas: float = 2.5) -> np.ndarray:
+    """Weights (M,) that bound the pull of an observation; sigma from the median length."""
+    length = np.linalg.norm(residuals_px, axis=1)
+    sigma = max(float(np.median(length)) / 1.1774, 1e-6)  # median of a Rayleigh distribution
+    return np.minimum(1.0, beyond_sigmas * sigma / np.maximum(length, 1e-12))
+
+
+def _whiten(by_point: np.ndarray, weights: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
+    information = np.zeros((count, 3, 3))
+    np.add.at(information, point, np.einsum("m,mki,mkj->mij", weights, by_point, by_point))
+    trace = np.trace(information, axis1=1, axis2=2)
+    # Points seen under a tiny angle have a depth that nothing fixes.
+    information += (1e-7 * trace + 1e-300)[:, None, None] * np.eye(3)
+    inverse_root = np.linalg.inv(np.linalg.cholesky(information))
+    return by_point @ np.swapaxes(inverse_root, 1, 2)[point]
+
+
+def _normal(
+    per_frame: np.ndarray,
+    shared: np.ndarray,
+    frame: np.ndarray,
+    frames: int,
+    whitened: np.ndarray,
+    point: np.ndarray,
+    weights: np.ndarray,
+) -> np.ndarray:
+    m = len(frame)
+    first_shared = _PER_FRAME * frames
+    columns = np.concatenate(
+        [
+            _PER_FRAME * frame[:, None] + np.arange(_PER_FRAME),
+            np.broadcast_to(first_shared + np.arange(shared.shape[2]), (m, shared.shape[2])),
+        ],
+        axis=1,
+    )
+    root = np.sqrt(weights)[:, None, None]
+    a = _rows_to_sparse(
+        root * np.concatenate([per_frame, shared], axis=2), columns, first_shared + shared.shape[2]
+    )
+    count = int(point.max()) + 1
+    p = _rows_to_sparse(root * whitened, 3 * point[:, None] + np.arange(3), 3 * count)
+    through_points = p.T @ a
+    direct = a.T @ a
+    normal = np.asarray((direct - through_points.T @ through_points).todense())
+    # What is left of an unknown after its points can be less than rounding.
+    normal[np.diag_indices(len(normal))] += 1e-8 * direct.diagonal()
+    return normal
+
+
+def _rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
+    m, two, n = values.shape
+    pointers = n * np.arange(two * m + 1)
+    return sparse.csr_matrix(
+        (values.ravel(), np.repeat(columns, two, axis=0).ravel(), pointers), (two * m, width)
+    )
+
+
+def partial_out(block: Block) -> Partialled:
+    """Take from effects and residuals what points, poses and lens explain of them."""
+    frames = len(block.frames)
+    first_shared = _PER_FRAME * frames
+    nuisance = np.concatenate(
+        [block.frame_columns[:, :POSE].ravel(), first_shared + np.arange(LENS)]
+    )
+    wanted = np.arange(first_shared + LENS, len(block.normal))
+    solved = solve_spd(
+        block.normal[np.ix_(nuisance, nuisance)], block.normal[np.ix_(nuisance, wanted)]
+    )
+    pose, lens = np.split(solved, [POSE * frames])
+    pose = pose.reshape(frames, POSE, -1)
+    values = np.concatenate([block.effects, block.residuals_px[:, :, None]], axis=2)
+    values = values - block.per_frame[:, :, :POSE] @ pose[block.frame] - block.lens @ lens
+    by_point = np.zeros((int(block.point.max()) + 1, 3, values.shape[2]))
+    weighted = block.weights[:, None, None] * (np.swapaxes(block.whitened, 1, 2) @ values)
+    np.add.at(by_point, block.point, weighted)
+    values = values - block.whitened @ by_point[block.point]
+    return Partialled(values[:, :, :-1], values[:, :, -1], pose[:, :, :-1])
+
+
+def solve_spd(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a positive semi-definite system, scaled to a unit diagonal and held where nothing fixes it."""
+    diagonal = np.diag(matrix)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = matrix * scale[:, None] * scale
+    scaled[np.diag_indices(len(scaled))] += _RIDGE
+    factor = linalg.cho_factor(scaled, check_finite=True)
+    return np.asarray(scale[:, None] * linalg.cho_solve(factor, right * scale[:, None]))
