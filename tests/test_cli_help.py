@@ -38,7 +38,7 @@ def command_for(words: list[str]) -> click.Command:
 
 
 def command_lines(text: str) -> list[tuple[str, bool]]:
-    """(words after spn-data, whether whole) of fenced lines, whole, and of inline code, which may cut short."""
+    """(words after spn-data, whether they are a whole line): of fenced lines, and of inline code."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     fenced = "\n".join(block for language, block in blocks if language in ("", "sh"))
     found = re.findall(r"^(?:\S*/)?spn-data( .*)$", fenced, re.MULTILINE)
