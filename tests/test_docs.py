@@ -14,6 +14,7 @@ import pytest
 from spn_data import errors
 from spn_data.area import STAGES, StageRecord
 from spn_data.diagnosis import FrameRegistration
+from spn_data.reconstruct import ReconstructOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
@@ -231,3 +232,23 @@ def test_what_the_program_says_is_documented():
     messages = list(raised())
     assert len(messages) > 60
     assert [m for m in messages if not any(words_in_order(d, m) for d in documented())] == []
+
+
+def test_figures_of_the_reconstruction_page_are_the_defaults():
+    """Numbers in the text of reconstruct.md are those of the option classes."""
+    options = ReconstructOptions()
+    pairs, features = options.pairs, options.features
+    text = " ".join(page("docs/reconstruct.md").split())
+    far = [pairs.overlap * 2**k for k in range(1, pairs.far_steps + 1)]
+    for sentence in (
+        f"at most {features.max_image_size_px:,} pixels, the {features.max_features:,} strongest",
+        f"the next {pairs.overlap} of its sequence",
+        f"those {', '.join(map(str, far[:-1]))} and {far[-1]} further",
+        f"the {pairs.spatial_neighbors} nearest by telemetry within {pairs.spatial_max_m:g} m",
+        f"the {pairs.appearance_neighbors} that look most alike",
+        f"needs {options.matching.min_inliers} inliers",
+        f"fewer than {options.enough_share * 100:g} % are in",
+        f"than {options.usable_share * 100:g} % of them, in one model",
+        f"COLMAP's {options.camera_model} model",
+    ):
+        assert sentence in text
