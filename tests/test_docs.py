@@ -15,6 +15,7 @@ from spn_data import errors
 from spn_data.area import STAGES, StageRecord
 from spn_data.diagnosis import FrameRegistration
 from spn_data.reconstruct import ReconstructOptions
+from spn_data.selection import SelectionOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
@@ -252,3 +253,16 @@ def test_figures_of_the_reconstruction_page_are_the_defaults():
         f"COLMAP's {options.camera_model} model",
     ):
         assert sentence in text
+
+
+def test_options_of_the_choice_of_frames_are_documented_with_their_defaults():
+    """input.md's table has the defaults of the option class."""
+    text = section(page("docs/input.md"), "How frames are chosen")
+    rows = re.findall(r"^\| `(.+)` \| ([^|]+) \|", text, re.MULTILINE)
+    assert len(rows) > 5
+    for names, values in rows:
+        for name, value in zip(names.split("`, `"), values.split(","), strict=True):
+            default = getattr(SelectionOptions(), name)
+            assert default == (None if value == "none" else float(value.strip(" m"))), name
+    blur = f"below {SelectionOptions().blur_ratio:g} of their median, a frame is blurred"
+    assert blur in text
