@@ -90,8 +90,8 @@ class ShutterDiagnosis:
             found.append(self._tell_jitter())
         if self.drifts:
             found.append(
-                f"the focal length drifts by {100 * self.zoom_drift:+.2g} % (sigma "
-                f"{100 * self.zoom_drift_sigma:.1g} %) from the first frame to the last; "
+                f"the focal length drifts by {_plain(100 * self.zoom_drift)} % (sigma "
+                f"{_plain(100 * self.zoom_drift_sigma, 1)} %) from the first frame to the last; "
                 "fix zoom and focus"
             )
         return f"{self.sequence}: {'; '.join(found)}" if found else ""
@@ -100,14 +100,14 @@ class ShutterDiagnosis:
         direction = "first to last" if self.readout_s > 0 else "last to first"
         text = (
             f"rolling shutter of about {1000 * abs(self.readout_s):.0f} ms (sigma "
-            f"{1000 * self.readout_sigma_s:.1g} ms) from {direction} row moves points by up to "
+            f"{_plain(1000 * self.readout_sigma_s, 1)} ms) from {direction} row moves points by up to "
             f"{self.displacement_p95_px:.1f} px"
         )
         if abs(self.readout_s) > _PLAUSIBLE_READOUT_S:
             text += " (sensors are faster: stabilisation or wrong times may add to it)"
-        off = f"{self.pose_turn_deg:.1g} degrees"
+        off = f"{_plain(self.pose_turn_deg)} degrees"
         if metres_per_unit is not None:
-            off = f"{100 * metres_per_unit * self.pose_shift:.1g} cm and {off}"
+            off = f"{_plain(100 * metres_per_unit * self.pose_shift)} cm and {off}"
         return (
             f"{text}; poses may be off by {off}; "
             "fly slower or film with a mechanical or global shutter"
@@ -115,11 +115,16 @@ class ShutterDiagnosis:
 
     def _tell_jitter(self) -> str:
         sizes = {"zoom": self.zoom_rms, "shear": self.shear_rms, "stretch": self.stretch_rms}
-        kinds = " and ".join(f"{kind} by {100 * sizes[kind]:.2g} %" for kind in self.jitters)
+        kinds = " and ".join(f"{kind} by {_plain(100 * sizes[kind])} %" for kind in self.jitters)
         return (
             f"frames differ in {kinds} (RMS), which moves points by up to {self.jitter_p95_px:.1f} px, "
             "as electronic stabilisation does; switch it off when filming"
         )
+
+
+def _plain(value: float, digits: int = 2) -> str:
+    """A number of some significant digits and without an exponent."""
+    return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
 
 
 def diagnose_shutter(
