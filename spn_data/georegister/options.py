@@ -51,6 +51,7 @@ class GeoregisterOptions:
     gimbal_agreement_deg: float = (
         5.0  # frames whose gimbal differs by more from the flight's others are dropped
     )
+    model_bend_deg: float = 0.02  # sigma of the tilt between a model's rotations and its positions
     level_camera_sigma_deg: float = (
         6.0  # roll of cameras without gimbal angles: of a flight, and of a frame
     )

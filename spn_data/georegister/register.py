@@ -112,6 +112,8 @@ def _fit_of(
     distance[problem.kind, problem.frame] = result.distance
     outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
     covariance = result.covariance[:7, :7].copy()
+    # Gravity acts on the cameras' rotations; what the positions are tilted against these no telemetry shows.
+    covariance[[3, 4], [3, 4]] += np.deg2rad(options.model_bend_deg) ** 2
     if not fixes.has_heights:
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = np.inf
