@@ -60,15 +60,15 @@ class Run:
 
     def __init__(self, sources: list[Path], area: Path, options: list[str]):
         self.log = area.with_suffix(".log")
-        self._out = self.log.open("a")
-        self._from = self._out.tell()
+        self._from = self.log.stat().st_size if self.log.exists() else 0
         command = [sys.executable, "-c", "from cli.data import main; main()", "reconstruct"]
-        self.process = subprocess.Popen(
-            [*command, *map(str, sources), "--area", str(area), "--threads", "1", *options],
-            stdout=self._out,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
+        with self.log.open("a") as out:
+            self.process = subprocess.Popen(
+                [*command, *map(str, sources), "--area", str(area), "--threads", "1", *options],
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
 
     @property
     def output(self) -> str:
@@ -122,7 +122,6 @@ class Run:
                 raise RuntimeError(f"not done after {timeout_s:.0f} s:\n{self.output}")
             time.sleep(0.05)
         self.process.returncode = os.waitstatus_to_exitcode(status)
-        self._out.close()
         if self.process.returncode != 0:
             raise RuntimeError(f"ended with {self.process.returncode}:\n{self.output}")
         return used.ru_utime + used.ru_stime

@@ -1,0 +1,259 @@
+"""Bad input ends in one clear line and exit code 1, and nothing that stood is changed."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from cli.data import main
+from spn_data.area import FRAMES, MODEL, VERSION, Area
+
+FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
+
+
+def run(*arguments: object) -> Result:
+    """One call of spn-data; a traceback is raised here."""
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def refused(*arguments: object) -> str:
+    """The one line with which a call is refused."""
+    result = run("reconstruct", *arguments)
+    assert result.exit_code == 1, result.output
+    errors = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(errors) == 1, result.stderr
+    return errors[0].removeprefix("Error: ")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def frames_of(video: Path) -> list[np.ndarray]:
+    with av.open(str(video)) as container:
+        return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+
+
+def write_video(path: Path, images: list[np.ndarray]) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=2)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode())
+
+
+@pytest.fixture
+def copy_of_flight(flight1: Path, tmp_path: Path) -> Path:
+    """A folder of a video and its SRT that a test may damage."""
+    return Path(shutil.copytree(flight1, tmp_path / "flight"))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "holds no video and no photo"),
+        (cut, "flight1.mp4: is truncated: the index (moov)"),
+        (lambda path: path.write_bytes(b""), "flight1.mp4: is empty (0 bytes)"),
+        (lambda path: path.write_text("no video\n"), "flight1.mp4: is not a video"),
+    ],
+    ids=["none", "truncated", "empty", "text"],
+)
+def test_a_video_that_is_none_is_named(
+    copy_of_flight: Path, tmp_path: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    damage(copy_of_flight / "flight1.mp4")
+    assert message in refused(copy_of_flight, "--area", tmp_path / "area")
+    assert not (tmp_path / "area").exists(), "nothing was made, so that nothing stays"
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    assert refused(tmp_path / "nowhere", "--area", tmp_path / "area").endswith("does not exist")
+
+
+def test_telemetry_of_another_length_is_refused_before_the_video_is_measured(
+    copy_of_flight: Path, tmp_path: Path
+) -> None:
+    srt = copy_of_flight / "flight1.SRT"
+    srt.write_text("\n\n".join(srt.read_text().split("\n\n")[:5]) + "\n\n")
+    message = refused(copy_of_flight, "--area", tmp_path / "area")
+    assert "flight1.SRT: its telemetry lasts 2 s, the video beside it 9 s" in message
+    assert not (tmp_path / "area").exists()
+
+
+def test_all_frames_blurred_is_said(flight1: Path, tmp_path: Path) -> None:
+    (tmp_path / "v").mkdir()
+    blurred = [cv2.GaussianBlur(f, (0, 0), 25) for f in frames_of(flight1 / "flight1.mp4")]
+    write_video(tmp_path / "v" / "blurred.mp4", blurred)
+    message = refused(tmp_path / "v", "--area", tmp_path / "area")
+    assert "blurred.mp4: every frame is blurred, dark or empty" in message
+
+
+def test_an_area_below_a_file_is_refused(flight1: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert "cannot be made: Not a directory" in refused(
+        flight1, "--area", tmp_path / "file" / "area"
+    )
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_area_of_a_newer_version_is_refused_and_left_alone(
+    finished_area: Path, flight1: Path, tmp_path: Path
+) -> None:
+    area = Path(shutil.copytree(finished_area, tmp_path / "area"))
+    path = area / MODEL / "stage.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": VERSION + 1}))
+    before = contents(area)
+    assert "2-model/stage.json: made by a newer version" in refused(
+        flight1, "--area", area, "--overwrite", *FAST
+    )
+    assert contents(area) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--max-features", "900"), "was made with features.max_features = 800, now 900"),
+        (("--fov", "80"), "1-frames stands already and was made with fov_deg.* = 72.0, now 80.0"),
+        (("--gnss-sigma", "1", "2"), "3-geo stands already and was made with fit.gnss_sigma_m"),
+        (("--seed", "3"), "2-model stands already and was made with seed = 0, now 3"),
+    ],
+)  # fmt: skip
+def test_a_changed_option_is_refused_by_name_and_changes_nothing(
+    finished_area: Path, flight1: Path, option: tuple[str, ...], message: str
+) -> None:
+    before = contents(finished_area)
+    found = refused(flight1, "--area", finished_area, *FAST, *option)
+    assert message in found
+    assert "--overwrite makes it anew" in found
+    assert contents(finished_area) == before
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--max-features", "0"),
+        ("--max-image-size", "-5"),
+        ("--fov", "500"),
+        ("--spacing", "nan"),
+        ("--gnss-sigma", "nan", "1"),
+        ("--correlation-time", "inf"),
+        ("--takeoff-alt", "100"),
+        ("--mask", "nowhere.png"),
+    ],
+)
+def test_an_option_out_of_bounds_is_a_usage_error(
+    flight1: Path, tmp_path: Path, option: tuple[str, ...]
+) -> None:
+    result = run("reconstruct", flight1, "--area", tmp_path / "area", *option)
+    assert result.exit_code == 2
+    assert option[0] in result.stderr
+    assert not (tmp_path / "area").exists()
+
+
+def mask(path: Path, height: int, width: int, value: int) -> None:
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.full((height, width), value, np.uint8))
+
+
+def test_masks_that_do_not_fit_are_refused_before_any_work(flight1: Path, tmp_path: Path) -> None:
+    area = ("--area", tmp_path / "area")
+    mask(tmp_path / "other" / "other.png", 180, 320, 255)
+    assert "holds no mask: none of flight1.png" in refused(
+        flight1, *area, "--mask", tmp_path / "other"
+    )
+    mask(tmp_path / "tall.png", 320, 180, 255)
+    assert "a mask of 180x320 does not fit images of 320x180" in refused(
+        flight1, *area, "--mask", tmp_path / "tall.png"
+    )
+    mask(tmp_path / "black.png", 180, 320, 0)
+    assert "black all over" in refused(flight1, *area, "--mask", tmp_path / "black.png")
+    assert not (tmp_path / "area").exists()
+
+
+def test_names_are_never_used_as_paths_or_markup(flight1: Path, tmp_path: Path) -> None:
+    """Brackets, quotes, dashes, case, control characters and other alphabets in the names of photos."""
+    names = [
+        "a.jpg",
+        "A.jpg",
+        "-x.jpg",
+        'it\'s "q".jpg',
+        "ünï 写真.jpg",
+        "[b]x.jpg",
+        ":smile:.jpg",
+    ]
+    photos = tmp_path / "[red]"
+    photos.mkdir()
+    for name, image in zip(names, frames_of(flight1 / "flight1.mp4"), strict=False):
+        (photos / name).write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+    (photos / "bad\n\x1b[31m.jpg").write_bytes(b"x")
+    (photos / "cut.jpg").write_bytes((photos / "a.jpg").read_bytes()[:9000])
+    (photos / "empty.png").write_bytes(b"")
+    result = run("reconstruct", photos, "--area", tmp_path / "area", *FAST)
+    assert "control characters" in result.output
+    assert "\x1b[31m" not in result.output
+    rows = (tmp_path / "area" / FRAMES / "frames.csv").read_text()
+    assert rows.count(",chosen,") == len(names)
+    assert rows.count(",unreadable,") == 2
+    made = sorted(p.name.lower() for p in (tmp_path / "area" / FRAMES / "red").iterdir())
+    assert len(set(made)) == len(names), "no two frames differ by case alone"
+
+
+def test_only_one_process_works_on_an_area(flight1: Path, finished_area: Path) -> None:
+    with Area(finished_area).locked():
+        assert "in use by another spn-data" in refused(flight1, "--area", finished_area, *FAST)
+
+
+def test_a_damaged_database_is_named(flight1: Path, finished_area: Path, tmp_path: Path) -> None:
+    """Half-done matching whose database was overwritten with something else."""
+    area = Path(shutil.copytree(finished_area, tmp_path / "area"))
+    shutil.rmtree(area / "3-geo")
+    partial = Area(area).partial(MODEL)
+    (area / MODEL).rename(partial)
+    (partial / "stage.json").rename(partial / "started.json")
+    (partial / "database.db").write_bytes(b"no database" * 1000)
+    message = refused(flight1, "--area", area, *FAST)
+    assert "database.db: damaged, or not a COLMAP database; remove it" in message
+    (partial / "database.db").unlink()
+    assert run("reconstruct", flight1, "--area", area, *FAST).exit_code == 0
+
+
+def limited(bytes_a_file: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_a_file, bytes_a_file))
+
+
+def test_frames_that_cannot_be_written_are_one_line(flight1: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for a disk that refuses; then it goes on."""
+    command = [sys.executable, "-c", "from cli.data import main; main()", "reconstruct"]
+    arguments = [str(flight1), "--area", str(tmp_path / "area"), *FAST]
+    result = subprocess.run(
+        [*command, *arguments],
+        preexec_fn=limited(10_000),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert "File too large" in result.stderr

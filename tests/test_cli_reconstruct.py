@@ -1,0 +1,198 @@
+"""`spn-data reconstruct` on a short simulated flight: made, left alone, extended, and shown by status."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sqlite3
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from click.testing import CliRunner, Result
+
+from cli.data import main
+from spn_data.area import FRAMES, GEO, MODEL, Area, read_json
+from spn_data.colmap.model import read_scene
+from spn_data.frames import read_frames
+
+FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
+
+
+def run(*arguments: object) -> Result:
+    """One call of spn-data; a traceback is raised here."""
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def _interruption() -> ModuleType:
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "interruption.py"
+    spec = importlib.util.spec_from_file_location("interruption_for_add", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def area(finished_area: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_area, tmp_path / "area"))
+
+
+def test_run_again_unchanged_says_so_and_changes_no_byte(
+    finished_area: Path, flight1: Path
+) -> None:
+    before = contents(finished_area)
+    result = run("reconstruct", flight1, "--area", finished_area, *FAST)
+    assert result.exit_code == 0
+    for stage in (FRAMES, MODEL, GEO):
+        assert f"{stage}: unchanged since" in result.stdout
+    assert contents(finished_area) == before
+
+
+def test_more_threads_are_no_change(finished_area: Path, flight1: Path) -> None:
+    result = run("reconstruct", flight1, "--area", finished_area, *FAST, "--threads", "2")
+    assert result.exit_code == 0
+    assert "2-model: unchanged" in result.stdout
+
+
+def test_an_area_in_the_folder_of_its_own_videos_is_no_input(flight1: Path, tmp_path: Path) -> None:
+    """`cd video; spn-data reconstruct .` twice."""
+    here = Path(shutil.copytree(flight1, tmp_path / "here"))
+    assert run("reconstruct", here, "--area", here, *FAST).exit_code == 0
+    again = run("reconstruct", here, "--area", here, *FAST)
+    assert again.exit_code == 0, again.output
+    assert "1-frames: unchanged" in again.stdout
+
+
+def test_a_refused_georegistration_leaves_the_model_and_nothing_unfinished(
+    area: Path, flight1: Path
+) -> None:
+    """Fixes said to be 1 km uncertain determine nothing; another sigma then needs no --overwrite."""
+    shutil.rmtree(area / GEO)
+    wild = ("--gnss-sigma", "1000", "1000", "--ignore-gimbal")
+    result = run("reconstruct", flight1, "--area", area, *FAST, *wild)
+    assert result.exit_code == 1
+    assert "2-model is complete, but its place in the world is refused" in result.stderr
+    assert not Area(area).partial(GEO).exists()
+    assert Area(area).facts.sources == (str(flight1),)
+    assert run("reconstruct", flight1, "--area", area, *FAST).exit_code == 0
+
+
+def rows(database: Path, sql: str) -> list[tuple[object, ...]]:
+    with sqlite3.connect(database) as connection:
+        found = connection.execute(sql).fetchall()
+    connection.close()
+    return found
+
+
+def test_add_extends_an_area_and_keeps_what_it_had(
+    area: Path, finished_area: Path, flight2: Path
+) -> None:
+    """Features and matches are taken over, the origin is exactly the same, old frames keep their names."""
+    result = run("reconstruct", flight2, "--area", area, "--add", *FAST)
+    assert result.exit_code == 0, result.output
+    old, new = Area(finished_area), Area(area)
+    names = read_frames(new.folder(FRAMES) / "frames.csv")
+    before = read_frames(old.folder(FRAMES) / "frames.csv")
+    assert names.names[: len(before)].tolist() == before.names.tolist()
+    assert set(names.sequences.tolist()) == {"flight1", "flight2"}
+    first_told = next(s for s in result.stdout.splitlines() if s.startswith("features: "))
+    kept = int(before.chosen.sum())
+    assert int(first_told.split()[1]) == kept + 1, "only frames of the new flight are worked on"
+    databases = [one.folder(MODEL) / "database.db" for one in (old, new)]
+    for sql in (
+        f"SELECT image_id, data FROM descriptors WHERE image_id <= {kept}",
+        "SELECT image_id, name FROM images WHERE name LIKE 'flight1/%'",
+    ):
+        assert rows(databases[0], sql) == rows(databases[1], sql)
+    pairs = "SELECT pair_id, data FROM two_view_geometries"
+    assert set(rows(databases[0], pairs)) <= set(rows(databases[1], pairs))
+    geo = [read_json(one.folder(GEO) / "geo.json")["origin"] for one in (old, new)]
+    assert geo[0] == geo[1]
+    registered = read_scene(new.folder(GEO)).names
+    assert {name.split("/")[0] for name in registered} == {"flight1", "flight2"}
+    assert new.facts.sources == (*old.facts.sources, str(flight2))
+    assert not (area / ".next").exists()
+    again = run("reconstruct", flight2, "--area", area, "--add", *FAST)
+    assert again.exit_code == 1
+    assert "nothing to add: what it holds is already in the area" in again.stderr
+
+
+@pytest.mark.slow
+def test_a_sequence_of_a_name_that_exists_gets_another(
+    area: Path, flight2: Path, tmp_path: Path
+) -> None:
+    """The second flight, its video called like the first one's; what is in the area is passed over."""
+    more = tmp_path / "more"
+    more.mkdir()
+    for path in flight2.iterdir():
+        shutil.copy(path, more / path.name.replace("flight2", "flight1"))
+    result = run("reconstruct", more, "--area", area, "--add", *FAST)
+    assert result.exit_code == 0, result.output
+    sequences = read_frames(area / FRAMES / "frames.csv").sequences.tolist()
+    assert list(dict.fromkeys(sequences)) == ["flight1", "flight1-2"]
+
+
+@pytest.mark.slow
+def test_adding_with_other_options_says_that_features_are_made_anew(
+    area: Path, flight2: Path
+) -> None:
+    result = run("reconstruct", flight2, "--area", area, "--add", *FAST, "--max-features", "700")
+    assert result.exit_code == 0, result.output
+    told = " ".join(result.stdout.split())
+    assert (
+        "features and matches are made anew: the area's were made with max_features = 800" in told
+    )
+
+
+def test_a_kill_while_adding_leaves_the_old_area_whole(area: Path, flight2: Path) -> None:
+    """Its bytes stay, status shows the addition, and the same command goes on."""
+    interruption = _interruption()
+    before = contents(area)
+    options = ["--add", "--max-features", "800", "--fov", "72"]
+    killed = interruption.Run([flight2], area, options)
+    killed.wait_for("matching")
+    assert killed.kill() == 0
+    now = {k: v for k, v in contents(area).items() if not k.startswith(".next/")}
+    assert now == before
+    shown = run("status", "--area", area)
+    assert shown.stdout.count(" complete ") == 3
+    assert "an addition is unfinished" in shown.stdout
+    resumed = interruption.Run([flight2], area, options)
+    resumed.finish()
+    assert "features:" not in resumed.output
+    sequences = set(read_frames(area / FRAMES / "frames.csv").sequences.tolist())
+    assert sequences == {"flight1", "flight2"}
+
+
+def test_status_of_no_area_is_an_error(tmp_path: Path) -> None:
+    result = run("status", "--area", tmp_path / "none")
+    assert result.exit_code == 1
+    assert "none is no area: spn-data reconstruct VIDEO --area ... makes one" in result.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_status_shows_what_is_complete_unfinished_missing_and_stale(area: Path) -> None:
+    complete = run("status", "--area", area).stdout
+    assert complete.count(" complete ") == 3
+    assert "14 of 14 frames" in complete
+    (area / GEO).rename(area / f".{GEO}.partial")
+    partial = run("status", "--area", area).stdout
+    assert "unfinished" in partial
+    assert "in units of the model: lengths there are no metres" in " ".join(partial.split())
+    (area / f".{GEO}.partial").rename(area / GEO)
+    stage = area / FRAMES / "stage.json"
+    stage.write_text(stage.read_text().replace('"candidates": 18', '"candidates": 19'))
+    stale = run("status", "--area", area)
+    assert stale.exit_code == 0
+    assert stale.stdout.count("stale: 1-frames") == 2
