@@ -53,7 +53,7 @@ def frame_jitter(
 
 def most_likely_scatter(noise: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """Most likely scatter beyond noise of independent values (n,) of noise variances (n,), and its sigmas."""
-    known = noise < _WELL_KNOWN**2
+    known = (noise > 0) & (noise < _WELL_KNOWN**2)
     if known.sum() < max(5, len(noise) / 2):
         return float("nan"), 0.0
     noise, values = _MISFIT**2 * noise[known], values[known]

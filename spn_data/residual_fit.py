@@ -137,6 +137,9 @@ def linearize(
     place = np.full(len(scene.names), -1)
     place[frames] = np.arange(len(frames))
     rows = np.flatnonzero((place[seen.image_idx] >= 0) & np.isfinite(seen.residuals_px).all(axis=1))
+    # A point that is nearly in the camera's plane projects anywhere, and no weight bounds its derivatives.
+    length = np.linalg.norm(seen.residuals_px[rows], axis=1)
+    rows = rows[length <= 20 * np.median(length)] if len(rows) else rows
     tracks = np.bincount(seen.point_idx[rows], minlength=len(scene.points))
     # Chosen by chance and not by length: long tracks lie in some parts of the scene only.
     order = np.random.default_rng(0).permutation(np.flatnonzero(tracks >= 3))

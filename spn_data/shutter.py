@@ -141,6 +141,8 @@ def diagnose_shutter(
     options = options or ShutterOptions()
     if len(sequences) != len(scene.names) or len(time_s) != len(scene.names):
         raise ValueError(f"{len(sequences)} sequences for {len(scene.names)} images")
+    if not np.isfinite(time_s).all():
+        raise ValueError("every image needs a time")
     found = []
     for sequence in sorted(set(sequences.tolist())):
         for camera_id in sorted(set(scene.camera_ids[sequences == sequence].tolist())):
@@ -290,7 +292,7 @@ def _fit_effects(
     inverse = solve_spd(information, np.eye(len(effects)))
     independent = spread / degrees * np.diag(inverse)
     sigmas = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), independent))
-    return effects, sigmas, 1 - after / before if before > 0 else 0.0
+    return effects, sigmas, max(0.0, 1 - after / before) if before > 0 else 0.0
 
 
 def _pose_shift(

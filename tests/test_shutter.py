@@ -220,6 +220,23 @@ def test_a_handful_of_frames_is_not_judged(tmp: Path) -> None:
         diagnose_shutter(filmed.scene, filmed.seen, sequences[1:], filmed.time_s)
 
 
+def test_wild_and_unknown_residuals_do_not_change_the_finding(tmp: Path) -> None:
+    """1 % of residuals at 1e7 px and 10 % NaN leave the zoom where it was; none at all is no diagnosis."""
+    filmed = film(tmp, 2, Flaws(zoom_jitter=0.005))
+    residuals = filmed.seen.residuals_px.copy()
+    residuals[::100] = 1e7
+    residuals[5::10] = np.nan
+    found = replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose()
+    assert found.zoom_rms == pytest.approx(filmed.diagnose().zoom_rms, rel=0.1)
+    residuals[:] = 0
+    assert (
+        replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose().tell() == ""
+    )
+    residuals[:] = np.nan
+    nothing = replace(filmed.seen, residuals_px=residuals)
+    assert diagnose_shutter(filmed.scene, nothing, filmed.sequences, filmed.time_s) == ()
+
+
 def test_twists_are_the_velocity_of_a_still_point_in_the_camera() -> None:
     """A screw motion: twist x point equals the numerical derivative of the point's coordinates."""
     rate, speed = np.array([0.1, 0.5, -0.2]), np.array([2.0, -1.0, 0.5])
