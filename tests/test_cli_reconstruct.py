@@ -155,6 +155,7 @@ def test_adding_with_other_options_says_that_features_are_made_anew(
     )
 
 
+@pytest.mark.slow
 def test_a_kill_while_adding_leaves_the_old_area_whole(area: Path, flight2: Path) -> None:
     """Its bytes stay, status shows the addition, and the same command goes on."""
     interruption = _interruption()

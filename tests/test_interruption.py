@@ -78,7 +78,7 @@ def test_ctrl_c_in_each_step_ends_at_once_and_the_next_run_goes_on(
     assert interruption.difference(finished_area, area).position_m < 0.01
 
 
-@pytest.mark.parametrize("step", ["frames", "matching"])
+@pytest.mark.parametrize("step", [pytest.param("frames", marks=pytest.mark.slow), "matching"])
 def test_a_kill_outside_mapping_changes_no_pose(
     start: Start, area: Path, finished_area: Path, step: str
 ) -> None:
@@ -122,6 +122,7 @@ def member(run: Any, command: str) -> int:
     raise AssertionError(f"no process {command}")
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced_within_the_run(
     start: Start, area: Path, finished_area: Path
 ) -> None:
@@ -132,6 +133,7 @@ def test_a_killed_worker_is_replaced_within_the_run(
     assert interruption.difference(finished_area, area).largest_as_is_m < 1e-9
 
 
+@pytest.mark.slow
 def test_a_killed_mapper_is_told_in_one_line_and_the_next_run_finishes(
     start: Start, area: Path, finished_area: Path
 ) -> None:
