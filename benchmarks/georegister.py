@@ -6,7 +6,7 @@
 Without an area, the model of each draw is the simulator's exact poses with 1 cm and 0.03 degrees of noise,
 its rotations as a whole 0.02 degrees off, in another gauge. With one, its reconstruction is taken, FLIGHTS
 being what `spn-data simulate` wrote; the draws replace its telemetry. The oracle is the plain least-squares
-similarity of the true centres to the same fixes without bursts. Errors are against the truth, nothing aligned.
+similarity of the true centres to the same fixes without bursts. Errors are against the truth, unaligned.
 """
 
 from __future__ import annotations

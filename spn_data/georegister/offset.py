@@ -28,7 +28,7 @@ _NO_OFFSET_M = 1e-4  # a flight alone has no vertical offset to another
 _WEAK_PRECISION = 1e-4  # of the time offset: keeps the equations solvable where nothing tells it
 # Two offsets whose costs differ by less than this are both possible (nine is three sigma).
 _AMBIGUOUS_COST = 9.0
-_LARGE_SIGMAS = 5.0
+_LARGE_SIGMAS = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class OffsetOptions:
 
     max_offset_s: float = 5.0
     max_sigma_s: float = 0.1  # an offset known worse than this is called undetermined,
-    large_sigma_s: float = 0.3  # or than this where it is five sigma from zero: better than none
+    large_sigma_s: float = 0.3  # or than this where it is eight sigma from zero: better than none
     step_s: float = 0.1  # of the first search
 
 
@@ -241,7 +241,8 @@ class _Flight:
         Not by the telemetry's own: its noise would pass for motion.
         """
         n = len(self.time_s)
-        after, before = np.minimum(np.arange(n) + 1, n - 1), np.maximum(np.arange(n) - 1, 0)
+        # Two frames to each side: noise of the model, too, passes for motion, the less the wider the step.
+        after, before = np.minimum(np.arange(n) + 2, n - 1), np.maximum(np.arange(n) - 2, 0)
         moved = []
         for index in (after, before):
             shifted = replace(

@@ -135,7 +135,7 @@ class Problem:
     def conservative(self, levels: Levels) -> Levels:
         """Levels for deciding what the data determine: fixes may agree by luck or by filtering."""
         floor_bias = np.array([0.5, 0.5, 0.2, 0.2, 0.0, 0.0, 0.0])
-        floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.05, 0.0, 0.2])
+        floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.2, 0.0, 0.2])
         return levels.at_least(floor_bias, floor_white)
 
     def start(self, world_from_model: Similarity, inlier: np.ndarray) -> State:
