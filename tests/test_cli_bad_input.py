@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 import shutil
 import subprocess
@@ -257,3 +258,21 @@ def test_frames_that_cannot_be_written_are_one_line(flight1: Path, tmp_path: Pat
     assert "Traceback" not in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert "File too large" in result.stderr
+
+
+def test_garbage_lines_are_passed_over_and_no_fix_at_all_leaves_the_model_without_metres(
+    copy_of_flight: Path, tmp_path: Path
+) -> None:
+    srt = copy_of_flight / "flight1.SRT"
+    records = srt.read_text().split("\n\n")
+    records[3] = "4\ngarbage here"
+    records[5] = "zzz"
+    text = re.sub(r"(latitude|longitude): [-\d.]+", r"\1: 0.000000", "\n\n".join(records))
+    srt.write_text(text)
+    result = run("reconstruct", copy_of_flight, "--area", tmp_path / "area", *FAST)
+    assert result.exit_code == 0, result.output
+    told = " ".join(result.stdout.split())
+    assert "records left out: 1, the first at line 19" in told
+    assert "0 of 16 records with a fix" in told
+    assert "in units of the model: lengths there are no metres" in told
+    assert not Area(tmp_path / "area").has("3-geo")
