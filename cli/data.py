@@ -32,7 +32,7 @@ def main(verbose: bool) -> None:
     "--spacing",
     "motion_share",
     type=options.Finite(0.005, 1),
-    default=0.08,
+    default=0.1,
     show_default=True,
     help="Motion of the image between chosen frames, as a share of its width.",
 )

@@ -15,12 +15,14 @@ import numpy as np
 from spn_data.area import FRAMES, MODEL, Area, StageRecord, StageWork, read_json
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json
+from spn_data.colmap.model import read_observations
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
+from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.timing import Progress, Stopwatch
 
 DATABASE = "database.db"
@@ -49,10 +51,11 @@ def build_model(
     stopwatch = Stopwatch()
     result = reconstruct(frames_to_map(area, chosen), work.path, options, progress, stopwatch)
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
+    shutters = _shutters(result.model, chosen, stopwatch)
     write_registration(work.path / REGISTRATION, result.registrations)
     _name_results(work.path, result)
     return work.finish(
-        counts=_counts(result, chosen),
+        counts=_counts(result, chosen, shutters),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=(*notes, *result.attempts, *passages),
@@ -117,6 +120,17 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
+def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[ShutterDiagnosis, ...]:
+    """Rolling shutter and stabilisation of each video; photos are taken too far apart to tell."""
+    with stopwatch.step("shutter"):
+        scene, observations = read_observations(model)
+        row = {name: k for k, name in enumerate(chosen.names.tolist())}
+        rows = np.array([row[name] for name in scene.names], dtype=np.int64)
+        if not (chosen.video_frame[rows] >= 0).any():
+            return ()
+        return diagnose_shutter(scene, observations, chosen.sequences[rows], chosen.time_s[rows])
+
+
 def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -137,7 +151,9 @@ def _name_results(work: Path, result: ReconstructResult) -> None:
         path.rename(work / path.name)
 
 
-def _counts(result: ReconstructResult, chosen: Frames) -> dict[str, object]:
+def _counts(
+    result: ReconstructResult, chosen: Frames, shutters: tuple[ShutterDiagnosis, ...]
+) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
     scene = result.scene
@@ -154,6 +170,7 @@ def _counts(result: ReconstructResult, chosen: Frames) -> dict[str, object]:
     }
     return {
         "cameras": cameras,
+        "shutter": [s.counts() for s in shutters],
         "frames": len(result.registrations),
         "registered": len(registered),
         "submodels": list(result.submodels),
