@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from typing import Any
 from spn_data.errors import StageError
 
 Event = dict[str, Any]
+_FULL_BYTES = 1_000_000
 STOP_WAIT_S = 5  # what a child gets to end by itself
 
 
@@ -56,6 +58,8 @@ def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event],
             child.stdout.close()
     if code != 0:
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        if shutil.disk_usage(log.parent).free < _FULL_BYTES:
+            how += " on a full disk"
         raise StageError(
             f"{module.rpartition('.')[2]} {how}. What was done before is kept: the same command goes on. "
             f"{log} ends in: {_last_line(log)}"

@@ -195,7 +195,9 @@ def _map(
         log=work / "mapping.log",
         progress=lambda registered: progress("mapping", min(registered, n), n),
     )
-    done.write_text(json.dumps([model.name for model in models]))
+    listed = done.with_suffix(".part")
+    listed.write_text(json.dumps([model.name for model in models]))
+    listed.replace(done)
     return models
 
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -165,6 +166,23 @@ def test_a_kill_while_scratch_files_are_removed_loses_nothing(
     assert not (area / MODEL / "mapping-first").exists()
     assert not (area / MODEL / "started.json").exists()
     assert interruption.difference(finished_area, area).largest_as_is_m < 1e-9
+
+
+def test_a_model_that_a_full_disk_cut_short_is_an_error(
+    finished_area: Path, tmp_path: Path
+) -> None:
+    """COLMAP itself writes on without a word; a limit on the size of files stands for the disk."""
+    script = (
+        "import resource, sys; from pathlib import Path\n"
+        "from spn_data.colmap.model import write_transformed\n"
+        "from spn_data.pose import Similarity\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "write_transformed(Path(sys.argv[1]), Path(sys.argv[2]), Similarity.identity())\n"
+    )
+    command = [sys.executable, "-c", script, str(finished_area / MODEL), str(tmp_path / "out")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 1
+    assert "cannot be written whole; is the disk full?" in result.stderr
 
 
 @pytest.mark.slow

@@ -97,6 +97,7 @@ def main() -> None:
 
 def _map(job: MappingJob) -> None:
     from spn_data.colmap import pycolmap
+    from spn_data.colmap.model import write_native
 
     pycolmap.set_random_seed(job.seed)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.INFO.value
@@ -109,8 +110,7 @@ def _map(job: MappingJob) -> None:
     folders = []
     for rank, i in enumerate(sorted(models, key=lambda i: (-models[i].num_reg_images(), i))):
         folder = Path(job.output) / f"model-{rank}"
-        folder.mkdir(exist_ok=True)
-        models[i].write(str(folder))
+        write_native(models[i], folder)
         folders.append(str(folder))
     child.send({"models": folders})
 
@@ -160,7 +160,7 @@ def _refine(
     source: str, target: str, camera_model: str, refine_principal_point: bool, threads: int
 ) -> None:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.model import upgrade_camera
+    from spn_data.colmap.model import upgrade_camera, write_native
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
@@ -170,8 +170,7 @@ def _refine(
     before = model.compute_mean_reprojection_error()
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
-    Path(target).mkdir(parents=True, exist_ok=True)
-    model.write(target)
+    write_native(model, Path(target))
     child.send({"error_before_px": before, "error_px": model.compute_mean_reprojection_error()})
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
-from spn_data.errors import FormatError
+from spn_data.errors import FormatError, StageError
 from spn_data.pose import Poses, Similarity
 
 
@@ -150,8 +150,20 @@ def write_transformed(source: Path, target: Path, world_from_model: Similarity) 
             world_from_model.translation,
         )
     )
+    write_native(native, target)
+
+
+def write_native(native: pycolmap.Reconstruction, target: Path) -> None:
+    """Write a model and read it back: COLMAP does not notice a disk that is full. Raises StageError then."""
     target.mkdir(parents=True, exist_ok=True)
     native.write(str(target))
+    try:
+        found = load_native(target)
+        whole = found.num_points3D() == native.num_points3D()
+    except FormatError:
+        whole = False
+    if not whole:
+        raise StageError(f"{target}: cannot be written whole; is the disk full?")
 
 
 def from_native_camera(camera: pycolmap.Camera) -> Camera:
