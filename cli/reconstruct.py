@@ -9,6 +9,7 @@ from typing import Any
 from cli import options, show
 from spn_data.features import FeatureOptions
 from spn_data.pipeline.frames import FramesOptions
+from spn_data.pipeline.geo import GeoStageOptions
 from spn_data.pipeline.reconstruct import Options, reconstruct
 from spn_data.pipeline.reconstruct import add as extend
 from spn_data.reconstruct import ReconstructOptions
@@ -35,6 +36,7 @@ def run(
     **geo: Any,
 ) -> None:
     """Make or extend the area, telling each stage as it is done."""
+    given = options.geo_options(**geo)
     wanted = Options(
         frames=FramesOptions(
             selection=SelectionOptions(target_count=target_count, motion_share=motion_share),
@@ -49,7 +51,7 @@ def run(
             threads=threads or os.cpu_count() or 1,
             seed=seed,
         ),
-        geo=options.geo_options(**geo),
+        geo=None if given == GeoStageOptions() else given,
     )
     area = options.open_area(area_folder)
     with area.locked(), show.Live() as live:

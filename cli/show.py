@@ -40,7 +40,8 @@ class Live:
     def planned(self, found: Plan, model_cost: tuple[float, int]) -> None:
         rows = []
         for source in found.sources:
-            beside = ", ".join(path.name for path in source.telemetry) or "none beside it"
+            own = "in the photos" if source.kind == "photos" else "none beside it"
+            beside = ", ".join(path.name for path in source.telemetry) or own
             what = (
                 f"{len(source.parts)} photos" if source.kind == "photos" else _files(source.parts)
             )

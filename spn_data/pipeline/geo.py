@@ -10,11 +10,12 @@ import numpy as np
 
 from spn_data.area import FRAMES, GEO, MODEL, Area, StageRecord, StageWork, write_json
 from spn_data.colmap.model import Scene, read_scene, write_transformed
-from spn_data.errors import GeometryError
+from spn_data.errors import FormatError, GeometryError
 from spn_data.frames import Frames, read_frames
+from spn_data.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.observe import align_telemetry
 from spn_data.georegister.offset import TimeOffset, estimate_time_offset
-from spn_data.georegister.options import GeoregisterOptions
+from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.georegister.register import georegister as fit
 from spn_data.georegister.result import GeoFit
 from spn_data.telemetry.table import read_track
@@ -29,6 +30,27 @@ class GeoStageOptions:
     fit: GeoregisterOptions = field(default_factory=GeoregisterOptions)
     # Added to the telemetry's times, by sequence ("*" for all); a sequence not named here is estimated.
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
+
+
+def recorded_options(record: StageRecord) -> GeoStageOptions:
+    """The options that a georegistration was made with. Raises FormatError where they cannot be read."""
+    try:
+        fit = dict(record.options["fit"])
+        sigma, reference, origin = fit["gnss_sigma_m"], fit["height_reference"], fit["origin"]
+        if origin is not None:
+            place = HeightReference(origin["height_reference"])
+            origin = GeoOrigin(**{**origin, "height_reference": place})
+        fit |= {
+            "gnss_sigma_m": None if sigma is None else tuple(sigma),
+            "heights": Heights(fit["heights"]),
+            "height_reference": None if reference is None else HeightReference(reference),
+            "origin": origin,
+        }
+        return GeoStageOptions(
+            fit=GeoregisterOptions(**fit), time_offset_s=dict(record.options["time_offset_s"])
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{record.stage}: its options cannot be read ({error!r})") from error
 
 
 def has_fixes(area: Area) -> bool:

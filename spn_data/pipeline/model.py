@@ -49,7 +49,8 @@ def build_model(
     frames = read_frames(area.folder(FRAMES) / "frames.csv")
     chosen = frames.select(frames.chosen)
     stopwatch = Stopwatch()
-    result = reconstruct(frames_to_map(area, chosen), work.path, options, progress, stopwatch)
+    to_map = frames_to_map(area, chosen)
+    result = reconstruct(to_map, work.path, options, progress, stopwatch)
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result.model, chosen, stopwatch)
     write_registration(work.path / REGISTRATION, result.registrations)
@@ -118,6 +119,29 @@ def rough_positions(frames: Frames) -> np.ndarray:
         origin = GeoOrigin(float(middle[0]), float(middle[1]), 0.0)
         positions[known] = origin.enu_from_wgs84(np.column_stack([lat_lon, height]))
     return positions
+
+
+_FOCAL_SURPRISE = 0.1  # relative change of a focal length that was known
+
+
+def _focal_remarks(result: ReconstructResult, frames: FramesToMap) -> list[str]:
+    """A word where a focal length came out far from what it was said to be."""
+    remarks = []
+    key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
+    scene = result.scene
+    for key, i in {
+        key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)
+    }.items():
+        start, known = frames.start_cameras[key]
+        found_px, said_px = scene.cameras[i].focal_px[0], start.focal_px[0]
+        if known and abs(found_px / said_px - 1) > _FOCAL_SURPRISE:
+            remarks.append(
+                f"camera {key}: the focal length came out at {found_px:.0f} px, "
+                f"{found_px / said_px - 1:+.0%} from the {said_px:.0f} px that were given. A flight at one "
+                "height that looks one way hardly determines it, and heights are off by as much; or the "
+                "video is cropped. --camera settles it"
+            )
+    return remarks
 
 
 def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[ShutterDiagnosis, ...]:

@@ -10,7 +10,12 @@ from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, Facts, StageRecord, 
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegister.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
-from spn_data.pipeline.geo import GeoStageOptions, georegister, has_fixes
+from spn_data.pipeline.geo import (
+    GeoStageOptions,
+    georegister,
+    has_fixes,
+    recorded_options,
+)
 from spn_data.pipeline.model import build_model
 from spn_data.reconstruct import ReconstructOptions, estimate_model_cost
 from spn_data.telemetry.track import TelemetrySummary
@@ -22,7 +27,9 @@ class Options:
 
     frames: FramesOptions = field(default_factory=FramesOptions)
     model: ReconstructOptions = field(default_factory=ReconstructOptions)
-    geo: GeoStageOptions = field(default_factory=GeoStageOptions)
+    geo: GeoStageOptions | None = (
+        None  # None: as the area was georegistered before, else the defaults
+    )
 
 
 class Watcher(Protocol):
@@ -63,10 +70,11 @@ def add(
     for stage in (FRAMES, MODEL):
         if not area.has(stage):
             raise StageError(f"{area.folder(stage)} is missing: nothing to add to; leave out --add")
+    geo = _geo_options(area, options)
     if area.has(GEO):
         origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
-        fit = replace(options.geo.fit, origin=origin)
-        options = replace(options, geo=replace(options.geo, fit=fit))
+        geo = replace(geo, fit=replace(geo.fit, origin=origin))
+    options = replace(options, geo=geo)
     found = plan(inputs, options.frames, extended=area)
     if overwrite:
         area.drop_next()
@@ -108,12 +116,19 @@ def _stages(
     if not has_fixes(area):
         return
     try:
-        geo = georegister(area, options.geo, watcher.progress, overwrite=overwrite)
+        geo_options = _geo_options(area, options)
+        geo = georegister(area, geo_options, watcher.progress, overwrite=overwrite)
     except GeometryError as error:
         raise StageError(
             f"{area.folder(MODEL)} is complete, but its place in the world is refused: {error}"
         ) from error
     tell(geo, before.get(GEO))
+
+
+def _geo_options(area: Area, options: Options) -> GeoStageOptions:
+    if options.geo is not None:
+        return options.geo
+    return recorded_options(area.record(GEO)) if area.has(GEO) else GeoStageOptions()
 
 
 def _model_cost(found: Plan, options: ReconstructOptions) -> tuple[float, int]:
