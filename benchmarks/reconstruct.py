@@ -29,11 +29,12 @@ from rich.console import Console
 from rich.table import Table
 from truth import error_figures, true_of_scene
 
-from spn_data.area import FRAMES, Area, versions
+from spn_data.area import FRAMES, Area
 from spn_data.colmap.model import Scene, load_native, scene_of
 from spn_data.errors import GeometryError, SpnError, StageError
 from spn_data.frames import Frames, read_frames
 from spn_data.pose import Poses, Similarity, pose_errors
+from spn_data.record import versions
 
 VERSION = 1  # of the JSON
 STAGES = ("features", "pairs", "matching", "mapping", "refinement")

@@ -20,7 +20,10 @@ from rich.table import Table
 from spn_data.area import FRAMES, GEO, MODEL, Area
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.frames import Frames, read_frames
+from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.georegister.result import GeoFit
 from spn_data.pose import Poses, Similarity, pose_errors
+from spn_data.record import read_json
 from spn_data.simulate.truth import read_truth
 
 
@@ -33,6 +36,14 @@ def true_poses(frames: Frames, truth_folder: Path) -> Poses:
     return Poses(
         np.concatenate([p.centers for p in poses]), np.concatenate([p.quats_wxyz for p in poses])
     )
+
+
+def at_origin(true: Poses, true_origin: GeoOrigin, origin: GeoOrigin) -> Poses:
+    """True poses about another origin. Heights above take-off are the simulator's up coordinates."""
+    lat_lon_alt = true_origin.wgs84_from_enu(true.centers)
+    if origin.height_reference == HeightReference.TAKEOFF:
+        lat_lon_alt[:, 2] = true.centers[:, 2]
+    return Poses(origin.enu_from_wgs84(lat_lon_alt), true.quats_wxyz)
 
 
 def compare(area: Area, flights: Path) -> dict[str, Any]:
@@ -49,9 +60,11 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
     }
     if area.has(GEO):
         geo = read_scene(area.folder(GEO))
-        true_from_geo = Similarity.fit(geo.poses.centers, true.centers)
+        origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
+        there = at_origin(true, read_truth(flights / "truth", chosen.sequences[0]).origin, origin)
+        true_from_geo = Similarity.fit(geo.poses.centers, there.centers)
+        figures["georegistered"] = error_figures(geo.poses, there)
         up = true_from_geo.rotation[2, 2]
-        figures["georegistered"] = error_figures(geo.poses, true)
         figures["tilt_deg"] = float(np.rad2deg(np.arccos(np.clip(up, -1, 1))))
         figures["scale_error"] = 1 / true_from_geo.scale - 1
     return figures

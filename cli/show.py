@@ -7,9 +7,10 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from cli import console
-from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, StageRecord
+from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area
 from spn_data.errors import StageError
 from spn_data.pipeline.frames import Plan
+from spn_data.record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
 

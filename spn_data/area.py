@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
-import os
-import platform
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
 from spn_data.errors import FormatError, StageError
+from spn_data.record import (
+    VERSION,
+    StageRecord,
+    check_version,
+    difference,
+    read_record,
+    versions,
+    write_atomically,
+    write_json,
+)
 
-VERSION = 1  # of the area's layout and of stage.json
 FRAMES, MODEL, GEO = "1-frames", "2-model", "3-geo"
 STAGES = (FRAMES, MODEL, GEO)
 UPSTREAM: dict[str, tuple[str, ...]] = {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL)}
@@ -49,38 +54,6 @@ class Facts:
     """
 
     sources: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageRecord:
-    """What a stage was made of, with what, and what it cost; stage.json.
-
-    options : of the stage; inputs : content fingerprint by file name; upstream : fingerprint of each
-    stage it was made from; counts : what it holds; seconds, cpu_seconds : by step, child processes
-    included; notes : what the user should know.
-    """
-
-    stage: str
-    options: dict[str, Any]
-    inputs: dict[str, str]
-    upstream: dict[str, str]
-    counts: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    cpu_seconds: dict[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    versions: dict[str, str] = field(default_factory=dict)
-    finished: str = ""
-
-    @property
-    def made_of(self) -> dict[str, Any]:
-        """What decides whether a stage would come out the same."""
-        made_of = {"options": self.options, "inputs": self.inputs, "upstream": self.upstream}
-        return dict(json.loads(json.dumps(made_of)))
-
-    def fingerprint(self) -> str:
-        """Changes whenever the stage is made anew from something else."""
-        content = json.dumps({"of": self.made_of, "counts": self.counts}, sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 class StageWork:
@@ -149,7 +122,7 @@ class Area:
         path = self.folder(stage) / _RECORD
         if not path.exists():
             raise StageError(f"{self.folder(stage)} is missing; run spn-data reconstruct first")
-        return _read_record(path)
+        return read_record(path)
 
     def stale_because(self, stage: str) -> str | None:
         """Why a stage no longer fits what it was made from, or None."""
@@ -193,7 +166,7 @@ class Area:
             if found.made_of == record.made_of:
                 return found
             if not overwrite:
-                change = _difference(found, record)
+                change = difference(found, record)
                 raise StageError(
                     f"{self.folder(stage)} stands already and {change}; "
                     "--overwrite makes it anew, another --area leaves it"
@@ -202,11 +175,11 @@ class Area:
         started = path / _STARTED
         resumed = started.exists()
         if resumed:
-            found = _read_record(started)
+            found = read_record(started)
             if found.made_of != record.made_of:
                 if not overwrite and _holds_work(path):
                     raise StageError(
-                        f"{path} holds unfinished work and {_difference(found, record)}; "
+                        f"{path} holds unfinished work and {difference(found, record)}; "
                         "give the same options to go on, or --overwrite to start anew"
                     )
                 shutil.rmtree(path)
@@ -272,7 +245,7 @@ class Area:
         if facts == self.facts and (self.root / _FACTS).exists():
             return
         text = tomli_w.dumps({"version": VERSION, "sources": list(facts.sources)})
-        _write_atomically(self.root / _FACTS, text)
+        write_atomically(self.root / _FACTS, text)
         self.facts = facts
 
     def _read_facts(self) -> Facts:
@@ -281,7 +254,7 @@ class Area:
             return Facts()
         try:
             table = tomllib.loads(path.read_text())
-            _check_version(path, table["version"])
+            check_version(path, table["version"])
             return Facts(sources=tuple(str(s) for s in table["sources"]))
         except (tomllib.TOMLDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
             raise FormatError(f"{path}: not an area file of this program ({error!r})") from error
@@ -318,98 +291,6 @@ class Area:
         shutil.rmtree(following)
 
 
-def content_fingerprint(path: Path) -> str:
-    """Of a file's size and of its first, middle and last megabyte: quick also for hours of video."""
-    size = path.stat().st_size
-    digest = hashlib.sha256(str(size).encode())
-    with path.open("rb") as handle:
-        for start in (0, max(0, size // 2 - 2**19), max(0, size - 2**20)):
-            handle.seek(start)
-            digest.update(handle.read(2**20))
-    return digest.hexdigest()[:16]
-
-
-def write_json(path: Path, value: Any) -> None:
-    _write_atomically(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
-
-
-def read_json(path: Path) -> Any:
-    """Raises FormatError where the file is missing, damaged, or of a newer version."""
-    try:
-        value = json.loads(path.read_text())
-        _check_version(path, value["version"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: cannot be read ({error!r})") from error
-    return value
-
-
-def versions() -> dict[str, str]:
-    """Of what computed something."""
-    found = {"python": platform.python_version()}
-    for package in ("squeezeposenet-toolkit", "pycolmap", "opencv-python-headless", "numpy", "av"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
-
-
-def _read_record(path: Path) -> StageRecord:
-    table = read_json(path)
-    del table["version"]
-    try:
-        return StageRecord(**{**table, "notes": tuple(table["notes"])})
-    except (TypeError, KeyError) as error:
-        raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
-
-
-def _check_version(path: Path, found: int) -> None:
-    if found > VERSION:
-        raise FormatError(
-            f"{path}: made by a newer version of this program (format {found}, this reads {VERSION}); "
-            "update the program"
-        )
-
-
-def _difference(found: StageRecord, wanted: StageRecord) -> str:
-    """In words, what two records are made of that differs."""
-    for name, before, now in _changed_options(found.options, wanted.options):
-        return f"was made with {name} = {before!r}, now {now!r}"
-    new = sorted(set(wanted.inputs) - set(found.inputs))
-    gone = sorted(set(found.inputs) - set(wanted.inputs))
-    changed = sorted(
-        k for k in set(wanted.inputs) & set(found.inputs) if wanted.inputs[k] != found.inputs[k]
-    )
-    for what, names in (
-        ("does not hold", new),
-        ("holds the missing", gone),
-        ("saw another", changed),
-    ):
-        if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            return f"{what} {names[0]}{more}"
-    return "was made from an earlier " + " and ".join(
-        name for name in wanted.upstream if wanted.upstream[name] != found.upstream.get(name)
-    )
-
-
-def _holds_work(path: Path) -> bool:
-    """Whether an unfinished stage has made any file yet."""
-    return any(p.is_file() and p.name != _STARTED for p in path.rglob("*"))
-
-
-def _changed_options(
-    found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    """(name, value before, value now) of each option that differs, those in groups as `group.name`."""
-    for name in dict.fromkeys((*wanted, *found)):
-        before, now = found.get(name), wanted.get(name)
-        if isinstance(before, Mapping) and isinstance(now, Mapping):
-            yield from _changed_options(before, now, f"{prefix}{name}.")
-        elif before != now:
-            yield prefix + name, before, now
-
-
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -417,13 +298,6 @@ def _make_folder(path: Path) -> None:
         raise StageError(f"{path} cannot be made: {error.strerror}") from error
 
 
-def _write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("w") as handle:
-            handle.write(text)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise StageError(f"{path} cannot be written: {error.strerror}") from error
+def _holds_work(path: Path) -> bool:
+    """Whether an unfinished stage has made any file yet."""
+    return any(p.is_file() and p.name != _STARTED for p in path.rglob("*"))

@@ -50,7 +50,9 @@ class Camera:
         center = (width / 2, height / 2)
         model = {0: "SIMPLE_PINHOLE", 1: "SIMPLE_RADIAL", 2: "RADIAL", 4: "OPENCV"}[len(distortion)]
         focals = (f, f) if model == "OPENCV" else (f,)
-        return cls(model, width, height, np.array([*focals, *center, *distortion], dtype=np.float64))
+        return cls(
+            model, width, height, np.array([*focals, *center, *distortion], dtype=np.float64)
+        )
 
     def _get(self, name: str, default: float = 0.0) -> float:
         names = MODELS[self.model]

@@ -83,7 +83,9 @@ class GeoOrigin:
     def enu_from_wgs84(self, lat_lon_alt: np.ndarray) -> np.ndarray:
         """East, north, up (N, 3) in metres of (latitude deg, longitude deg, height m) (N, 3)."""
         origin, enu_from_ecef = self._ecef_and_axes()
-        return (ecef_from_wgs84(np.asarray(lat_lon_alt, dtype=np.float64)) - origin) @ enu_from_ecef.T
+        return (
+            ecef_from_wgs84(np.asarray(lat_lon_alt, dtype=np.float64)) - origin
+        ) @ enu_from_ecef.T
 
     def wgs84_from_enu(self, enu: np.ndarray) -> np.ndarray:
         """(latitude deg, longitude deg, height m) (N, 3) of east, north, up (N, 3) in metres."""

@@ -175,7 +175,9 @@ class Similarity:
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod
-    def fit(cls, source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
+    def fit(
+        cls, source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
+    ) -> Similarity:
         """Least-squares target_from_source over corresponding points (N, 3), N >= 3, weights (N,) >= 0.
 
         Raises GeometryError where the points lie on one line or coincide (nothing fixes the rotation).

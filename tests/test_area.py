@@ -7,18 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.area import (
-    FRAMES,
-    GEO,
-    MODEL,
-    VERSION,
-    Area,
-    Facts,
-    StageRecord,
-    StageWork,
-    content_fingerprint,
-)
+from spn_data.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.errors import FormatError, StageError
+from spn_data.record import VERSION, StageRecord, content_fingerprint
 
 
 def make(
@@ -57,7 +48,9 @@ def test_interrupted_work_made_of_the_same_goes_on(tmp_path: Path) -> None:
 
 def test_interrupted_work_of_other_options_is_not_thrown_away(tmp_path: Path) -> None:
     area = Area(tmp_path)
-    area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
+    begun = area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
+    assert isinstance(begun, StageWork)
+    (begun.path / "half").write_text("done")
     with pytest.raises(StageError, match=r"unfinished work and was made with n = 1, now 2"):
         area.begin(FRAMES, {"n": 2}, {}, overwrite=False)
     work = area.begin(FRAMES, {"n": 2}, {}, overwrite=True)

@@ -18,7 +18,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli.data import main
-from spn_data.area import FRAMES, MODEL, VERSION, Area
+from spn_data.area import FRAMES, MODEL, Area
+from spn_data.record import VERSION
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

@@ -13,9 +13,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli.data import main
-from spn_data.area import FRAMES, GEO, MODEL, Area, read_json
+from spn_data.area import FRAMES, GEO, MODEL, Area
 from spn_data.colmap.model import read_scene
 from spn_data.frames import read_frames
+from spn_data.record import read_json
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area import FRAMES, Area, StageRecord, content_fingerprint, read_json, write_json
+from spn_data.area import FRAMES, Area
 from spn_data.camera_file import camera_to_json, read_camera
 from spn_data.candidates import Candidates, analyse, frames_of
 from spn_data.errors import InputError
@@ -20,6 +20,7 @@ from spn_data.frames import Frames, read_frames, write_frames
 from spn_data.photos import load_mask
 from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.telemetry import check_telemetry, telemetry_of
+from spn_data.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
 from spn_data.sources import Source, SourceKind, discover
 from spn_data.telemetry.table import write_track

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, GEO, MODEL, Area, StageRecord, StageWork, write_json
+from spn_data.area import FRAMES, GEO, MODEL, Area, StageWork
 from spn_data.colmap.model import Scene, read_scene, write_transformed
 from spn_data.errors import FormatError, GeometryError
 from spn_data.frames import Frames, read_frames
@@ -18,6 +18,7 @@ from spn_data.georegister.offset import TimeOffset, estimate_time_offset
 from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.georegister.register import georegister as fit
 from spn_data.georegister.result import GeoFit
+from spn_data.record import StageRecord, write_json
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.timing import Progress, Stopwatch

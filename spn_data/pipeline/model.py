@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, MODEL, Area, StageRecord, StageWork, read_json
+from spn_data.area import FRAMES, MODEL, Area, StageWork
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json
 from spn_data.colmap.model import read_observations
@@ -22,6 +22,7 @@ from spn_data.errors import FormatError
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
+from spn_data.record import StageRecord, read_json
 from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.timing import Progress, Stopwatch
 
