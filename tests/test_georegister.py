@@ -225,6 +225,26 @@ def test_telemetry_of_another_flight_is_refused(standard):
         replace(standard, telemetry=shuffled).fit()
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_two_flights_with_each_other_s_telemetry_are_refused_for_it(seed):
+    """Of the same length, so that only the angles and positions tell."""
+    drawn = draw(replace(STANDARD, seed=seed))
+    first = np.array(drawn.sequence) == "flight1"
+    n = min(first.sum(), (~first).sum())
+    rows = np.arange(len(first))
+    rows[:n], rows[np.flatnonzero(~first)[:n]] = np.flatnonzero(~first)[:n], np.arange(n)
+    swapped = replace(drawn, telemetry=replace(drawn.telemetry.select(rows), time_s=drawn.time_s))
+    with pytest.raises(GeometryError, match="is this telemetry of another flight"):
+        swapped.fit()
+
+
+def test_a_gimbal_that_was_never_written_does_not_stop_the_fit(standard):
+    frozen = replace(standard.telemetry, gimbal_deg=np.zeros_like(standard.telemetry.gimbal_deg))
+    fit = replace(standard, telemetry=frozen).fit()
+    assert "gimbal" not in fit.observations
+    assert any("gimbal angles disagree" in note for note in fit.notes)
+
+
 def test_frames_without_telemetry_change_nothing(standard):
     """Rows of NaN take no part, and have no residual."""
     gone = np.zeros(len(standard.time_s), dtype=bool)
@@ -278,15 +298,15 @@ def test_fixes_left_out_in_blocks_fit_worse_than_those_used(standard_fit):
     assert standard_fit.held_out_flights.folds == 2
 
 
-def test_gimbal_angles_of_nonsense_are_dropped(standard, standard_fit):
-    """Angles that do not move with the camera are named and not used; the other flight's still are."""
+def test_gimbal_angles_that_move_otherwise_than_the_camera_are_refused_by_name(standard):
+    """Without the angles of both flights the fit goes on."""
     gimbal = standard.telemetry.gimbal_deg.copy()
     second = np.array(standard.sequence) == "flight2"
     gimbal[second, 1:] = np.random.default_rng(2).uniform(-60, 60, (second.sum(), 2))
-    fit = replace(standard, telemetry=replace(standard.telemetry, gimbal_deg=gimbal)).fit()
-    assert any("flight2: gimbal angles disagree" in note for note in fit.notes)
-    assert set(fit.gimbal_bias_deg) == {"flight1"}
-    assert standard.errors(fit).tilt_deg < 0.3
+    wrong = replace(standard, telemetry=replace(standard.telemetry, gimbal_deg=gimbal))
+    with pytest.raises(GeometryError, match="flight2: its gimbal angles move by"):
+        wrong.fit()
+    assert standard.errors(wrong.fit(GeoregisterOptions(use_gimbal=False))).tilt_deg < 2
 
 
 def test_the_zero_of_heights_is_what_was_said_of_it(standard, standard_fit):

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spn_data.errors import GeometryError
+
+
+# Gimbals hold their angles to a few tenths of a degree; another flight's are degrees off.
+_FOREIGN_DEG = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
@@ -40,6 +46,7 @@ def gravity_from_gimbal(
 
     cam_from_model (N, 3, 3); up_cam (N, 3), NaN unknown. A flight is used where at least two thirds of its
     frames lie within `agreement_deg` of its median direction, and this within it of the other flights'.
+    Raises GeometryError where a flight's angles move, but not as its cameras do: they are another flight's.
     """
     up_model = np.einsum("nji,nj->ni", cam_from_model, up_cam)
     known = np.isfinite(up_model).all(axis=1)
@@ -50,6 +57,7 @@ def gravity_from_gimbal(
         if not mine.any():
             continue
         angle = angles_deg(up_model[mine], robust_direction(up_model[mine]))
+        _require_own_telemetry(name, up_cam[mine], float(np.median(angle)))
         if np.mean(angle < agreement_deg) < 2 / 3:
             notes.append(
                 f"{name}: gimbal angles disagree with the model's own rotations "
@@ -71,6 +79,17 @@ def gravity_from_gimbal(
             )
             usable &= ~mine
     return Gravity(direction, usable, tuple(notes))
+
+
+def _require_own_telemetry(name: str, up_cam: np.ndarray, disagreement_deg: float) -> None:
+    """A gimbal that stands still may be one that was never written; one that moves must move rightly."""
+    moved_deg = float(np.median(angles_deg(up_cam, robust_direction(up_cam))))
+    if min(moved_deg, disagreement_deg) > _FOREIGN_DEG:
+        raise GeometryError(
+            f"{name}: its gimbal angles move by {moved_deg:.1f} deg, but not with its camera (median "
+            f"disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or its clock off "
+            "by seconds? Put the right file beside the video, give --time-offset, or --ignore-gimbal"
+        )
 
 
 def angles_deg(directions: np.ndarray, direction: np.ndarray) -> np.ndarray:
