@@ -194,10 +194,13 @@ def verdict(area: Area) -> None:
     sentence = f"{counts['registered']} of {counts['frames']} frames ({share:.1%}) have a pose"
     if area.has(GEO) and area.stale_because(GEO) is None:
         c = area.record(GEO).counts
-        sentence += (
-            f" in {area.folder(GEO)}; the whole model may lie {_m(_twice(c['sigma_horizontal_m']))} "
-            f"beside and {_m(_twice(c['sigma_vertical_m']))} above or below its true place (2 sigma)."
-        )
+        horizontal = _m(_twice(c["sigma_horizontal_m"]))
+        sentence += f" in {area.folder(GEO)}; the whole model may lie {horizontal} beside"
+        if c["height_reference"] == "unknown":
+            sentence += " its true place (2 sigma), and its heights count from an unknown zero."
+        else:
+            vertical = _m(_twice(c["sigma_vertical_m"]))
+            sentence += f" and {vertical} above or below its true place (2 sigma)."
     else:
         sentence += f" in {area.folder(MODEL)}, in units of the model: lengths there are no metres."
     console.out.print(sentence)

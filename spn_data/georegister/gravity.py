@@ -8,7 +8,6 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 
-
 # Gimbals hold their angles to a few tenths of a degree; another flight's are degrees off.
 _FOREIGN_DEG = 2.0
 
@@ -86,9 +85,9 @@ def _require_own_telemetry(name: str, up_cam: np.ndarray, disagreement_deg: floa
     moved_deg = float(np.median(angles_deg(up_cam, robust_direction(up_cam))))
     if min(moved_deg, disagreement_deg) > _FOREIGN_DEG:
         raise GeometryError(
-            f"{name}: its gimbal angles move by {moved_deg:.1f} deg, but not with its camera (median "
-            f"disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or its clock off "
-            "by seconds? Put the right file beside the video, give --time-offset, or --ignore-gimbal"
+            f"{name}: its gimbal angles move by {moved_deg:.1f} deg, but not with its camera "
+            f"(median disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or its "
+            "clock off by seconds? Put the right file beside the video, give --time-offset, or --ignore-gimbal"
         )
 
 

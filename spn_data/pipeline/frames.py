@@ -19,7 +19,7 @@ from spn_data.extraction import Cost, check_space, estimate_cost, extract_chosen
 from spn_data.frames import Frames, read_frames, write_frames
 from spn_data.photos import load_mask
 from spn_data.pipeline.cameras import start_cameras
-from spn_data.pipeline.telemetry import check_telemetry, telemetry_of
+from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks
 from spn_data.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
 from spn_data.sources import Source, SourceKind, discover
@@ -164,6 +164,7 @@ def choose_frames(
         check_usable(measured.measured, options.selection, source.parts[0].name)
         tell(source.sequence, None if track is None else summarize(track))
         notes += measured.notes
+        notes += [] if track is not None else unread_tracks(source)
         candidates.append(measured)
         tracks.append(track)
     _check_some_fit(candidates)

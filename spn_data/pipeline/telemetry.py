@@ -96,3 +96,15 @@ def _of_photos(source: Source, candidates: Candidates) -> Telemetry | None:
         moved = replace(log, time_s=log.utc_s - zero_s)
         return moved.select(np.isfinite(moved.time_s))
     return own if own is not None and np.isfinite(own.gimbal_deg).any() else None
+
+
+def unread_tracks(source: Source) -> list[str]:
+    """A sentence where a video without readable telemetry carries some of a kind that is not read."""
+    if source.kind is SourceKind.PHOTOS:
+        return []
+    names = sorted({name for part in source.parts for name in probe(part).data_streams})
+    return [
+        f"{source.sequence}: its data tracks ({', '.join(names)}) are not read: GoPro's GPMF and DJI's own "
+        "need to be converted to GPX or CSV first"
+        for _ in names[:1]
+    ]

@@ -1,0 +1,20 @@
+"""Which telemetry a source gets, and what is said where it gets none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spn_data.pipeline.telemetry import unread_tracks
+from spn_data.sources import discover
+
+
+def test_a_gopro_video_is_told_to_carry_a_track_that_is_not_read(shared_data: Path) -> None:
+    (source,) = discover(shared_data / "video" / "gopro-karma.mp4").sources
+    (note,) = unread_tracks(source)
+    assert note.startswith("gopro-karma: its data tracks (")
+    assert "GoPro MET" in note
+
+
+def test_nothing_is_said_of_a_video_without_data_tracks(flight1: Path) -> None:
+    (source,) = discover(flight1).sources
+    assert unread_tracks(source) == []
