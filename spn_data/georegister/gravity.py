@@ -86,8 +86,9 @@ def _require_own_telemetry(name: str, up_cam: np.ndarray, disagreement_deg: floa
     if min(moved_deg, disagreement_deg) > _FOREIGN_DEG:
         raise GeometryError(
             f"{name}: its gimbal angles move by {moved_deg:.1f} deg, but not with its camera "
-            f"(median disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or its "
-            "clock off by seconds? Put the right file beside the video, give --time-offset, or --ignore-gimbal"
+            f"(median disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or "
+            "its clock off by seconds? Put the right file beside the video, give --time-offset, or "
+            "--ignore-gimbal"
         )
 
 
