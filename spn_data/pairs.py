@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,7 +117,10 @@ def appearance_vocabulary(descriptors: list[np.ndarray], options: PairOptions) -
     words = min(options.words, len(sample))
     if words == 0:
         return np.zeros((0, 128), np.float32)
-    centers, _ = kmeans2(unit_descriptors(sample), words, iter=12, minit="points", rng=rng)
+    with warnings.catch_warnings():
+        # A word that no descriptor is nearest to only leaves its part of the description empty.
+        warnings.filterwarnings("ignore", "One of the clusters is empty")
+        centers, _ = kmeans2(unit_descriptors(sample), words, iter=12, minit="points", rng=rng)
     return np.asarray(centers, np.float32)
 
 

@@ -111,6 +111,7 @@ def reconstruct(
     best: tuple[int, Path, Attempt, tuple[int, ...]] | None = None
     story: list[str] = []
     for attempt in attempts(options):
+        told = progress if attempt.name == "first" else _named(progress, attempt.name)
         with MapDatabase.open(work / attempt.database) as database:
             images = [
                 DatabaseImage(name, str(key))
@@ -118,18 +119,20 @@ def reconstruct(
             ]
             database.add_images(images, frames.start_cameras)
             with stopwatch.step("features"):
-                extract_missing(database, frames, attempt.features, options.threads, progress)
+                extract_missing(database, frames, attempt.features, options.threads, told)
             with stopwatch.step("pairs"):
                 pairs = pairs_of(database, frames, attempt.pairs)
             with stopwatch.step("matching"):
-                match_missing(database, frames, pairs, options.matching, options.threads, progress)
+                match_missing(database, frames, pairs, options.matching, options.threads, told)
         with stopwatch.step("mapping"):
-            models = _map(work, attempt, frames, options, progress, start_from=None)
+            models = _map(work, attempt, frames, options, told, start_from=None)
         submodels = tuple(count_registered(model) for model in models)
         registered, model = (submodels[0], models[0]) if models else (0, None)
         story.append(_tell(attempt, submodels, len(frames.names)))
         if model is not None and 2 < registered < len(frames.names):
-            second = _second_chance(work, attempt, frames, model, options, progress, stopwatch)
+            second = _second_chance(
+                work, attempt, frames, model, options, _named(told, "again"), stopwatch
+            )
             gained = count_registered(second) - registered
             if gained > 0:
                 story.append(f"wider pairs for the missing frames registered {gained} more")
@@ -243,6 +246,11 @@ def _refine(work: Path, model: Path, options: ReconstructOptions, progress: Prog
     )
     progress("refinement", 1, 1)
     return target
+
+
+def _named(progress: Progress, name: str) -> Progress:
+    """Steps under a name of their own, so that a second round is not taken for the first."""
+    return lambda step, done, total: progress(f"{step} ({name})", done, total)
 
 
 def _tell(attempt: Attempt, submodels: tuple[int, ...], n: int) -> str:

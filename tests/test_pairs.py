@@ -64,3 +64,11 @@ def test_an_image_without_features_does_not_stop_the_others() -> None:
     none = np.zeros((0, 128), np.uint8)
     vocabulary = appearance_vocabulary([none, none], PairOptions())
     assert describe_appearance(none, vocabulary).shape == (0,)
+
+
+def test_few_distinct_features_make_a_vocabulary_without_a_warning() -> None:
+    few = np.random.default_rng(0).integers(0, 255, (3, 128)).astype(np.uint8)
+    vocabulary = appearance_vocabulary([np.repeat(few, 40, axis=0)], PairOptions())
+    appearance = describe_appearance(few, vocabulary)
+    assert np.isfinite(appearance).all()
+    assert np.linalg.norm(appearance) < 1.001
