@@ -43,21 +43,23 @@ class Attempt:
     database: str
     features: FeatureOptions
     pairs: PairOptions
+    hold_intrinsics: bool = False
 
 
 def attempts(options: ReconstructOptions) -> list[Attempt]:
-    """The options as they are, and then more features on wider pairs."""
+    """As the options are; with intrinsics that cannot drift; and with more features on wider pairs."""
+    features, pairs = options.features, options.pairs
     more = replace(
-        options.features,
-        max_features=options.features.max_features * 2,
-        contrast_threshold=options.features.contrast_threshold / 2,
+        features,
+        max_features=features.max_features * 2,
+        contrast_threshold=features.contrast_threshold / 2,
     )
-    return [
-        Attempt("first", "", "database.db", options.features, options.pairs),
-        Attempt(
-            "dense", "more features, wider pairs", "database-dense.db", more, options.pairs.wider()
-        ),
-    ]
+    ladder = [Attempt("first", "", "database.db", features, pairs)]
+    if options.engine == "incremental":
+        why = "intrinsics held until the end"
+        ladder.append(Attempt("steady", why, "database.db", features, pairs, hold_intrinsics=True))
+    why = "more features, wider pairs"
+    return [*ladder, Attempt("dense", why, "database-dense.db", more, pairs.wider())]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +193,7 @@ def _map(
         seed=options.seed,
         snapshot_every=max(3, n // 10),
         min_model_size=10 if n >= 30 else 3,
+        hold_intrinsics=attempt.hold_intrinsics,
         start_from="" if snapshot is None else str(snapshot),
     )
     models = run_mapping(

@@ -36,7 +36,10 @@ class SelectionOptions:
     min_sharpness: float = 1.0  # grey levels; a source whose best frames stay below it is unusable
     still_share: float = 0.005  # photos that moved less, at one place, are the same photo twice
     still_m: float = 0.5  # and lie nearer than this by their telemetry
-    target_count: int | None = None  # frames wanted of all videos; scales motion, time, distance
+    target_count: int | None = None  # of all sources; scales motion_share and max_spacing_s
+    min_count: int = (
+        30  # of a video, where no target is given: below it frames are chosen more densely
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +133,27 @@ def choose_all(
 ) -> list[Choice]:
     """`choose` for several videos (measurements, positions), near `target_count` frames in all where given.
 
-    Motion and the longest spacing are scaled together; the shortest spacing holds, so that a target may stay
-    out of reach.
+    Without a target, a video that gives fewer than `min_count` frames is chosen from more densely: a short
+    clip, or one far from what it shows, would else fall apart.
     """
-    if options.target_count is None:
-        return [choose(m, options, position_m=p) for m, p in sources]
+    if options.target_count is not None:
+        return _choose_near(sources, options, options.target_count)
+    choices = [choose(m, options, position_m=p) for m, p in sources]
+    return [
+        choice
+        if choice.chosen.sum() >= options.min_count
+        else _choose_near([source], options, options.min_count)[0]
+        for source, choice in zip(sources, choices, strict=True)
+    ]
+
+
+def _choose_near(
+    sources: list[tuple[Measurements, np.ndarray | None]], options: SelectionOptions, target: int
+) -> list[Choice]:
+    """Near `target` frames in all: motion and the longest spacing are scaled together.
+
+    The shortest spacing holds, so that a target may stay out of reach.
+    """
 
     def scaled(factor: float) -> list[Choice]:
         these = replace(
@@ -152,12 +171,12 @@ def choose_all(
         middle = float(np.sqrt(low * high))
         choices = scaled(middle)
         count = sum(int(c.chosen.sum()) for c in choices)
-        error = abs(count - options.target_count)
+        error = abs(count - target)
         if best is None or error < best[0]:
             best = (error, choices)
         if error == 0:
             break
-        low, high = (middle, high) if count > options.target_count else (low, middle)
+        low, high = (middle, high) if count > target else (low, middle)
     assert best is not None
     return best[1]
 

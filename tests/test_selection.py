@@ -215,6 +215,15 @@ def test_a_target_out_of_reach_keeps_the_shortest_spacing() -> None:
     assert choice.chosen.sum() == pytest.approx(600 / 3, abs=2)
 
 
+def test_a_video_with_little_motion_gives_enough_frames_and_leaves_the_other_as_it_is() -> None:
+    """A clip of a minute that moves by a fifth of its width, beside a flight that moves by twelve."""
+    still, moving = measured(np.full(600, 0.2 / 600)), measured(np.full(600, 0.02))
+    assert choose(still, DEFAULT).chosen.sum() < DEFAULT.min_count - 5
+    denser, same = choose_all([(still, None), (moving, None)], DEFAULT)
+    assert denser.chosen.sum() == pytest.approx(DEFAULT.min_count, abs=2)
+    assert np.array_equal(same.chosen, choose(moving, DEFAULT).chosen)
+
+
 def test_photos_are_all_chosen_but_repeats() -> None:
     """A photo twice from one place is skipped; the same view from elsewhere is not."""
     data = measured(np.array([0, 0.2, 0.001, 0.2, 0.001]))

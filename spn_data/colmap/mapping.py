@@ -27,6 +27,7 @@ class MappingJob:
     seed: int = 0
     snapshot_every: int = 20  # registered images
     min_model_size: int = 10  # images, below which a sub-model is dropped
+    hold_intrinsics: bool = False  # leave their refinement to the last bundle adjustment
     start_from: str = ""  # folder of a model to go on from
 
 
@@ -125,6 +126,13 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
         snapshot_frames_freq=job.snapshot_every,
     )
     options.min_model_size = job.min_model_size
+    # 127 degrees wide: shorter focal lengths only fit the noise of a weak geometry.
+    for part in (options, options.mapper, options.triangulation):
+        part.min_focal_length_ratio = 0.25
+    if job.hold_intrinsics:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = False
+        options.mapper.abs_pose_refine_extra_params = False
     # A last bundle adjustment follows in `refine`: those on the way need not be many, nor converge.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.35
     options.ba_global_max_refinements = 2
