@@ -1,0 +1,45 @@
+"""The whole way on real drone data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from cli.data import main
+from spn_data.area import GEO, MODEL, Area
+
+
+def reconstruct(source: Path, area: Path) -> Area:
+    result = CliRunner().invoke(main, ["reconstruct", str(source), "--area", str(area)])
+    assert result.exit_code == 0, result.output
+    return Area(area)
+
+
+@pytest.mark.slow
+def test_photos_of_a_beach_become_one_georeferenced_model(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """18 photos 40 m above the ground, with gimbal angles; weak texture makes the retries work."""
+    area = reconstruct(shared_data / "photos-dji-xmp", tmp_path / "area")
+    model, geo = area.record(MODEL).counts, area.record(GEO).counts
+    assert model["registered"] == model["frames"] == 18
+    assert 0.1 < model["mean_error_px"] < 0.6
+    assert "gimbal" in geo["observations"]
+    assert 0.05 < geo["horizontal_rmse_m"] < 1.0
+    assert geo["outliers"] == 0
+
+
+@pytest.mark.slow
+def test_a_real_flight_video_without_readable_telemetry_becomes_one_model(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """13 s straight along a coast: so weak a geometry that free intrinsics drift off."""
+    area = reconstruct(shared_data / "video" / "gopro-karma.mp4", tmp_path / "area")
+    counts = area.record(MODEL).counts
+    assert counts["frames"] >= 25
+    assert counts["registered"] >= 0.95 * counts["frames"]
+    (camera,) = counts["cameras"].values()
+    assert 40 < camera["fov_deg"] < 127
+    assert not area.has(GEO)
