@@ -199,3 +199,20 @@ def test_status_shows_what_is_complete_unfinished_missing_and_stale(area: Path) 
     stale = run("status", "--area", area)
     assert stale.exit_code == 0
     assert stale.stdout.count("stale: 1-frames") == 2
+
+
+def test_a_focal_length_far_from_what_was_given_is_told(flight1: Path, tmp_path: Path) -> None:
+    """A lens of 72 degrees given as one of 60: the model finds 72, and says that it is another."""
+    options = ("--max-features", "800", "--threads", "1", "--fov", "60")
+    result = run("reconstruct", flight1, "--area", tmp_path / "area", *options)
+    assert result.exit_code == 0, result.output
+    record = Area(tmp_path / "area").record(MODEL)
+    assert 66 < record.counts["cameras"]["flight1"]["fov_deg"] < 78
+    assert any(
+        note.startswith("camera flight1: the focal length came out") for note in record.notes
+    )
+
+
+def test_no_surprise_is_told_of_a_focal_length_that_was_given_rightly(finished_area: Path) -> None:
+    notes = Area(finished_area).record(MODEL).notes
+    assert not any("focal length" in note for note in notes)

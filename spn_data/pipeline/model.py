@@ -15,7 +15,7 @@ import numpy as np
 from spn_data.area import FRAMES, MODEL, Area, StageWork
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json
-from spn_data.colmap.model import read_observations
+from spn_data.colmap.model import Scene, read_observations
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
@@ -60,7 +60,13 @@ def build_model(
         counts=_counts(result, chosen, shutters),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
-        notes=(*notes, *result.attempts, *passages),
+        notes=(
+            *notes,
+            *result.attempts,
+            *passages,
+            *_focal_remarks(result.scene, to_map),
+            *(told for shutter in shutters if (told := shutter.tell())),
+        ),
     )
 
 
@@ -125,11 +131,10 @@ def rough_positions(frames: Frames) -> np.ndarray:
 _FOCAL_SURPRISE = 0.1  # relative change of a focal length that was known
 
 
-def _focal_remarks(result: ReconstructResult, frames: FramesToMap) -> list[str]:
+def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
     """A word where a focal length came out far from what it was said to be."""
     remarks = []
     key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
-    scene = result.scene
     for key, i in {
         key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)
     }.items():
