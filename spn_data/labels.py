@@ -1,0 +1,293 @@
+"""Labels: poses of frames relative to a frozen map, with what they rest on; poses.csv and observations."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, fields, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.errors import InputError
+from spn_data.frames import check_name
+from spn_data.pose import Poses, Similarity, canonical_quats
+from spn_data.record import write_atomically
+
+_MAX_CSV_BYTES = 2_000_000_000
+_UPPER = np.triu_indices(6)
+
+
+class LabelStatus(StrEnum):
+    """Whether a frame has a pose."""
+
+    REGISTERED = "registered"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """N frames of one kind, in the order of sequence and time; a frame without a pose holds NaN.
+
+    names : (N,) str, `<sequence>/<frame>.jpg`; unique. sequences, cameras : (N,) str, key of the lens.
+    sources : (N,) str, name of the file that the frame is from; video_frame : (N,) int, index among its
+    decoded frames, -1 for a photo; dense : (N,) bool, a frame that was not chosen: its pixels are read
+    from the video, those of the others from a stored image.
+    time_s : (N,) seconds since the sequence's first frame.
+    status : (N,) str, a LabelStatus; reason : (N,) str, why it failed, empty else.
+    poses : of the frames in the map's frame (East-North-Up metres once georegistered).
+    covariance : (N, 6, 6) relative to the map, over the centre (east, north, up; metres) and a rotation
+    vector in the camera frame (radians): R_true = exp(v) @ R.
+    inliers : (N,) int, map points that the pose agrees with; coverage : (N,) share of the image that they
+    cover; error_px : (N,) root mean square of their residuals.
+    """
+
+    names: np.ndarray
+    sequences: np.ndarray
+    cameras: np.ndarray
+    sources: np.ndarray
+    video_frame: np.ndarray
+    dense: np.ndarray
+    time_s: np.ndarray
+    status: np.ndarray
+    reason: np.ndarray
+    poses: Poses
+    covariance: np.ndarray
+    inliers: np.ndarray
+    coverage: np.ndarray
+    error_px: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        for column in fields(self):
+            if len(getattr(self, column.name)) != n:
+                raise ValueError(
+                    f"{column.name} has {len(getattr(self, column.name))} rows, not {n}"
+                )
+        if len(set(self.names.tolist())) != n:
+            raise ValueError("names of frames are not unique")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def registered(self) -> np.ndarray:
+        """(N,) bool: has a pose."""
+        return self.status == LabelStatus.REGISTERED
+
+    def select(self, index: np.ndarray) -> Labels:
+        """The rows of an index or mask (N,)."""
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @classmethod
+    def concatenate(cls, parts: list[Labels]) -> Labels:
+        """The rows of several, one after the other."""
+        if not parts:
+            raise ValueError("no labels to put together")
+        values: dict[str, Any] = {
+            f.name: np.concatenate([getattr(p, f.name) for p in parts])
+            for f in fields(cls)
+            if f.name != "poses"
+        }
+        centers = np.concatenate([p.poses.centers for p in parts])
+        quats = np.concatenate([p.poses.quats_wxyz for p in parts])
+        return cls(**values, poses=Poses(centers, quats))
+
+    def moved(self, b_from_a: Similarity) -> Labels:
+        """The same labels in another frame of the same map; covariances turn and scale with it."""
+        has = self.registered
+        centers = np.full((len(self), 3), np.nan)
+        quats = np.full((len(self), 4), np.nan)
+        there = b_from_a.apply_to_poses(self.poses[has])
+        centers[has], quats[has] = there.centers, there.quats_wxyz
+        jacobian = np.eye(6)  # rotation vectors in the camera frame stay as they are
+        jacobian[:3, :3] = b_from_a.scale * b_from_a.rotation
+        covariance = jacobian @ self.covariance @ jacobian.T
+        return replace(self, poses=Poses(centers, quats), covariance=covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Map points that N frames see, M observations in all, sorted by frame.
+
+    frame_idx : (M,) row of the frame in its Labels; point_ids : (M,) COLMAP's ids in the map;
+    pixels : (M, 2) where they are seen, COLMAP's pixel convention, in the frame's own (distorted) image.
+    """
+
+    frame_idx: np.ndarray
+    point_ids: np.ndarray
+    pixels: np.ndarray
+
+    def __post_init__(self) -> None:
+        if not len(self.frame_idx) == len(self.point_ids) == len(self.pixels):
+            raise ValueError("observations of points differ in length")
+        if np.any(np.diff(self.frame_idx) < 0):
+            raise ValueError("observations are not sorted by frame")
+
+    def of_frame(self, row: int) -> tuple[np.ndarray, np.ndarray]:
+        """(point_ids (K,), pixels (K, 2)) of one frame."""
+        first, last = np.searchsorted(self.frame_idx, [row, row + 1])
+        return self.point_ids[first:last], self.pixels[first:last]
+
+    def select(self, rows: np.ndarray) -> SeenPoints:
+        """Those of the frames at `rows`, numbered anew in that order."""
+        starts = np.searchsorted(self.frame_idx, rows)
+        ends = np.searchsorted(self.frame_idx, rows, side="right")
+        index = np.concatenate(
+            [np.arange(a, b) for a, b in zip(starts, ends, strict=True)] or [np.zeros(0, np.int64)]
+        ).astype(np.int64)
+        frame_idx = np.repeat(np.arange(len(rows)), ends - starts)
+        return SeenPoints(frame_idx, self.point_ids[index], self.pixels[index])
+
+
+_COVARIANCE_COLUMNS = [f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True)]
+_COLUMNS = [
+    *("name", "time_s", "status", "reason", "x", "y", "z", "qw", "qx", "qy", "qz", "inliers"),
+    *("coverage", "error_px", "camera", "source", "video_frame", "dense"),
+    *_COVARIANCE_COLUMNS,
+]
+
+
+def write_labels(path: Path, labels: Labels) -> None:
+    """As poses.csv (docs/formats.md); the file appears whole."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for k in range(len(labels)):
+        numbers = [*labels.poses.centers[k], *labels.poses.quats_wxyz[k]]
+        writer.writerow(
+            [
+                *(
+                    labels.names[k],
+                    repr(float(labels.time_s[k])),
+                    labels.status[k],
+                    labels.reason[k],
+                ),
+                *map(_cell, numbers),
+                int(labels.inliers[k]),
+                *map(_cell, (labels.coverage[k], labels.error_px[k])),
+                *(labels.cameras[k], labels.sources[k], int(labels.video_frame[k])),
+                int(labels.dense[k]),
+                *map(_cell, labels.covariance[k][_UPPER]),
+            ]
+        )
+    write_atomically(path, text.getvalue())
+
+
+def read_labels(path: Path) -> Labels:
+    """From poses.csv. Raises InputError with the line where it is not what `write_labels` writes."""
+    try:
+        if path.stat().st_size > _MAX_CSV_BYTES:
+            raise InputError(f"is larger than {_MAX_CSV_BYTES // 1_000_000} MB", path=path)
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file, strict=True)
+            if next(reader, None) != _COLUMNS:
+                raise InputError(
+                    f"the header is not that of poses.csv: {','.join(_COLUMNS)}", path=path, line=1
+                )
+            rows = [_parse(path, reader.line_num, cells) for cells in reader]
+    except OSError as error:
+        raise InputError(f"can't be read: {error.strerror}", path=path) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"is not a CSV file ({error})", path=path) from error
+    try:
+        return _labels_of(rows)
+    except ValueError as error:
+        raise InputError(str(error), path=path) from error
+
+
+def _parse(path: Path, line: int, cells: list[str]) -> dict[str, Any]:
+    try:
+        if len(cells) != len(_COLUMNS):
+            raise ValueError(f"{len(cells)} cells, expected {len(_COLUMNS)}")
+        row: dict[str, Any] = dict(zip(_COLUMNS, cells, strict=True))
+        check_name(row["name"])
+        if row["status"] not in set(LabelStatus):
+            raise ValueError(f"status {row['status']!r} is none of {', '.join(LabelStatus)}")
+        if "/" in row["source"] or "\\" in row["source"] or row["source"] in ("", ".", ".."):
+            raise ValueError(f"source {row['source']!r} is not the name of a file")
+        row["pose"] = [_number(row[c]) for c in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+        row["covariance"] = [_number(row[c]) for c in _COVARIANCE_COLUMNS]
+        if row["status"] == LabelStatus.REGISTERED:
+            if not np.isfinite(row["pose"]).all():
+                raise ValueError("a registered frame without a pose")
+            row["pose"][3:] = canonical_quats(np.array(row["pose"][3:])).tolist()
+        elif np.isfinite(row["pose"]).any():
+            raise ValueError("a failed frame with a pose")
+        for column in ("inliers", "video_frame", "dense"):
+            row[column] = int(row[column])
+        for column in ("time_s", "coverage", "error_px"):
+            row[column] = _number(row[column])
+    except ValueError as error:
+        raise InputError(str(error), path=path, line=line) from error
+    return row
+
+
+def _labels_of(rows: list[dict[str, Any]]) -> Labels:
+    def strings(column: str) -> np.ndarray:
+        return np.array([row[column] for row in rows], dtype=np.str_)
+
+    def numbers(column: str, dtype: Any) -> np.ndarray:
+        return np.array([row[column] for row in rows], dtype=dtype)
+
+    names = strings("name")
+    poses = numbers("pose", np.float64).reshape(-1, 7)
+    covariance = np.zeros((len(rows), 6, 6))
+    covariance[:, _UPPER[0], _UPPER[1]] = numbers("covariance", np.float64).reshape(-1, 21)
+    covariance[:, _UPPER[1], _UPPER[0]] = covariance[:, _UPPER[0], _UPPER[1]]
+    return Labels(
+        names=names,
+        sequences=np.array([name.split("/")[0] for name in names.tolist()], dtype=np.str_),
+        cameras=strings("camera"),
+        sources=strings("source"),
+        video_frame=numbers("video_frame", np.int64),
+        dense=numbers("dense", np.int64) != 0,
+        time_s=numbers("time_s", np.float64),
+        status=strings("status"),
+        reason=strings("reason"),
+        poses=Poses(poses[:, :3], poses[:, 3:]),
+        covariance=covariance,
+        inliers=numbers("inliers", np.int64),
+        coverage=numbers("coverage", np.float64),
+        error_px=numbers("error_px", np.float64),
+    )
+
+
+def _cell(value: float) -> str:
+    return "" if np.isnan(value) else repr(float(value))
+
+
+def _number(cell: str) -> float:
+    if cell == "":
+        return float("nan")
+    value = float(cell)
+    if not abs(value) <= 1e15:
+        raise ValueError(f"{cell!r} is not a finite number")
+    return value
+
+
+def write_seen_points(path: Path, seen: SeenPoints) -> None:
+    """As observations.npz: plain arrays, written whole."""
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            frame_idx=seen.frame_idx.astype(np.int64),
+            point_ids=seen.point_ids.astype(np.int64),
+            pixels=seen.pixels.astype(np.float64),
+        )
+    temporary.replace(path)
+
+
+def read_seen_points(path: Path) -> SeenPoints:
+    """Raises InputError where it is not what `write_seen_points` writes. No pickle is opened."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            seen = SeenPoints(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"is no file of observations ({error})", path=path) from error
+    if seen.pixels.shape != (len(seen.frame_idx), 2):
+        raise InputError("is no file of observations (shapes differ)", path=path)
+    return seen
