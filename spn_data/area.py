@@ -27,15 +27,16 @@ from spn_data.record import (
     write_json,
 )
 
-FRAMES, MODEL, GEO = "1-frames", "2-model", "3-geo"
-STAGES = (FRAMES, MODEL, GEO)
-UPSTREAM: dict[str, tuple[str, ...]] = {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL)}
+FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"
+STAGES = (FRAMES, MODEL, GEO)  # of the map; --add exchanges them together
+EVALUATION, DENSE = "4-eval", "4-dense"  # folders with one stage a sequence
+_GROUPS = (EVALUATION, DENSE)
 
 # What only unfinished work holds: it is removed once the stage's record stands.
 SCRATCH: dict[str, tuple[str, ...]] = {
     FRAMES: (".analysis",),
     MODEL: ("mapping-*", "database-*", "refined"),
-    GEO: (),
+    EVALUATION: (".analysis", "found.npz"),
 }
 
 _FACTS = "area.toml"
@@ -112,35 +113,66 @@ class Area:
         return self.folder(stage).is_dir()
 
     def _old(self, stage: str) -> Path:
-        return self.root / f".old-{stage}"
+        folder = self.folder(stage)
+        return folder.with_name(f".old-{folder.name}")
 
     def partial(self, stage: str) -> Path:
-        return self.root / f".{stage}.partial"
+        folder = self.folder(stage)
+        return folder.with_name(f".{folder.name}.partial")
+
+    def sequences(self, group: str) -> tuple[str, ...]:
+        """Names of the complete stages of a group (EVALUATION or DENSE), sorted."""
+        folder = self.root / group
+        found = folder.iterdir() if folder.is_dir() else iter(())
+        return tuple(sorted(p.name for p in found if p.is_dir() and not p.name.startswith(".")))
+
+    def stages(self) -> tuple[str, ...]:
+        """All stages that stand, in the order of work."""
+        after = [f"{group}/{name}" for group in _GROUPS for name in self.sequences(group)]
+        return tuple(stage for stage in (*STAGES, *after, SPLIT) if self.has(stage))
+
+    def upstream_names(self, stage: str) -> tuple[str, ...]:
+        """The stages that `stage` is made from, as the area is now."""
+        group, _, name = stage.partition("/")
+        if stage == SPLIT:
+            return tuple(s for s in self.stages() if s != SPLIT)
+        if group == DENSE:
+            evaluation = f"{EVALUATION}/{name}"
+            return (MODEL, evaluation) if self.has(evaluation) else (FRAMES, MODEL)
+        return {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL), EVALUATION: (MODEL,)}[group]
 
     def record(self, stage: str) -> StageRecord:
         """Raises StageError where the stage is missing, FormatError where a newer version made it."""
         path = self.folder(stage) / _RECORD
         if not path.exists():
-            raise StageError(f"{self.folder(stage)} is missing; run spn-data reconstruct first")
+            raise StageError(f"{self.folder(stage)} is missing; run {_command(stage)} first")
         return read_record(path)
 
     def stale_because(self, stage: str) -> str | None:
         """Why a stage no longer fits what it was made from, or None."""
         record = self.record(stage)
-        for name in UPSTREAM[stage]:
+        for name, fingerprint in record.upstream.items():
             if not self.has(name):
                 return f"{name} is missing"
-            if self.record(name).fingerprint() != record.upstream[name]:
+            if self.record(name).fingerprint() != fingerprint:
                 return f"{name} was made anew since"
-        return None
+        added = [name for name in self.upstream_names(stage) if name not in record.upstream]
+        return f"{added[0]} was added since" if added else None
 
     def upstream_of(self, stage: str) -> dict[str, str]:
         """Fingerprints of the stages that `stage` is made from. Raises StageError for a stale one."""
-        for name in UPSTREAM[stage]:
-            reason = self.stale_because(name)
-            if reason:
-                raise StageError(f"{self.folder(name)} is stale: {reason}; run reconstruct again")
-        return {name: self.record(name).fingerprint() for name in UPSTREAM[stage]}
+        names = self.upstream_names(stage)
+        for name in names:
+            self.check_fresh(name)
+        return {name: self.record(name).fingerprint() for name in names}
+
+    def check_fresh(self, stage: str) -> None:
+        """Raises StageError where a stage is missing or stale."""
+        reason = self.stale_because(stage)
+        if reason:
+            raise StageError(
+                f"{self.folder(stage)} is stale: {reason}; run {_command(stage)} again"
+            )
 
     def begin(
         self,
@@ -195,7 +227,7 @@ class Area:
 
     def put_in_place(self, stage: str, path: Path) -> None:
         """Rename a complete folder to the stage's name; a kill at any moment loses neither version."""
-        for pattern in SCRATCH[stage]:
+        for pattern in SCRATCH.get(stage.partition("/")[0], ()):
             for scratch in path.glob(pattern):
                 shutil.rmtree(scratch) if scratch.is_dir() else scratch.unlink()
         shutil.rmtree(self._old(stage), ignore_errors=True)
@@ -228,18 +260,26 @@ class Area:
     def _finish_exchange(self) -> None:
         """Complete the renames that a killed process left half-way; not those of one that still runs."""
         exchanging = (self.root / _NEXT / _READY).exists()
-        moved = [s for s in STAGES if self._old(s).exists() and not self.folder(s).exists()]
-        if not exchanging and not moved:
+        if not exchanging and not self._moved_away():
             return
         try:
             with self.locked():
-                for stage in STAGES:
-                    if self._old(stage).exists() and not self.folder(stage).exists():
-                        self._old(stage).rename(self.folder(stage))
+                for stage in self._moved_away():
+                    self._old(stage).rename(self.folder(stage))
                 if (self.root / _NEXT / _READY).exists():
                     self._take_next()
         except InUseError:
             return
+
+    def _moved_away(self) -> list[str]:
+        """Stages between the two renames of an exchange."""
+        names = [*STAGES, SPLIT]
+        for group in _GROUPS:
+            names += [
+                f"{group}/{old.name.removeprefix('.old-')}"
+                for old in (self.root / group).glob(".old-*")
+            ]
+        return [s for s in names if self._old(s).exists() and not self.folder(s).exists()]
 
     def write_facts(self, facts: Facts) -> None:
         if facts == self.facts and (self.root / _FACTS).exists():
@@ -289,6 +329,18 @@ class Area:
         if (following / _FACTS).exists():
             (following / _FACTS).replace(self.root / _FACTS)
         shutil.rmtree(following)
+
+
+def _command(stage: str) -> str:
+    """The command that makes a stage."""
+    group, _, name = stage.partition("/")
+    commands = {
+        GEO: "spn-data georegister",
+        EVALUATION: f"spn-data register VIDEO --name {name}",
+        DENSE: f"spn-data register --all-frames --name {name}",
+        SPLIT: "spn-data split",
+    }
+    return commands.get(group, "spn-data reconstruct")
 
 
 def _make_folder(path: Path) -> None:

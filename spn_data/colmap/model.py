@@ -13,6 +13,7 @@ import numpy as np
 from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.errors import FormatError, StageError
+from spn_data.map_points import MapPoints
 from spn_data.pose import Poses, Similarity
 
 
@@ -115,6 +116,20 @@ def read_observations(folder: Path) -> tuple[Scene, Observations]:
     """The scene with all its measurements."""
     native = load_native(folder)
     scene = scene_of(native)
+    return scene, observations_of(native, scene)
+
+
+def read_map(folder: Path) -> tuple[Scene, Observations, MapPoints]:
+    """The scene, its measurements, and its points with ids and colours, in the order of Scene.points."""
+    native = load_native(folder)
+    scene = scene_of(native)
+    ids = sorted(native.points3D)
+    colors = np.array([native.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
+    points = MapPoints(np.array(ids, np.int64), scene.points, colors, scene.track_lengths)
+    return scene, observations_of(native, scene), points
+
+
+def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observations:
     point_position = {point_id: k for k, point_id in enumerate(sorted(native.points3D))}
     image_idx, point_idx, pixels, residuals = [], [], [], []
     by_name = {image.name: image for image in _registered(native)}
@@ -132,7 +147,7 @@ def read_observations(folder: Path) -> tuple[Scene, Observations]:
         point_idx.append(index)
         pixels.append(measured)
         residuals.append(projected - measured)
-    return scene, Observations(
+    return Observations(
         np.concatenate(image_idx),
         np.concatenate(point_idx),
         np.concatenate(pixels),

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
 from spn_data.camera import Camera
+from spn_data.camera_file import camera_from_json
+from spn_data.colmap.model import Observations, Scene, read_map
+from spn_data.errors import FormatError
+from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
-from spn_data.labels import Labels, SeenPoints
+from spn_data.georegister.result import GeoFit
+from spn_data.labels import Labels, LabelStatus, SeenPoints, read_labels, read_seen_points
+from spn_data.map_points import MapPoints, covered_share
+from spn_data.pose import Poses, Similarity
+from spn_data.record import read_json
 
-
-@dataclass(frozen=True, eq=False)
-class MapPoints:
-    """The map's points: ids (P,) COLMAP's, ascending; xyz (P, 3) in the map's frame; colors (P, 3) uint8 RGB;
-    track_lengths (P,) mapping frames that see each.
-    """
-
-    ids: np.ndarray
-    xyz: np.ndarray
-    colors: np.ndarray
-    track_lengths: np.ndarray
-
-    def rows_of(self, point_ids: np.ndarray) -> np.ndarray:
-        """Rows (K,) of point ids (K,). Raises KeyError for an id that the map does not hold."""
-        rows = np.minimum(np.searchsorted(self.ids, point_ids), max(0, len(self.ids) - 1))
-        if len(point_ids) and not np.array_equal(self.ids[rows], point_ids):
-            raise KeyError("a point that the map does not hold")
-        return rows
+POSES, SEEN, CAMERA, REGISTRATION = (
+    "poses.csv",
+    "observations.npz",
+    "camera.json",
+    "registration.json",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class LabelledArea:
     units : "m" (East-North-Up about `origin`) or "model" (COLMAP's gauge; origin is None).
     mapping : chosen frames of the mapping flights; dense : their other frames; evaluation : by sequence,
     chosen and dense frames. Each with the map points that the frames see. cameras : by key, in pixels of
-    the full-size images. stale : reasons for which a part is left out or doubtful.
+    the full-size images.
     """
 
     units: str
@@ -50,3 +50,184 @@ class LabelledArea:
     dense_seen: SeenPoints
     evaluation: dict[str, Labels]
     evaluation_seen: dict[str, SeenPoints]
+
+
+def map_folder(area: Area) -> Path:
+    """Where the map's frame is: 3-geo, or 2-model where telemetry did not determine a place."""
+    return area.folder(GEO if area.has(GEO) else MODEL)
+
+
+def read_labelled_area(area: Area) -> LabelledArea:
+    """All labels, in metres where the area is georegistered.
+
+    Raises StageError for a stage that is missing or stale, FormatError or InputError for a damaged file.
+    """
+    area.upstream_of(GEO)  # frames and model stand and fit each other
+    for stage in area.stages():
+        if stage.partition("/")[0] in (GEO, EVALUATION, DENSE):
+            area.check_fresh(stage)
+    scene, observations, points = read_map(map_folder(area))
+    chosen = chosen_frames(area)
+    mapping, mapping_seen = _mapping_labels(area, scene, observations, points, chosen)
+    cameras = {
+        str(key): scene.cameras[int(scene.camera_ids[scene.names.index(name)])]
+        for key, name in _camera_samples(chosen, scene).items()
+    }
+    world_from_model = read_world_from_model(area)
+    evaluation, evaluation_seen = {}, {}
+    for name in area.sequences(EVALUATION):
+        stage = f"{EVALUATION}/{name}"
+        parts = [_read_stage(area, stage, world_from_model)]
+        if name in area.sequences(DENSE):
+            parts.append(_read_stage(area, f"{DENSE}/{name}", world_from_model))
+        evaluation[name], evaluation_seen[name] = _together(parts)
+        cameras[name] = _read_camera(area.folder(stage) / CAMERA)
+    dense = [
+        _read_stage(area, f"{DENSE}/{name}", world_from_model)
+        for name in area.sequences(DENSE)
+        if name not in evaluation
+    ]
+    nothing = (mapping.select(np.zeros(0, np.int64)), mapping_seen.select(np.zeros(0, np.int64)))
+    dense_labels, dense_seen = _together(dense) if dense else nothing
+    return LabelledArea(
+        units="m" if area.has(GEO) else "model",
+        origin=read_origin(area),
+        points=points,
+        cameras=cameras,
+        mapping=mapping,
+        mapping_seen=mapping_seen,
+        dense=dense_labels,
+        dense_seen=dense_seen,
+        evaluation=evaluation,
+        evaluation_seen=evaluation_seen,
+    )
+
+
+def chosen_frames(area: Area) -> Frames:
+    """The mapping flights' frames that went into reconstruction."""
+    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    return frames.select(frames.chosen)
+
+
+def read_origin(area: Area) -> GeoOrigin | None:
+    """None where the area is not georegistered."""
+    if not area.has(GEO):
+        return None
+    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
+
+
+def read_world_from_model(area: Area) -> Similarity:
+    """From COLMAP's gauge to the frame that labels are in: the identity where there is no 3-geo."""
+    if not area.has(GEO):
+        return Similarity.identity()
+    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).world_from_model
+
+
+def similarity_to_json(similarity: Similarity) -> dict[str, Any]:
+    return {
+        "scale": similarity.scale,
+        "rotation": similarity.rotation.tolist(),
+        "translation": similarity.translation.tolist(),
+    }
+
+
+def similarity_from_json(value: dict[str, Any]) -> Similarity:
+    return Similarity(
+        float(value["scale"]),
+        np.array(value["rotation"], np.float64).reshape(3, 3),
+        np.array(value["translation"], np.float64).reshape(3),
+    )
+
+
+def _camera_samples(chosen: Frames, scene: Scene) -> dict[str, str]:
+    """A registered image of each camera key."""
+    registered = set(scene.names)
+    pairs = zip(chosen.cameras.tolist(), chosen.names.tolist(), strict=True)
+    return {key: name for key, name in pairs if name in registered}
+
+
+def _mapping_labels(
+    area: Area, scene: Scene, observations: Observations, points: MapPoints, chosen: Frames
+) -> tuple[Labels, SeenPoints]:
+    """The model's own frames; those that mapping left out have no pose."""
+    n = len(chosen)
+    row_of = {name: k for k, name in enumerate(chosen.names.tolist())}
+    rows = np.array([row_of[name] for name in scene.names], dtype=np.int64)
+    centers, quats = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+    centers[rows], quats[rows] = scene.poses.centers, scene.poses.quats_wxyz
+    covariance = np.full((n, 6, 6), np.nan)
+    status = np.full(n, LabelStatus.FAILED.value, dtype="<U10")
+    status[rows] = LabelStatus.REGISTERED.value
+    inliers, coverage, error_px = np.zeros(n, np.int64), np.zeros(n), np.full(n, np.nan)
+    ends = np.searchsorted(observations.image_idx, np.arange(len(scene.names) + 1))
+    squared = (observations.residuals_px**2).sum(axis=1)
+    for k, row in enumerate(rows):
+        mine = slice(ends[k], ends[k + 1])
+        camera = scene.cameras[int(scene.camera_ids[k])]
+        inliers[row] = mine.stop - mine.start
+        coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
+        error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
+    reasons = _missing_reasons(area)
+    labels = Labels(
+        names=chosen.names,
+        sequences=chosen.sequences,
+        cameras=chosen.cameras,
+        sources=chosen.sources,
+        video_frame=chosen.video_frame,
+        dense=np.zeros(n, bool),
+        time_s=chosen.time_s,
+        status=status,
+        reason=np.array([reasons.get(name, "") for name in chosen.names.tolist()], dtype=np.str_),
+        poses=Poses(centers, quats),
+        covariance=covariance,
+        inliers=inliers,
+        coverage=coverage,
+        error_px=error_px,
+    )
+    order = np.argsort(rows[observations.image_idx], kind="stable")
+    seen = SeenPoints(
+        rows[observations.image_idx][order],
+        points.ids[observations.point_idx[order]],
+        observations.pixels[order],
+    )
+    return labels, seen
+
+
+def _missing_reasons(area: Area) -> dict[str, str]:
+    path = area.folder(MODEL) / "registration.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return {row["name"]: row["reason"] for row in csv.DictReader(file)}
+    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"{path}: cannot be read ({error!r})") from error
+
+
+def _read_stage(area: Area, stage: str, world_from_model: Similarity) -> tuple[Labels, SeenPoints]:
+    """Labels of one stage, moved to where the map is now: it may have been georegistered anew since."""
+    folder = area.folder(stage)
+    labels = read_labels(folder / POSES)
+    there = read_json(folder / REGISTRATION)["world_from_model"]
+    written = similarity_from_json(there)
+    if similarity_to_json(written) != similarity_to_json(world_from_model):
+        labels = labels.moved(world_from_model @ written.inverse())
+    return labels, read_seen_points(folder / SEEN)
+
+
+def _together(parts: list[tuple[Labels, SeenPoints]]) -> tuple[Labels, SeenPoints]:
+    """One after the other, sorted by sequence and time."""
+    labels = Labels.concatenate([part for part, _ in parts])
+    first = np.cumsum([0, *(len(part) for part, _ in parts)])
+    seen = SeenPoints(
+        np.concatenate([s.frame_idx + first[k] for k, (_, s) in enumerate(parts)]),
+        np.concatenate([s.point_ids for _, s in parts]),
+        np.concatenate([s.pixels for _, s in parts]),
+    )
+    order = np.lexsort((labels.time_s, labels.sequences))
+    return labels.select(order), seen.select(order)
+
+
+def _read_camera(path: Path) -> Camera:
+    try:
+        return camera_from_json(read_json(path))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{path}: is no camera ({error})") from error
