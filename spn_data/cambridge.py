@@ -1,0 +1,223 @@
+"""Lists of poses in the format of Cambridge Landmarks (Kendall et al. 2015): dataset_train.txt and its like.
+
+Three header lines, then `path x y z qw qx qy qz` an image: the camera's centre in the world, and the
+quaternion that turns world axes into camera axes, scalar first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.errors import InputError
+from spn_data.pose import Poses, canonical_quats
+from spn_data.record import write_atomically
+
+HEADER = ("Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", "")
+MAX_FRAMES = 1_000_000
+_MAX_LINE_BYTES = 4096
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d{1,3})?")
+# Six decimals leave a unit quaternion's length within 1e-6 of one.
+_UNIT_TO_THE_DIGITS = 1e-5
+_UNIT_AT_ALL = 0.01
+_FAR_TIMES = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class CambridgeList:
+    """N images with their poses, in the file's order.
+
+    names : paths below the scene's folder, unique, with "/" between folders, leading nowhere else.
+    poses : in the world of the file, whose unit, origin and up it does not state. Quaternions that are
+        unit to the file's digits are kept as printed, so that they can be printed again.
+    quats_as_read : (N, 4), scalar first, as they stand in the file.
+    header : the file's first three lines.
+    """
+
+    names: tuple[str, ...]
+    poses: Poses
+    quats_as_read: np.ndarray
+    header: tuple[str, str, str] = HEADER
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def read_cambridge(path: Path | str) -> CambridgeList:
+    """Raises InputError, with the line, where it is not such a list or leads out of its folder."""
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise InputError("is no file" if path.exists() else "does not exist", path=path)
+        lines = _lines(path)
+        header = tuple(_header_line(path, k, next(lines, (k + 1, None))[1]) for k in range(3))
+        rows = _rows(path, lines)
+    except OSError as error:
+        raise InputError(f"can't be read: {error.strerror}", path=path) from error
+    values = np.array(list(rows.values()), dtype=np.float64).reshape(-1, 7)
+    as_read = values[:, 3:]
+    canonical = canonical_quats(as_read)
+    # Dividing by the length again would change the last digit of some.
+    is_unit = np.abs(np.linalg.norm(as_read, axis=1) - 1) <= _UNIT_TO_THE_DIGITS
+    sign = np.where(np.einsum("ni,ni->n", canonical, as_read) < 0, -1.0, 1.0)
+    quats = np.where(is_unit[:, None], sign[:, None] * as_read, canonical)
+    return CambridgeList(
+        tuple(rows), Poses(values[:, :3], quats), as_read, (header[0], header[1], header[2])
+    )
+
+
+def write_cambridge(path: Path, names: Sequence[str], poses: Poses) -> None:
+    """The list of images `names` with their poses, six decimals; the file appears whole.
+
+    names : paths that `read_cambridge` takes, without spaces. Raises ValueError for other names and for
+    poses that are not finite.
+    """
+    if len(names) != len(poses) or len(set(names)) != len(names):
+        raise ValueError(f"{len(names)} names ({len(set(names))} different), {len(poses)} poses")
+    numbers = np.concatenate([poses.centers, poses.quats_wxyz], axis=1)
+    if not np.isfinite(numbers).all():
+        raise ValueError("a pose that is not finite can't be listed")
+    lines = list(HEADER)
+    for name, row in zip(names, numbers.tolist(), strict=True):
+        _check_name(name)
+        lines.append(" ".join([name, *(f"{value:.6f}" for value in row)]))
+    write_atomically(path, "\n".join(lines) + "\n")
+
+
+def far_positions(centers: np.ndarray) -> np.ndarray:
+    """(N,) bool: more than 20 times as far from the median centre as 9 of 10 are; none of fewer than 10."""
+    if len(centers) < 10:
+        return np.zeros(len(centers), dtype=bool)
+    distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    usual = np.quantile(distance, 0.9)
+    return distance > _FAR_TIMES * usual if usual > 0 else np.zeros(len(centers), dtype=bool)
+
+
+def oddities(found: CambridgeList) -> list[str]:
+    """What a list holds that its user should know, a sentence each; empty for an ordinary one."""
+    sentences = []
+    far = far_positions(found.poses.centers)
+    middle = np.median(found.poses.centers, axis=0) if len(found) else np.zeros(3)
+    for k in np.flatnonzero(far)[:10]:
+        center = found.poses.centers[k]
+        position = ", ".join(f"{value:.6g}" for value in center)
+        away = np.linalg.norm(center - middle)
+        usual = np.quantile(np.linalg.norm(found.poses.centers[~far] - middle, axis=1), 0.9)
+        sentences.append(
+            f"{found.names[k]}: position ({position}) lies {away:.3g} from the median position; "
+            f"9 of 10 others lie within {usual:.3g}"
+        )
+    if np.count_nonzero(far) > 10:
+        sentences.append(f"{np.count_nonzero(far) - 10} more positions lie that far away")
+    length = np.linalg.norm(found.quats_as_read, axis=1)
+    sentences += _of_rows(
+        found, np.abs(length - 1) > _UNIT_TO_THE_DIGITS, "quaternion is not of length one; divided"
+    )
+    turned = np.einsum("ni,ni->n", found.quats_as_read, found.poses.quats_wxyz) < 0
+    sentences += _of_rows(
+        found, turned, "quaternion with a negative scalar part; its sign is turned, same rotation"
+    )
+    _, first = np.unique(
+        np.concatenate([found.poses.centers, found.poses.quats_wxyz], axis=1),
+        axis=0,
+        return_index=True,
+    )
+    again = np.ones(len(found), dtype=bool)
+    again[first] = False
+    sentences += _of_rows(found, again, "same pose as an earlier image, to the last digit")
+    return sentences
+
+
+def _of_rows(found: CambridgeList, rows: np.ndarray, sentence: str) -> list[str]:
+    if not rows.any():
+        return []
+    more = f" and {np.count_nonzero(rows) - 1} more" if np.count_nonzero(rows) > 1 else ""
+    return [f"{found.names[int(np.argmax(rows))]}{more}: {sentence}"]
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(line number, text without its end) of a file in which no line is endless."""
+    with path.open("rb") as file:
+        number = 0
+        while raw := file.readline(_MAX_LINE_BYTES + 1):
+            number += 1
+            if len(raw) > _MAX_LINE_BYTES:
+                raise InputError(
+                    f"the line is longer than {_MAX_LINE_BYTES} bytes", path=path, line=number
+                )
+            try:
+                text = raw.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError as error:
+                raise InputError("the line is not UTF-8 text", path=path, line=number) from error
+            yield number, text.strip()
+
+
+def _header_line(path: Path, k: int, text: str | None) -> str:
+    is_right = (
+        text is not None
+        and (
+            text.startswith("Visual Landmark Dataset"),
+            text.startswith("ImageFile"),
+            text == "",
+        )[k]
+    )
+    if text is None or not is_right:
+        raise InputError(
+            f"{'nothing' if text is None else repr(text[:60])} where a Cambridge list has "
+            f"{HEADER[k]!r}: it begins with three header lines",
+            path=path,
+            line=k + 1,
+        )
+    return text
+
+
+def _rows(path: Path, lines: Iterator[tuple[int, str]]) -> dict[str, list[float]]:
+    rows: dict[str, list[float]] = {}
+    for number, text in lines:
+        if not text:
+            continue
+        if len(rows) >= MAX_FRAMES:
+            raise InputError(f"holds more than {MAX_FRAMES} images", path=path, line=number)
+        try:
+            name, values = _row(text)
+            if name in rows:
+                raise ValueError(f"{name} is listed twice")
+        except ValueError as error:
+            raise InputError(str(error), path=path, line=number) from error
+        rows[name] = values
+    return rows
+
+
+def _row(text: str) -> tuple[str, list[float]]:
+    cells = text.split()
+    if len(cells) != 8:
+        raise ValueError(f"{len(cells)} fields, expected 8: path x y z qw qx qy qz")
+    _check_name(cells[0])
+    for cell in cells[1:]:
+        if not _NUMBER.fullmatch(cell):
+            raise ValueError(f"{cell[:40]!r} is not a number")
+    values = [float(cell) for cell in cells[1:]]
+    if not max(map(abs, values)) <= 1e15:
+        raise ValueError("a number beyond 1e15")
+    length = float(np.linalg.norm(values[3:]))
+    if not abs(length - 1) <= _UNIT_AT_ALL:
+        raise ValueError(
+            f"the quaternion has length {length:.6g}, not 1: are the columns mixed up?"
+        )
+    return cells[0], values
+
+
+def _check_name(name: str) -> None:
+    """ValueError unless the name is a path that stays below the folder it is looked up in."""
+    parts = name.split("/")
+    if (
+        any(part in ("", ".", "..") for part in parts)
+        or any(c in name for c in '\\:"<>|?*')
+        or any(c.isspace() or not c.isprintable() for c in name)
+        or len(name) > 1024
+    ):
+        raise ValueError(f"{name[:80]!r} is not a path below the list's folder")
