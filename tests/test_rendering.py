@@ -1,0 +1,213 @@
+"""Rendered images are where projection says: no shift, no empty border, nothing finer than a pixel let in."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from spn_data.camera import Camera
+from spn_data.errors import GeometryError
+from spn_data.pose import rotations_from_angles
+from spn_data.rendering import Renderer, RenderingOptions, canonical_camera, undistorted_camera
+from spn_data.simulate.render import Renderer as Simulator
+from spn_data.simulate.scene import SceneOptions, build_place, paint_all
+
+MAPPING = Camera("OPENCV", 1280, 720, np.array([880.9, 881.5, 645, 356, -0.12, 0.03, 1e-3, -5e-4]))
+SLANTED = Camera("SIMPLE_RADIAL", 1280, 720, np.array([930.0, 620.0, 371.0, -0.06]))
+NARROW = Camera("SIMPLE_RADIAL", 960, 540, np.array([1000.0, 480.0, 270.0, 0.02]))
+SMALL = RenderingOptions()
+
+
+def rays_of(target: Camera, step: float = 1.0) -> np.ndarray:
+    """Rays (N, 3) of a pinhole's outermost edge."""
+    x, y = np.arange(0, target.width + step, step), np.arange(0, target.height + step, step)
+    edge = [
+        *((a, b) for a in x for b in (0, target.height)),
+        *((a, b) for b in y for a in (0, target.width)),
+    ]
+    rays = target.unproject(np.array(edge, dtype=np.float64))
+    return np.column_stack([rays, np.ones(len(rays))])
+
+
+def shift_px(found: np.ndarray, wanted: np.ndarray, block: int = 90) -> np.ndarray:
+    """Least-squares shift (B, 2) of an image's blocks against another's, beyond blocks without texture."""
+    a, b = (cv2.GaussianBlur(np.asarray(i, np.float64), (0, 0), 1.0) for i in (found, wanted))
+    gy, gx = np.gradient(b)
+    shifts = []
+    for row in range(0, b.shape[0] - block + 1, block):
+        for column in range(0, b.shape[1] - block + 1, block):
+            part = np.s_[row : row + block, column : column + block]
+            slope = np.stack([gx[part].ravel(), gy[part].ravel()], axis=1)
+            if np.linalg.eigvalsh(slope.T @ slope)[0] > block**2:
+                solved = np.linalg.lstsq(slope, (b - a)[part].ravel(), rcond=None)
+                shifts.append(solved[0])
+    return np.array(shifts)
+
+
+@pytest.mark.parametrize("others", [[], [SLANTED]])
+def test_the_canonical_camera_has_no_empty_border_and_is_as_wide_as_can_be(others):
+    """Its edge lies inside every mapping image; with a focal length 0.1 % shorter it would not."""
+    cameras = [MAPPING, *others]
+    target = canonical_camera(cameras, SMALL)
+    assert (target.width, target.height) == (480, 270)
+    assert target.model == "SIMPLE_PINHOLE"
+    assert target.params[1:].tolist() == [240.0, 135.0]
+    wider = Camera("SIMPLE_PINHOLE", 480, 270, target.params * [0.999, 1, 1])
+    outside = []
+    for view in (target, wider):
+        pixels = [c.project(rays_of(view)) / [c.width, c.height] for c in cameras]
+        outside.append(max(np.abs(np.concatenate(pixels) - 0.5).max() - 0.5, 0.0))
+    assert outside[0] < 1e-6
+    assert outside[1] > 1e-5
+    assert all(Renderer(camera, target).all_valid for camera in cameras)
+    assert not all(Renderer(camera, wider).all_valid for camera in cameras)
+
+
+def test_a_pinhole_keeps_its_whole_view():
+    """Of a centred pinhole nothing is cut off: the canonical focal length is its own, reduced."""
+    camera = Camera.from_horizontal_fov(1280, 720, 72.0)
+    target = canonical_camera([camera], RenderingOptions(width_px=320))
+    assert (target.width, target.height) == (320, 180)
+    assert target.params[0] == pytest.approx(camera.params[0] / 4, rel=1e-12)
+
+
+def test_the_undistorted_camera_keeps_the_images_size():
+    """A lens's own pinhole: its size, square pixels, principal point in the middle."""
+    target = undistorted_camera(SLANTED)
+    assert (target.width, target.height) == (1280, 720)
+    assert target.params[1:].tolist() == [640.0, 360.0]
+    assert Renderer(SLANTED, target).all_valid
+
+
+def test_an_axis_outside_the_image_is_refused():
+    """A crop that does not hold the optical axis has no view centred on it."""
+    camera = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, -20.0, 240.0]))
+    with pytest.raises(GeometryError, match="principal point lies outside"):
+        canonical_camera([camera], SMALL)
+
+
+def test_a_lens_model_that_folds_back_is_not_followed_past_the_fold():
+    """Strong barrel distortion maps far rays back into the image: they are invalid, and limit the view."""
+    camera = Camera("RADIAL", 640, 480, np.array([300.0, 320.0, 240.0, -0.35, 0.0]))
+    fold = np.sqrt(1 / (3 * 0.35))
+    target = canonical_camera([camera], RenderingOptions(width_px=320))
+    assert np.linalg.norm(target.unproject(np.zeros((1, 2)))) <= fold * (1 + 1e-9)
+    beyond = Camera("SIMPLE_PINHOLE", 320, 240, np.array([80.0, 160.0, 120.0]))
+    valid = Renderer(camera, beyond).valid
+    radius = np.hypot(*np.meshgrid((np.arange(320) - 159.5) / 80, (np.arange(240) - 119.5) / 80))
+    assert valid[120, 160]
+    assert not valid[radius > fold].any()
+
+
+@pytest.fixture(scope="module")
+def place():
+    built = build_place(SceneOptions(seed=2, texels_per_m=40.0))
+    return built.faces, paint_all(built)
+
+
+@pytest.mark.parametrize("camera", [MAPPING, SLANTED], ids=["mapping", "slanted"])
+def test_rendering_agrees_with_the_simulators_projection(place, camera):
+    """A simulated image, undistorted and reduced, lies where the same view taken by the pinhole lies.
+
+    0.02 px everywhere; the simulator knows nothing of undistortion. A slip of half a source pixel would
+    be 0.19 px.
+    """
+    target = canonical_camera([MAPPING, SLANTED], SMALL)
+    center, rotation = np.array([2.0, -8.0, 6.0]), rotations_from_angles(np.array([20.0, -12, 3]))
+    taken = Simulator(*place, camera).render(center, rotation)
+    wanted = Simulator(*place, target).render(center, rotation)
+    found = Renderer(camera, target).render(taken)
+    assert found.dtype == np.uint8
+    assert found.shape == wanted.shape == (270, 480, 3)
+    shifts = shift_px(found.mean(axis=2), wanted.mean(axis=2))
+    assert len(shifts) >= 9
+    assert np.abs(shifts).max() < 0.02
+    assert np.abs(found.astype(float) - wanted).mean() < 3.0
+
+
+def test_what_is_finer_than_a_pixel_is_averaged_away():
+    """Stripes of 1.25 output pixels keep 30 % of their contrast, taking every third pixel all of it."""
+    camera = Camera.from_horizontal_fov(1280, 720, 72.0)
+    target = canonical_camera([camera], SMALL)
+    x, y = np.meshgrid(np.arange(1280) + 0.5, np.arange(720) + 0.5)
+
+    def contrast(period_out_px: float) -> float:
+        period = period_out_px * 1280 / 480
+        stripes = 127 + 100 * np.cos(2 * np.pi * (0.8 * x + 0.6 * y) / period)
+        found = Renderer(camera, target).render(np.round(stripes).astype(np.uint8))
+        return float(np.sqrt(2) * found[10:-10, 10:-10].std() / 100)
+
+    assert contrast(10) > 0.97
+    assert contrast(2.5) > 0.7
+    assert contrast(1.25) < 0.3
+    assert contrast(1.0) < 0.12
+
+
+def test_a_narrower_camera_leaves_invalid_pixels_black():
+    """The mask is true just where the pixel's whole area projects into the image, by the camera itself."""
+    target = canonical_camera([MAPPING], SMALL)
+    renderer = Renderer(NARROW, target)
+    assert 0.1 < renderer.valid.mean() < 0.9
+    white = renderer.render(np.full((540, 960, 3), 200, np.uint8))
+    assert (white[~renderer.valid] == 0).all()
+    assert (white[renderer.valid] == 200).all()
+    rng = np.random.default_rng(1)
+    row, column = rng.integers(0, 270, 400), rng.integers(0, 480, 400)
+    inside = np.ones(400, bool)
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        ray = target.unproject(np.stack([column + dx, row + dy], axis=1).astype(float))
+        pixels = NARROW.project(np.column_stack([ray, np.ones(400)]))
+        inside &= np.all((pixels >= 0) & (pixels <= [960, 540]), axis=1)
+    assert (renderer.valid[row, column] == inside).all()
+
+
+def test_a_users_mask_is_rendered_with_its_image():
+    """Pixels that see anything masked out are not used."""
+    target = canonical_camera([MAPPING], SMALL)
+    usable = np.ones((720, 1280), bool)
+    usable[:, 900:] = False
+    rendered = Renderer(MAPPING, target).render_mask(usable)
+    edge = target.project(
+        np.column_stack([MAPPING.unproject(np.array([[900.0, 356.0]])), np.ones(1)])
+    )[0, 0]
+    assert rendered[135, : int(edge) - 1].all()
+    assert not rendered[135, int(edge) + 2 :].any()
+
+
+@pytest.mark.parametrize("camera", [MAPPING, NARROW], ids=["mapping", "narrow"])
+def test_points_move_with_the_image(camera):
+    """A point's rendered pixel is the pinhole's projection of it, to 1e-6 px; only those in view stay."""
+    target = canonical_camera([MAPPING], SMALL)
+    rng = np.random.default_rng(3)
+    points = np.column_stack(
+        [rng.uniform(-1, 1, 3000), rng.uniform(-0.6, 0.6, 3000), np.ones(3000)]
+    )
+    pixels = camera.project(points)
+    points = points[np.all((pixels > 0) & (pixels < [camera.width, camera.height]), axis=1)]
+    renderer = Renderer(camera, target)
+    moved, seen = renderer.move(camera.project(points))
+    wanted = target.project(points)
+    in_view = np.all((wanted >= 0) & (wanted < [480, 270]), axis=1)
+    assert seen.sum() > 100
+    assert np.abs(moved - wanted)[seen].max() < 1e-6
+    assert not (seen & ~in_view).any()
+    column, row = moved[seen].astype(int).T
+    assert renderer.valid[row, column].all()
+    lost = in_view & ~seen  # on a pixel that the narrow camera sees in part
+    assert lost.sum() == 0 if camera is MAPPING else 0 < lost.mean() < 0.02
+
+
+def test_no_points_move_to_no_points():
+    """A frame that sees nothing is no special case."""
+    moved, seen = Renderer(MAPPING, canonical_camera([MAPPING], SMALL)).move(np.zeros((0, 2)))
+    assert moved.shape == (0, 2)
+    assert seen.shape == (0,)
+
+
+def test_an_image_of_another_size_is_our_mistake():
+    """The camera of another image is noticed."""
+    with pytest.raises(ValueError, match="960x540 for a camera of 1280x720"):
+        Renderer(MAPPING, canonical_camera([MAPPING], SMALL)).render(
+            np.zeros((540, 960, 3), np.uint8)
+        )
