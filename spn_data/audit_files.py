@@ -1,0 +1,160 @@
+"""Whether the files of a data set agree with the labels and with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.audit import Finding, finding_of
+from spn_data.labels import Labels
+from spn_data.pose import Poses
+from spn_data.split import LEFT_OUT, TEST, TRAIN, VALIDATION, Split
+
+# Half a unit of the sixth decimal, and what rounding adds.
+_PRINTED = 0.5e-6 + 1e-9
+
+
+def check_labels(parts: Mapping[str, Labels]) -> Finding:
+    """Every pose is finite with a unit quaternion; a covariance is unknown, or finite and not negative."""
+    bad: list[str] = []
+    count = without = 0
+    for labels in parts.values():
+        rows = np.flatnonzero(labels.registered)
+        count += len(rows)
+        finite = np.isfinite(labels.poses.centers[rows]).all(axis=1)
+        norms = np.linalg.norm(labels.poses.quats_wxyz[rows], axis=1)
+        covariance = labels.covariance[rows]
+        unknown = np.isnan(covariance).all(axis=(1, 2))
+        without += int(unknown.sum())
+        whole = np.isfinite(covariance).all(axis=(1, 2))
+        variances = np.diagonal(covariance, axis1=1, axis2=2)
+        for fine, what in (
+            (finite, "its position is not finite"),
+            (np.abs(norms - 1) < 1e-6, "its quaternion is not of length 1"),
+            (unknown | whole, "its covariance is not finite"),
+            (~whole | (variances >= 0).all(axis=1), "a variance is negative"),
+        ):
+            bad += [f"{name}: {what}" for name in labels.names[rows[~fine]].tolist()]
+    return finding_of(
+        "labels finite",
+        bad,
+        f"{count} labels are finite; {without} have no covariance",
+        "labels cannot be used as they are",
+    )
+
+
+def check_covered(parts: Mapping[str, Labels], split: Split) -> Finding:
+    """The split knows every frame exactly once; those with a pose have a group or a reason, others none.
+
+    parts : all labels, "mapping", "dense", and each evaluation sequence by its name.
+    """
+    names, times = np.unique(split.names, return_counts=True)
+    bad = [
+        f"{name} stands {n} times in the split"
+        for name, n in zip(names, times, strict=True)
+        if n > 1
+    ]
+    group = dict(zip(split.names.tolist(), split.group.tolist(), strict=True))
+    reason = dict(zip(split.names.tolist(), split.reason.tolist(), strict=True))
+    known: set[str] = set()
+    for part, labels in parts.items():
+        allowed = {part} if part not in ("mapping", "dense") else {TRAIN, VALIDATION, TEST}
+        for name, registered in zip(labels.names.tolist(), labels.registered.tolist(), strict=True):
+            known.add(name)
+            if name not in group:
+                bad.append(f"{name} is missing in the split")
+            elif group[name] == LEFT_OUT:
+                if not reason[name]:
+                    bad.append(f"{name} is left out without a reason")
+            elif not registered:
+                bad.append(f"{name} has no pose and is in {group[name]}")
+            elif group[name] not in allowed:
+                bad.append(f"{name} of {part} is in {group[name]}")
+    bad += [f"{name} is no frame of the area" for name in group if name not in known]
+    return finding_of(
+        "every frame once",
+        bad,
+        f"{len(known)} frames, each once: "
+        + ", ".join(f"{n} {name}" for name, n in split.counts().items())
+        + f", {int((split.group == LEFT_OUT).sum())} left out",
+        "split and frames do not agree",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseList:
+    """Images and their poses, as a file lists them."""
+
+    names: tuple[str, ...]
+    poses: Poses
+
+    def select(self, rows: np.ndarray) -> PoseList:
+        return PoseList(tuple(self.names[k] for k in rows), self.poses[rows])
+
+
+def check_dataset(
+    stored: Mapping[str, PoseList], parts: Mapping[str, Labels], split: Split
+) -> Finding:
+    """Each group of dataset.h5 holds just the frames that the split puts in it, with their labels' poses."""
+    bad = []
+    for name in sorted({*stored, *split.groups()}):
+        wanted = set(split.names[split.group == name].tolist())
+        found = set(stored[name].names) if name in stored else set()
+        bad += [f"{frame} is missing in group {name}" for frame in sorted(wanted - found)]
+        bad += [f"{frame} is in group {name}" for frame in sorted(found - wanted)]
+    labels = Labels.concatenate(list(parts.values()))
+    row_of = {name: k for k, name in enumerate(labels.names.tolist())}
+    for held in stored.values():
+        known = [k for k, name in enumerate(held.names) if name in row_of]
+        rows = [row_of[held.names[k]] for k in known]
+        same = (held.poses.centers[known] == labels.poses.centers[rows]).all(axis=1)
+        same &= (held.poses.quats_wxyz[known] == labels.poses.quats_wxyz[rows]).all(axis=1)
+        bad += [
+            f"{held.names[known[k]]} has another pose than its label" for k in np.flatnonzero(~same)
+        ]
+    return finding_of(
+        "dataset.h5 holds the split",
+        bad,
+        f"{sum(len(held.names) for held in stored.values())} images in {len(stored)} groups, "
+        "each with its label's pose",
+        "dataset.h5 and split.json do not agree",
+    )
+
+
+def check_cambridge(listed: Mapping[str, PoseList], stored: Mapping[str, PoseList]) -> Finding:
+    """Lists of Cambridge Landmarks agree with dataset.h5 to the printed digits.
+
+    listed : by file, as read back; stored : by the same file, what should stand in it, in its order. Names
+    are compared without their suffix.
+    """
+    bad, images = [], 0
+    for file in sorted({*listed, *stored}):
+        if file not in listed:
+            bad.append(f"{file} is missing")
+            continue
+        if file not in stored:
+            bad.append(f"{file} is more than there should be")
+            continue
+        found, wanted = listed[file], stored[file]
+        images += len(found.names)
+        if [_stem(n) for n in found.names] != [_stem(n) for n in wanted.names]:
+            bad.append(f"{file} lists other images, or in another order")
+            continue
+        apart = np.abs(found.poses.centers - wanted.poses.centers).max(axis=1)
+        # Either sign is the same rotation where the scalar part is zero.
+        signs = np.sign(np.einsum("ni,ni->n", found.poses.quats_wxyz, wanted.poses.quats_wxyz))
+        turned = np.abs(signs[:, None] * found.poses.quats_wxyz - wanted.poses.quats_wxyz)
+        off = np.maximum(apart, turned.max(axis=1)) > _PRINTED
+        bad += [f"{file}: {found.names[k]} has another pose" for k in np.flatnonzero(off)]
+    return finding_of(
+        "Cambridge lists agree with dataset.h5",
+        bad,
+        f"{images} poses in {len(listed)} lists agree to the printed digits",
+        "lists and dataset.h5 do not agree",
+    )
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0]
