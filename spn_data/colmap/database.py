@@ -134,6 +134,14 @@ class MapDatabase:
             self._native.write_matches(*pair.image_ids, pair.matches)
             self._native.write_two_view_geometry(*pair.image_ids, geometry)
 
+    def read_inliers(self, first: str, second: str) -> np.ndarray:
+        """Verified matches (K, 2) int64 of feature indices of two images; none where the pair has none."""
+        pair = (self.ids[first], self.ids[second])
+        if not self._native.exists_two_view_geometry(*pair):
+            return np.zeros((0, 2), np.int64)
+        matches = self._native.read_two_view_geometry(*pair).inlier_matches
+        return np.asarray(matches, dtype=np.int64).reshape(-1, 2)
+
     def num_pairs(self) -> int:
         """Pairs tried, verified or not."""
         return int(self._native.num_matched_image_pairs())

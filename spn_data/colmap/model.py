@@ -129,6 +129,16 @@ def read_map(folder: Path) -> tuple[Scene, Observations, MapPoints]:
     return scene, observations_of(native, scene), points
 
 
+def read_feature_points(folder: Path) -> dict[str, np.ndarray]:
+    """Point id of every feature (K,) by image name, in the order of the database; -1 where it is none."""
+    return {
+        image.name: np.array(
+            [p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64
+        )
+        for image in _registered(load_native(folder))
+    }
+
+
 def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observations:
     point_position = {point_id: k for k, point_id in enumerate(sorted(native.points3D))}
     image_idx, point_idx, pixels, residuals = [], [], [], []

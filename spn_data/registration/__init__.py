@@ -1,0 +1,1 @@
+"""Evaluation frames in a frozen map: their poses, how far to trust them, and which of them failed."""

@@ -1,0 +1,249 @@
+"""Least squares over a sequence in a frozen map: its poses, its lens, and the points that only it sees.
+
+Map points stay where they are. Poses are changed by a move of the centre along the map's axes and a
+rotation vector in the camera frame, R_new = exp(v) @ R: the order of every covariance here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from spn_data.camera import MODELS, Camera
+from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.residual_fit import projection_jacobians
+
+POSE = 6
+_LENS_COLUMN = {"k1": 4, "k2": 5}  # of projection_jacobians
+_MAX_STEPS = 50
+_CONVERGED = 1e-7  # relative decrease of the cost
+_FAR_PX = 1e3  # residual of a point at or behind the camera: it counts as an outlier
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceObservations:
+    """M measurements in N frames.
+
+    frame : (M,) row of the frame, ascending; pixels : (M, 2); map_xyz : (M, 3) the map point's place, NaN
+    where it is a point of the sequence's own; own : (M,) row of that point, -1 for a map point.
+    """
+
+    frame: np.ndarray
+    pixels: np.ndarray
+    map_xyz: np.ndarray
+    own: np.ndarray
+
+    def select(self, index: np.ndarray) -> SequenceObservations:
+        return SequenceObservations(
+            self.frame[index], self.pixels[index], self.map_xyz[index], self.own[index]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceState:
+    """poses : (N); camera : shared; own_points : (P, 3) points that only the sequence sees."""
+
+    poses: Poses
+    camera: Camera
+    own_points: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """The observations at a state.
+
+    residuals_px : (M, 2) projected minus measured; by_pose : (M, 2, 6); by_lens : (M, 2, L); by_point :
+    (M, 2, 3); lens : names of the L parameters. Points behind the camera have residuals of 1,000 px.
+    """
+
+    residuals_px: np.ndarray
+    by_pose: np.ndarray
+    by_lens: np.ndarray
+    by_point: np.ndarray
+    lens: tuple[str, ...]
+
+
+def lens_parameters(camera: Camera) -> tuple[str, ...]:
+    """The parameters that a sequence can tell: focal length and radial distortion."""
+    return tuple(name for name in MODELS[camera.model] if name in ("f", "fx", "fy", "k1", "k2"))
+
+
+def linearize(
+    state: SequenceState, observations: SequenceObservations, lens: tuple[str, ...]
+) -> Linearized:
+    rotations = state.poses.rotations[observations.frame]
+    places = np.where(
+        (observations.own >= 0)[:, None],
+        state.own_points[observations.own] if len(state.own_points) else 0.0,
+        observations.map_xyz,
+    )
+    offset = places - state.poses.centers[observations.frame]
+    in_camera = np.einsum("mij,mj->mi", rotations, offset)
+    behind = in_camera[:, 2] <= 1e-6 * np.linalg.norm(in_camera, axis=1)
+    safe = np.where(behind[:, None], np.array([0.0, 0.0, 1.0]), in_camera)
+    residuals = state.camera.project(safe) - observations.pixels
+    residuals[behind] = _FAR_PX
+    by_camera_point, by_all = projection_jacobians(state.camera, safe)
+    by_camera_point[behind] = 0.0
+    x, y, z = safe.T
+    zero = np.zeros_like(x)
+    # d(exp(v) X)/dv = -[X]x
+    minus_cross = np.stack(
+        [
+            np.stack([zero, z, -y], axis=1),
+            np.stack([-z, zero, x], axis=1),
+            np.stack([y, -x, zero], axis=1),
+        ],
+        axis=1,
+    )
+    by_point = by_camera_point @ rotations
+    by_pose = np.concatenate([-by_point, by_camera_point @ minus_cross], axis=2)
+    columns = []
+    for name in lens:
+        if name == "f":
+            columns.append(by_all[:, :, 0] + by_all[:, :, 1])
+        elif name in ("fx", "fy"):
+            columns.append(by_all[:, :, 0 if name == "fx" else 1])
+        else:
+            columns.append(by_all[:, :, _LENS_COLUMN[name]])
+    by_lens = np.stack(columns, axis=2) if columns else np.zeros((len(x), 2, 0))
+    by_lens[behind] = 0.0
+    return Linearized(residuals, by_pose, by_lens, by_point, lens)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Of poses and lens, own points eliminated.
+
+    matrix : sparse (6N+L, 6N+L); right : (6N+L,); point_inverse : (P, 3, 3); coupling : sparse (6N+L, 3P);
+    point_right : (P, 3).
+    """
+
+    matrix: sparse.csc_matrix
+    right: np.ndarray
+    point_inverse: np.ndarray
+    coupling: sparse.csr_matrix
+    point_right: np.ndarray
+
+
+def jacobian(
+    linearized: Linearized, frame: np.ndarray, frames: int, weights: np.ndarray
+) -> sparse.csr_matrix:
+    """Sparse (2M, 6N+L) by poses and lens, each row times the root of its weight."""
+    m, lens = len(frame), linearized.by_lens.shape[2]
+    root = np.sqrt(weights)[:, None, None]
+    values = np.concatenate([linearized.by_pose, linearized.by_lens], axis=2) * root
+    columns = np.empty((m, 2, POSE + lens), np.int64)
+    columns[:, :, :POSE] = (POSE * frame[:, None] + np.arange(POSE))[:, None]
+    columns[:, :, POSE:] = POSE * frames + np.arange(lens)
+    pointers = np.arange(0, values.size + 1, POSE + lens)
+    return sparse.csr_matrix(
+        (values.ravel(), columns.ravel(), pointers), shape=(2 * m, POSE * frames + lens)
+    )
+
+
+def normal_equations(
+    linearized: Linearized,
+    observations: SequenceObservations,
+    frames: int,
+    own_points: int,
+    weights: np.ndarray,
+) -> NormalEquations:
+    by_unknown = jacobian(linearized, observations.frame, frames, weights)
+    residuals = (linearized.residuals_px * np.sqrt(weights)[:, None]).ravel()
+    matrix = (by_unknown.T @ by_unknown).tocsc()
+    right = -(by_unknown.T @ residuals)
+    mine = np.flatnonzero(observations.own >= 0)
+    point_of = observations.own[mine]
+    root = np.sqrt(weights[mine])[:, None]
+    by_point = linearized.by_point[mine] * root[..., None]
+    v = np.zeros((own_points, 3, 3))
+    np.add.at(v, point_of, by_point.transpose(0, 2, 1) @ by_point)
+    v += 1e-12 * np.eye(3) * (1 + np.trace(v, axis1=1, axis2=2)[:, None, None])
+    inverse = np.linalg.inv(v)
+    point_right = np.zeros((own_points, 3))
+    weighted = linearized.residuals_px[mine] * root
+    np.add.at(point_right, point_of, -np.einsum("mij,mi->mj", by_point, weighted))
+    columns = np.repeat(3 * point_of[:, None] + np.arange(3), 2, axis=0)
+    of_points = sparse.csr_matrix(
+        (by_point.ravel(), columns.ravel(), np.arange(0, by_point.size + 1, 3)),
+        shape=(2 * len(mine), 3 * own_points),
+    )
+    rows = (2 * mine[:, None] + np.arange(2)).ravel()
+    coupling = (by_unknown[rows].T @ of_points).tocsr()
+    if own_points:
+        weighted_coupling = coupling @ sparse.block_diag(list(inverse), format="csr")
+        matrix = (matrix - weighted_coupling @ coupling.T).tocsc()
+        right = right - weighted_coupling @ point_right.ravel()
+    return NormalEquations(matrix, right, inverse, coupling, point_right)
+
+
+def adjust(
+    state: SequenceState,
+    observations: SequenceObservations,
+    *,
+    scale_px: float,
+    lens: tuple[str, ...],
+) -> SequenceState:
+    """The state of least robust cost (Cauchy, of this scale), by Levenberg's method from a good start."""
+    damping = 1e-6
+    linearized = linearize(state, observations, lens)
+    cost = _cost(linearized, scale_px)
+    for _ in range(_MAX_STEPS):
+        weights = cauchy_weights(linearized.residuals_px, scale_px)
+        normal = normal_equations(
+            linearized, observations, len(state.poses), len(state.own_points), weights
+        )
+        while True:
+            candidate = _step(state, normal, damping, lens)
+            ahead = linearize(candidate, observations, lens)
+            new_cost = _cost(ahead, scale_px)
+            if new_cost <= cost or damping > 1e6:
+                break
+            damping *= 10
+        if new_cost > cost:
+            return state
+        done = cost - new_cost < _CONVERGED * cost
+        state, linearized, cost = candidate, ahead, new_cost
+        damping = max(damping / 10, 1e-9)
+        if done:
+            break
+    return state
+
+
+def cauchy_weights(residuals_px: np.ndarray, scale_px: float) -> np.ndarray:
+    """(M,) of residuals (M, 2)."""
+    return 1 / (1 + (residuals_px**2).sum(axis=1) / scale_px**2)
+
+
+def _cost(linearized: Linearized, scale_px: float) -> float:
+    squared = (linearized.residuals_px**2).sum(axis=1)
+    return float(np.log1p(squared / scale_px**2).sum())
+
+
+def _step(
+    state: SequenceState, normal: NormalEquations, damping: float, lens: tuple[str, ...]
+) -> SequenceState:
+    diagonal = normal.matrix.diagonal()
+    damped = normal.matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())
+    change = splu(damped.tocsc()).solve(normal.right)
+    n = len(state.poses)
+    moves = change[: POSE * n].reshape(n, POSE)
+    poses = Poses.from_rotations(
+        state.poses.centers + moves[:, :3],
+        rotations_from_vectors(moves[:, 3:]) @ state.poses.rotations,
+    )
+    params = state.camera.params.copy()
+    for name, value in zip(lens, change[POSE * n :], strict=True):
+        params[MODELS[state.camera.model].index(name)] += value
+    camera = state.camera
+    if min(replace(camera, params=params).focal_px) > 0.05 * max(camera.width, camera.height):
+        camera = replace(camera, params=params)
+    own = state.own_points
+    if len(own):
+        right = normal.point_right - (normal.coupling.T @ change).reshape(-1, 3)
+        own = own + np.einsum("pij,pj->pi", normal.point_inverse, right)
+    return SequenceState(poses, camera, own)

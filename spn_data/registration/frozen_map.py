@@ -1,0 +1,63 @@
+"""The map as registration sees it: points, and descriptors of each frame that saw them. Read only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.model import Observations, Scene, read_feature_points, read_map
+from spn_data.map_points import MapPoints
+from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrame:
+    """Features of a map frame that are points of the map.
+
+    descriptors : (K, 128) uint8 RootSIFT; point_rows : (K,) rows in MapPoints.
+    """
+
+    descriptors: np.ndarray
+    point_rows: np.ndarray
+
+
+class FrozenMap:
+    """A model and its database, opened for reading."""
+
+    def __init__(self, folder: Path, database: MapDatabase):
+        self.scene: Scene
+        self.observations: Observations
+        self.points: MapPoints
+        self.scene, self.observations, self.points = read_map(folder)
+        self._feature_points = read_feature_points(folder)
+        self._database = database
+        described = [database.read_features(name).descriptors for name in self.scene.names]
+        self.vocabulary = appearance_vocabulary(described, PairOptions())
+        self._appearance = np.stack([describe_appearance(d, self.vocabulary) for d in described])
+
+    @classmethod
+    @contextmanager
+    def open(cls, folder: Path, database: Path) -> Iterator[Self]:
+        with MapDatabase.open(database) as opened:
+            yield cls(folder, opened)
+
+    def similar(self, descriptors: np.ndarray, count: int) -> list[str]:
+        """Names of the map frames that look most like an image with these descriptors, best first."""
+        likeness = self._appearance @ describe_appearance(descriptors, self.vocabulary)
+        order = np.argsort(-likeness, kind="stable")[:count]
+        return [self.scene.names[k] for k in order]
+
+    def frame(self, name: str) -> MapFrame:
+        features = self._database.read_features(name)
+        point_ids = self._feature_points[name]
+        is_point = np.flatnonzero(point_ids >= 0)
+        return MapFrame(features.descriptors[is_point], self.points.rows_of(point_ids[is_point]))
+
+    def frames(self, names: Sequence[str]) -> dict[str, MapFrame]:
+        return {name: self.frame(name) for name in names}

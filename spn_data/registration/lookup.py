@@ -1,0 +1,84 @@
+"""Which map points a frame shows: its features against those of similar map frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.colmap.database import MapDatabase
+from spn_data.matching import MatchOptions, match_descriptors
+from spn_data.parallel import run_batches
+from spn_data.registration.frozen_map import FrozenMap, MapFrame
+from spn_data.registration.options import RegisterOptions
+from spn_data.timing import Progress
+
+_FRAMES_A_BATCH = 4  # neighbours in time look like the same map frames
+
+
+def look_up(
+    name: str,
+    descriptors: np.ndarray,
+    map_frames: list[MapFrame],
+    options: MatchOptions,
+) -> tuple[str, np.ndarray]:
+    """Putative matches (M, 2) int64 of feature and map point row, each once. Pure."""
+    found = []
+    for frame in map_frames:
+        matches = match_descriptors(descriptors, frame.descriptors, options).astype(np.int64)
+        found.append(np.column_stack([matches[:, 0], frame.point_rows[matches[:, 1]]]))
+    together = np.concatenate(found) if found else np.zeros((0, 2), np.int64)
+    return name, np.unique(together, axis=0)
+
+
+def _look_up_batch(
+    batch: list[tuple[str, np.ndarray, list[str]]],
+    map_frames: dict[str, MapFrame],
+    options: MatchOptions,
+) -> list[tuple[str, np.ndarray]]:
+    return [
+        look_up(name, descriptors, [map_frames[n] for n in similar], options)
+        for name, descriptors, similar in batch
+    ]
+
+
+def look_up_missing(
+    names: tuple[str, ...],
+    database: MapDatabase,
+    frozen: FrozenMap,
+    folder: Path,
+    options: RegisterOptions,
+    workers: int,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """Putative matches of every frame by name; those found before lie in `folder`, a file each."""
+    folder.mkdir(exist_ok=True)
+    files = {name: folder / f"{name.replace('/', '-')}.npy" for name in names}
+    missing = [name for name in names if not files[name].exists()]
+    done = len(names) - len(missing)
+
+    def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
+        for start in range(0, len(missing), _FRAMES_A_BATCH):
+            batch = []
+            for name in missing[start : start + _FRAMES_A_BATCH]:
+                descriptors = database.read_features(name).descriptors
+                batch.append((name, descriptors, frozen.similar(descriptors, options.map_frames)))
+            needed = sorted({n for _, _, similar in batch for n in similar})
+            yield (
+                f"matching {batch[0][0]} with the map",
+                (batch, frozen.frames(needed), options.matching),
+            )
+
+    def store(result: list[tuple[str, np.ndarray]]) -> None:
+        nonlocal done
+        for name, matches in result:
+            temporary = files[name].with_suffix(".part")
+            with temporary.open("wb") as file:
+                np.save(file, matches)
+            temporary.replace(files[name])
+        done += len(result)
+        progress("map matches", done, len(names))
+
+    run_batches(_look_up_batch, batches(), workers=workers, on_result=store)
+    return {name: np.load(files[name], allow_pickle=False) for name in names}
