@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from spn_data.errors import InputError
 from spn_data.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
 from spn_data.telemetry.csv_columns import COLUMNS, Column, columns_of
-from spn_data.telemetry.textfile import MAX_RECORDS, read_text
+from spn_data.telemetry.textfile import MAX_RECORDS, csv_rows, read_text
 from spn_data.telemetry.track import Telemetry, increasing
 
 MAX_DAMAGED_FRACTION = 0.05  # of the rows, above which the log as a whole is not believed
@@ -38,7 +36,7 @@ def read_csv_log(path: Path | str) -> Telemetry:
     Needs a latitude, a longitude and a time; `docs/telemetry.md` lists names and units of columns.
     Up to 5 % damaged rows are left out and counted in the notes.
     """
-    rows = _rows(read_text(path), path)
+    rows = csv_rows(read_text(path), path, "telemetry")
     header_line, header = next(rows, (1, []))
     columns = _understood(header, header_line, path)
     records: list[dict[str, float]] = []
@@ -117,30 +115,6 @@ class _Table:
 
     def known(self, name: str) -> int:
         return int(np.isfinite(self[name]).sum())
-
-
-def _rows(text: str, path: Path | str) -> Iterator[tuple[int, list[str]]]:
-    """(line, cells) of each row that is not empty, the header first."""
-    lines = text.split("\n")
-    skip = 0
-    # Spreadsheets write "sep=;" first, loggers lines of comments.
-    while skip < len(lines) and (
-        not lines[skip].strip() or lines[skip].lower().startswith(("sep=", "#"))
-    ):
-        skip += 1
-    if skip == len(lines):
-        raise InputError("the file is empty: no telemetry in it", path=path)
-    delimiter = max(",;\t", key=lines[skip].count)
-    reader = csv.reader(lines[skip:], delimiter=delimiter)
-    try:
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            if delimiter == ";":  # where a comma is the decimal sign
-                cells = [cell.replace(",", ".") for cell in cells]
-            if any(cells):
-                yield skip + reader.line_num, cells
-    except csv.Error as error:
-        raise InputError(f"is no CSV: {error}", path=path, line=skip + reader.line_num) from error
 
 
 def _understood(header: list[str], line: int, path: Path | str) -> dict[str, Column]:

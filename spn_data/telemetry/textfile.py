@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import codecs
+import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 from spn_data.errors import InputError
@@ -40,3 +42,31 @@ def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
             raise InputError("is binary, not text", path=path)
         text = data.decode("utf-8-sig", errors="replace")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def csv_rows(text: str, path: Path | str, what: str) -> Iterator[tuple[int, list[str]]]:
+    """(line, cells) of each row of a CSV that is not empty, the header first; `what` it should hold.
+
+    Commas, semicolons or tabs between cells, whichever the header has most of; with semicolons, a comma in
+    a number is its decimal sign. Raises InputError for an empty file and for quotes that never end.
+    """
+    lines = text.split("\n")
+    skip = 0
+    # Spreadsheets write "sep=;" first, loggers lines of comments.
+    while skip < len(lines) and (
+        not lines[skip].strip() or lines[skip].lower().startswith(("sep=", "#"))
+    ):
+        skip += 1
+    if skip == len(lines):
+        raise InputError(f"the file is empty: no {what} in it", path=path)
+    delimiter = max(",;\t", key=lines[skip].count)
+    reader = csv.reader(lines[skip:], delimiter=delimiter)
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if delimiter == ";":
+                cells = [cell.replace(",", ".") for cell in cells]
+            if any(cells):
+                yield skip + reader.line_num, cells
+    except csv.Error as error:
+        raise InputError(f"is no CSV: {error}", path=path, line=skip + reader.line_num) from error

@@ -1,0 +1,174 @@
+"""How much of a camera's view a map has points for that it could be matched with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.pose import Poses
+from spn_data.timing import Progress
+
+_FINER = 2  # cells in which points hide others, to a cell of the grid, in each direction
+_BORDER_STEPS = 17
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """What counts as a view that the map has points for."""
+
+    columns: int = 16  # of the grid over the image
+    rows: int = 9
+    # A point looks alike from two places only if they see it from about the same side,
+    max_turn_deg: float = 40.0
+    max_range_factor: float = 2.0  # and from about the same distance.
+    # A point is hidden if as many points in about its direction
+    occluders: int = 3
+    occluder_ratio: float = 0.75  # lie nearer than this share of its distance.
+
+
+@dataclass(frozen=True, eq=False)
+class SeenMap:
+    """P points, and from where mapping frames saw each.
+
+    xyz : (P, 3). Sightings lie sorted by point: those of point p from starts[p] to starts[p + 1];
+    directions : (S, 3) unit vectors from the point to the frame; ranges : (S,) their distances.
+    """
+
+    xyz: np.ndarray
+    starts: np.ndarray
+    directions: np.ndarray
+    ranges: np.ndarray
+
+    @classmethod
+    def of(
+        cls, xyz: np.ndarray, centers: np.ndarray, frame_idx: np.ndarray, point_idx: np.ndarray
+    ) -> SeenMap:
+        """From points (P, 3), centres of frames (M, 3), and which frame (S,) saw which point (S,)."""
+        order = np.argsort(point_idx, kind="stable")
+        point_idx, frame_idx = point_idx[order], frame_idx[order]
+        rays = centers[frame_idx] - xyz[point_idx]
+        ranges = np.linalg.norm(rays, axis=1)
+        known = ranges > 0  # NaN, of a frame without a pose, is not
+        point_idx, rays, ranges = point_idx[known], rays[known], ranges[known]
+        starts = np.searchsorted(point_idx, np.arange(len(xyz) + 1))
+        directions = (rays / ranges[:, None]).astype(np.float32)
+        return cls(np.asarray(xyz, np.float64), starts, directions, ranges.astype(np.float32))
+
+
+def view_shares(
+    poses: Poses,
+    cameras: Sequence[Camera],
+    seen: SeenMap,
+    options: ViewOptions | None = None,
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Share (N,) of the cells of a grid over each image that hold a point which is visible and known.
+
+    cameras : one a pose. Visible: in front, inside the image, and not hidden behind nearer points. Known:
+    a mapping frame saw it from a direction within `max_turn_deg`, and from a distance within
+    `max_range_factor`, of those from which the pose sees it.
+    """
+    options = options or ViewOptions()
+    rotations = poses.rotations
+    borders = {id(camera): _border(camera) for camera in cameras}
+    shares = np.zeros(len(poses))
+    for k, camera in enumerate(cameras):
+        shares[k] = _share(
+            poses.centers[k], rotations[k], camera, borders[id(camera)], seen, options
+        )
+        if progress is not None and (k % 100 == 99 or k == len(cameras) - 1):
+            progress("view", k + 1, len(cameras))
+    return shares
+
+
+def _share(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    camera: Camera,
+    border: tuple[np.ndarray, np.ndarray],
+    seen: SeenMap,
+    options: ViewOptions,
+) -> float:
+    points, x, y, ranges = _in_view(center, rotation, camera, border, seen.xyz)
+    fine_columns, fine_rows = options.columns * _FINER, options.rows * _FINER
+    column = (x * (fine_columns / camera.width)).astype(np.int64)
+    row = (y * (fine_rows / camera.height)).astype(np.int64)
+    free = ~_hidden(row * fine_columns + column, ranges, fine_columns * fine_rows, options)
+    points, ranges = points[free], ranges[free]
+    cells = (row[free] // _FINER) * options.columns + column[free] // _FINER
+    known = _known(center, points, ranges, seen, options)
+    return len(np.unique(cells[known])) / (options.columns * options.rows)
+
+
+def _border(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest normalised (x, y) inside the image.
+
+    Far outside it, the polynomial of a lens can lead back in: such points are no part of the view.
+    """
+    steps = np.linspace(0, 1, _BORDER_STEPS)
+    zero, one = np.zeros(_BORDER_STEPS), np.ones(_BORDER_STEPS)
+    sides = [(steps, zero), (steps, one), (zero, steps), (one, steps)]
+    pixels = np.concatenate([np.stack(side, axis=1) for side in sides])
+    found = camera.unproject(pixels * [camera.width, camera.height])
+    return found.min(axis=0), found.max(axis=0)
+
+
+def _in_view(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    camera: Camera,
+    border: tuple[np.ndarray, np.ndarray],
+    xyz: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points (K,) in the image, their pixels x and y (K,), and distances from the camera (K,)."""
+    rays = (xyz - center) @ rotation.T
+    x, y, z = rays.T
+    (left, top), (right, bottom) = border
+    inside = (z > 0) & (x >= left * z) & (x <= right * z) & (y >= top * z) & (y <= bottom * z)
+    points = np.flatnonzero(inside)
+    rays = rays[points]
+    pixels = camera.project(rays)
+    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    ranges = np.linalg.norm(rays[inside], axis=1)
+    return points[inside], pixels[inside, 0], pixels[inside, 1], ranges
+
+
+def _hidden(cells: np.ndarray, ranges: np.ndarray, count: int, options: ViewOptions) -> np.ndarray:
+    """(K,) bool: `occluders` points of the same cell are nearer than `occluder_ratio` of its distance."""
+    if len(ranges) == 0:
+        return np.zeros(0, dtype=bool)
+    # Cell and distance as one number, so that one sort does both.
+    scale = 1.0 / (ranges.max() * 1.001)
+    ordered = np.sort(cells + ranges * scale)
+    starts = np.searchsorted(ordered, np.arange(count + 1))
+    wall = np.full(count, np.inf)
+    full = np.flatnonzero(np.diff(starts) >= options.occluders)
+    wall[full] = (ordered[starts[full] + options.occluders - 1] - full) / scale
+    return np.asarray(wall[cells] < options.occluder_ratio * ranges)
+
+
+def _known(
+    center: np.ndarray,
+    points: np.ndarray,
+    ranges: np.ndarray,
+    seen: SeenMap,
+    options: ViewOptions,
+) -> np.ndarray:
+    """(K,) bool: some sighting of the point is alike in direction and distance."""
+    first, counts = seen.starts[points], np.diff(seen.starts)[points]
+    last = np.cumsum(counts)
+    owner = np.repeat(np.arange(len(points)), counts)
+    sightings = np.arange(last[-1] if len(last) else 0) + np.repeat(first - (last - counts), counts)
+    toward = ((center - seen.xyz[points]) / ranges[:, None]).astype(np.float32)
+    cosine = np.einsum("ki,ki->k", seen.directions[sightings], toward[owner])
+    ratio = seen.ranges[sightings] / ranges.astype(np.float32)[owner]
+    factor = options.max_range_factor
+    alike = (
+        (cosine >= np.cos(np.deg2rad(options.max_turn_deg)))
+        & (ratio <= factor)
+        & (ratio >= 1 / factor)
+    )
+    return np.bincount(owner[alike], minlength=len(points)) > 0
