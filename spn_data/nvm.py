@@ -1,0 +1,241 @@
+"""Models in VisualSFM's format NVM_V3: cameras without distortion, points with their measurements.
+
+`name focal qw qx qy qz cx cy cz 0 0` a camera: the centre, and the rotation of world axes into camera axes
+(x right, y down, z forward), scalar first. `x y z r g b n` a point, then n times `image feature dx dy`:
+where it is seen, in pixels right of and below the principal point, which is the image's centre.
+http://ccwu.me/vsfm/doc.html#nvm
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.errors import InputError, StageError
+from spn_data.pose import Poses, canonical_quats
+
+MAX_IMAGES = 1_000_000
+MAX_POINTS = 100_000_000
+_MAX_LINE_BYTES = 64_000_000  # a point seen in a million images
+
+
+@dataclass(frozen=True, eq=False)
+class NvmModel:
+    """N images and P points with M measurements, these sorted by point.
+
+    names : of the images, unique; focal_px : (N,); distortion : (N,) VisualSFM's radial term, 0 in all
+    that we write; poses : (N); xyz : (P, 3); colors : (P, 3) uint8 RGB; point_idx, image_idx : (M,) rows;
+    feature_idx : (M,) number of the measurement in its image; offsets_px : (M, 2) from the image's centre.
+    """
+
+    names: tuple[str, ...]
+    focal_px: np.ndarray
+    distortion: np.ndarray
+    poses: Poses
+    xyz: np.ndarray
+    colors: np.ndarray
+    point_idx: np.ndarray
+    image_idx: np.ndarray
+    feature_idx: np.ndarray
+    offsets_px: np.ndarray
+
+
+def nvm_model(
+    names: tuple[str, ...],
+    poses: Poses,
+    focal_px: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray],
+    measurements: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> NvmModel:
+    """A model without distortion, from points (xyz, colors) and measurements (point_idx, image_idx, offsets).
+
+    Measurements may come in any order; points without one are left out.
+    """
+    point_idx, image_idx, offsets_px = measurements
+    order = np.lexsort((image_idx, point_idx))
+    point_idx, image_idx, offsets_px = point_idx[order], image_idx[order], offsets_px[order]
+    used, new_idx = np.unique(point_idx, return_inverse=True)
+    return NvmModel(
+        names,
+        np.asarray(focal_px, dtype=np.float64),
+        np.zeros(len(names)),
+        poses,
+        points[0][used],
+        points[1][used],
+        new_idx,
+        image_idx,
+        _numbers_within(image_idx, len(names)),
+        offsets_px,
+    )
+
+
+def offsets_from_center(camera: Camera, pixels: np.ndarray, focal_px: float) -> np.ndarray:
+    """(K, 2) where a camera without distortion, of that focal length and centred, sees `pixels` (K, 2)."""
+    return focal_px * camera.unproject(pixels) if len(pixels) else np.zeros((0, 2))
+
+
+def _numbers_within(image_idx: np.ndarray, images: int) -> np.ndarray:
+    """(M,) 0, 1, 2, … within each image, in the order of the measurements."""
+    order = np.argsort(image_idx, kind="stable")
+    counts = np.bincount(image_idx, minlength=images)
+    numbers = np.empty(len(image_idx), dtype=np.int64)
+    numbers[order] = np.arange(len(image_idx)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return numbers
+
+
+def write_nvm(path: Path, model: NvmModel) -> None:
+    """The file appears whole. Numbers are written so that they are read back the same, bit by bit."""
+    _check(model)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="\n") as file:
+            file.writelines(_text(model))
+        os.replace(temporary, path)
+    except OSError as error:
+        raise StageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _check(model: NvmModel) -> None:
+    for name in model.names:
+        if not name or any(c.isspace() or not c.isprintable() for c in name):
+            raise ValueError(f"{name!r} can't be an image's name in NVM")
+    numbers = (model.focal_px, model.poses.centers, model.poses.quats_wxyz, model.xyz)
+    if not all(np.isfinite(n).all() for n in (*numbers, model.offsets_px)):
+        raise ValueError("a number that is not finite can't be written as NVM")
+
+
+def _text(model: NvmModel) -> Iterator[str]:
+    yield f"NVM_V3\n\n{len(model.names)}\n"
+    for k, name in enumerate(model.names):
+        numbers = (*model.poses.quats_wxyz[k], *model.poses.centers[k])
+        yield (
+            f"{name} {model.focal_px[k]:.17g} {' '.join(f'{v:.17g}' for v in numbers)} "
+            f"{model.distortion[k]:.17g} 0\n"
+        )
+    yield f"\n{len(model.xyz)}\n"
+    first = np.searchsorted(model.point_idx, np.arange(len(model.xyz) + 1))
+    for k, (xyz, color) in enumerate(zip(model.xyz, model.colors, strict=True)):
+        mine = slice(first[k], first[k + 1])
+        seen = " ".join(
+            f"{image} {feature} {dx:.17g} {dy:.17g}"
+            for image, feature, (dx, dy) in zip(
+                model.image_idx[mine],
+                model.feature_idx[mine],
+                model.offsets_px[mine],
+                strict=True,
+            )
+        )
+        place = " ".join(f"{v:.17g}" for v in xyz)
+        yield f"{place} {' '.join(map(str, color))} {mine.stop - mine.start} {seen}".rstrip() + "\n"
+    yield "\n0\n"
+
+
+def read_nvm(path: Path | str) -> NvmModel:
+    """The first model of a file. Raises InputError, with the line, where it is none."""
+    path = Path(path)
+    lines = _Lines(path)
+    try:
+        return _read(lines)
+    except ValueError as error:
+        raise InputError(str(error), path=path, line=lines.number) from error
+    except OSError as error:
+        raise InputError(f"can't be read: {error.strerror}", path=path) from error
+    finally:
+        lines.close()
+
+
+class _Lines:
+    """Lines that hold something, one after the other, none endless."""
+
+    def __init__(self, path: Path):
+        self.number = 0
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise InputError(f"can't be read: {error.strerror}", path=path) from error
+
+    def close(self) -> None:
+        self._file.close()
+
+    def next(self, what: str) -> str:
+        """The next one; ValueError at the end of the file, which should have held `what`."""
+        while raw := self._file.readline(_MAX_LINE_BYTES + 1):
+            self.number += 1
+            if len(raw) > _MAX_LINE_BYTES:
+                raise ValueError(f"the line is longer than {_MAX_LINE_BYTES // 1_000_000} MB")
+            try:
+                text = raw.decode("utf-8").strip()
+            except UnicodeDecodeError as error:
+                raise ValueError("the line is not UTF-8 text") from error
+            if text:
+                return text
+        raise ValueError(f"the file ends where {what} should stand")
+
+
+def _read(lines: _Lines) -> NvmModel:
+    head = lines.next("NVM_V3")
+    # A fixed calibration may follow the word: each image has its focal length all the same.
+    if head.split()[0] != "NVM_V3":
+        raise ValueError(f"begins with {head[:40]!r}, not NVM_V3")
+    names: dict[str, None] = {}
+    cameras = array("d")
+    for _ in range(_count(lines.next("the number of images"), MAX_IMAGES)):
+        cells = lines.next("an image").split()
+        if len(cells) != 11:
+            raise ValueError(
+                f"{len(cells)} fields, expected 11: name focal qw qx qy qz cx cy cz r 0"
+            )
+        if cells[0] in names:
+            raise ValueError(f"{cells[0][:80]!r} is listed twice")
+        names[cells[0]] = None
+        cameras.extend(_numbers(cells[1:]))
+    xyz, colors, owners, offsets = array("d"), array("B"), array("q"), array("d")
+    for point in range(_count(lines.next("the number of points"), MAX_POINTS)):
+        cells = lines.next("a point").split()
+        count = _count(cells[6], MAX_IMAGES) if len(cells) > 6 else -1
+        if len(cells) != 7 + 4 * count:
+            raise ValueError(
+                f"{len(cells)} fields, expected x y z r g b n and n times image feature dx dy"
+            )
+        xyz.extend(_numbers(cells[:3]))
+        colors.extend(_count(cell, 255) for cell in cells[3:6])
+        for k in range(7, len(cells), 4):
+            image = _count(cells[k], MAX_IMAGES)
+            if image >= len(names):
+                raise ValueError(f"image {image} of {len(names)}")
+            owners.extend((point, image, _count(cells[k + 1], 2**62)))
+            offsets.extend(_numbers(cells[k + 2 : k + 4]))
+    numbers = np.array(cameras).reshape(-1, 10)
+    index = np.array(owners, dtype=np.int64).reshape(-1, 3)
+    return NvmModel(
+        tuple(names),
+        numbers[:, 0],
+        numbers[:, 8],
+        Poses(numbers[:, 5:8], canonical_quats(numbers[:, 1:5])),
+        np.array(xyz).reshape(-1, 3),
+        np.array(colors, dtype=np.uint8).reshape(-1, 3),
+        index[:, 0],
+        index[:, 1],
+        index[:, 2],
+        np.array(offsets).reshape(-1, 2),
+    )
+
+
+def _count(cell: str, most: int) -> int:
+    if not (cell.isascii() and cell.isdigit()) or len(cell) > 19 or int(cell) > most:
+        raise ValueError(f"{cell[:40]!r} is not a number from 0 to {most}")
+    return int(cell)
+
+
+def _numbers(cells: list[str]) -> list[float]:
+    values = [float(cell) for cell in cells]
+    if not all(math.isfinite(v) and abs(v) <= 1e15 for v in values):
+        raise ValueError("a number that is not finite or beyond 1e15")
+    return values
