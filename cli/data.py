@@ -9,6 +9,7 @@ import click
 
 from cli import options
 from cli.console import Group
+from cli.coverage import coverage
 
 
 @click.group(cls=Group)
@@ -100,6 +101,9 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
     area = options.open_area(area_folder)
     with area.locked(), show.Live() as live:
         live.stage(stage(area, options.geo_options(**chosen), live.progress, overwrite=overwrite))
+
+
+main.add_command(coverage)
 
 
 @main.command()

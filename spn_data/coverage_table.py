@@ -16,6 +16,9 @@ from spn_data.timing import Progress
 from spn_data.view_share import SeenMap, view_shares
 from spn_data.waypoints import write_csv
 
+_TELLING_M = 0.05  # less beyond the range of heights is not worth a sentence
+_FAR_M = 1000.0  # from the map: nobody plans that
+
 COLUMNS = (
     *("name", "status", "stratum", "nearest", "distance", "angle_deg", "height", "above_mapping"),
     *("view_share", "answer_distance", "answer_angle_deg", "x", "y", "z", "reason"),
@@ -147,6 +150,38 @@ def cover(
         answer_distance=spread(found.answer_distance),
         answer_angle_deg=spread(found.answer_angle_deg),
     )
+
+
+def remarks(name: str, coverage: Coverage) -> list[str]:
+    """What the user should know of one sequence or plan, a sentence each."""
+    summary = coverage.summary()
+    known = summary["frames"] - summary["failed"]
+    notes = []
+    if summary["failed"]:
+        notes.append(
+            f"{name}: {summary['failed']} of {summary['frames']} frames failed: without a pose, what "
+            "covers them is not known."
+        )
+    heights = summary["heights"]
+    if heights is None or known == 0:
+        return notes
+    low, high = heights["mapping"]
+    for count, side, by in (
+        (heights["above"], "above the highest", heights["highest_above"]),
+        (heights["below"], "below the lowest", -heights["lowest_below"]),
+    ):
+        if by >= _TELLING_M:
+            notes.append(
+                f"{name}: {count} of {known} lie {side} mapping frame, by up to {by:.1f} m "
+                f"(mapping heights {low:.1f} to {high:.1f} m): what is trained on the map has "
+                "seen no such height."
+            )
+    if summary["median"]["distance"] > _FAR_M:
+        notes.append(
+            f"{name}: the map is {summary['median']['distance'] / 1000:.0f} km away: are latitude, "
+            "longitude and their signs right?"
+        )
+    return notes
 
 
 def write_coverage(path: Path, coverage: Coverage) -> None:

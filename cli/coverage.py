@@ -1,0 +1,204 @@
+"""The command `spn-data coverage`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cli import console, options
+
+if TYPE_CHECKING:
+    from spn_data.coverage_table import Coverage
+    from spn_data.pipeline.coverage import AreaCoverage
+
+_LIMITS = (options.Finite(0, min_open=True), options.Finite(0, 180, min_open=True))
+_SHOWN_STOPS = 20
+
+
+@click.command()
+@options.area
+@click.option(
+    "--waypoints",
+    type=click.Path(path_type=Path),
+    metavar="FILE.csv",
+    help="Planned waypoints, instead of the evaluation sequences.",
+)
+@click.option(
+    "--camera",
+    "camera_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Camera (JSON) of waypoints that name none.  [default: the one that mapped most]",
+)
+@click.option(
+    "--fov",
+    "fov_deg",
+    type=options.Finite(5, 170),
+    metavar="DEG",
+    help="Or its horizontal field of view.",
+)
+@click.option(
+    "--high",
+    type=_LIMITS,
+    metavar="M DEG",
+    help="High coverage: a mapping frame within this.  [default: 2 15]",
+)
+@click.option(
+    "--medium",
+    type=_LIMITS,
+    metavar="M DEG",
+    help="Medium coverage: a mapping frame within this.  [default: 5 40]",
+)
+@click.option(
+    "--fly-again",
+    type=click.Path(path_type=Path),
+    metavar="FILE.csv",
+    help="Write where to fly again to close the gaps.",
+)
+@click.option(
+    "--wanted",
+    type=click.Choice(["high", "medium"]),
+    default="high",
+    show_default=True,
+    help="What the places to fly again should bring every frame to.",
+)
+@click.option(
+    "--margin",
+    type=options.Finite(0, 1, min_open=True),
+    default=0.7,
+    show_default=True,
+    help="Share of the limits that they are planned with; the rest is for flying inexactly.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace the file of --fly-again if it exists.")
+def coverage(
+    area_folder: Path,
+    waypoints: Path | None,
+    camera_file: Path | None,
+    fov_deg: float | None,
+    fly_again: Path | None,
+    overwrite: bool,
+    **chosen: Any,
+) -> None:
+    """How well the mapping flights cover the evaluation flights, or planned waypoints.
+
+    \b
+    Example:
+        spn-data coverage --area fields/north --fly-again again.csv
+    """
+    from spn_data.camera_file import read_camera
+    from spn_data.coverage import Stratum
+    from spn_data.pipeline.coverage import CoverageStageOptions, check_new, cover_area
+    from spn_data.refly import ReflyOptions
+    from spn_data.waypoints import write_csv
+
+    if waypoints is None and (camera_file is not None or fov_deg is not None):
+        raise click.UsageError(
+            "--camera and --fov are of --waypoints: labels have their own camera"
+        )
+    if camera_file is not None and fov_deg is not None:
+        raise click.UsageError("--camera and --fov are two answers to one question: give one")
+    wanted = CoverageStageOptions(
+        coverage=_strata(chosen["high"], chosen["medium"]),
+        refly=ReflyOptions(wanted=Stratum(chosen["wanted"]), margin=chosen["margin"]),
+        camera=None if camera_file is None else read_camera(camera_file),
+        fov_deg=fov_deg,
+    )
+    if fly_again is not None:
+        check_new(fly_again, overwrite=overwrite)
+    area = options.open_area(area_folder)
+    with area.locked(), console.progress() as progress:
+        found = cover_area(area, wanted, progress, waypoints=waypoints)
+    for name, each in found.by_name.items():
+        _show(name, each, found)
+    for note in found.notes:
+        console.note(note)
+    _show_stops(found, chosen["wanted"])
+    console.out.print(f"Frame by frame: {found.folder}.")
+    if fly_again is not None and found.fly_again is None:
+        console.note(f"{fly_again} is not written: without metres there is no place to fly to.")
+    elif fly_again is not None:
+        write_csv(fly_again, found.stops)
+        console.out.print(
+            f"{fly_again}: fly these, then spn-data reconstruct VIDEO --add --area {area_folder}"
+        )
+
+
+def _strata(high: tuple[float, float] | None, medium: tuple[float, float] | None) -> Any:
+    """The given limits; None where none is given. Raises UsageError for limits that don't fit."""
+    from spn_data.coverage import CoverageOptions
+
+    if high is None and medium is None:
+        return None
+    base = CoverageOptions()
+    high = high or (base.high_m, base.high_deg)
+    medium = medium or (base.medium_m, base.medium_deg)
+    try:
+        return CoverageOptions(
+            high_m=high[0], high_deg=high[1], medium_m=medium[0], medium_deg=medium[1]
+        )
+    except ValueError as error:
+        raise click.UsageError(f"--high {high} --medium {medium}: {error}") from error
+
+
+def _show(name: str, coverage: Coverage, found: AreaCoverage) -> None:
+    summary = coverage.summary()
+    failed, known = summary["failed"], summary["frames"] - summary["failed"]
+    unit = "m" if found.units == "m" else "units of the model"
+    rows = [("frames", f"{summary['frames']}" + (f", {failed} of them failed" if failed else ""))]
+    options_, median = found.options, summary["median"]
+    if options_ is not None and known:
+        limits = {
+            "high": f"<= {options_.high_m:g} {unit} and <= {options_.high_deg:g} deg",
+            "medium": f"<= {options_.medium_m:g} {unit} and <= {options_.medium_deg:g} deg",
+            "low": "farther",
+        }
+        rows += [
+            (f"{stratum} coverage", f"{n} ({n / known:.0%}); {limits[stratum]}")
+            for stratum, n in summary["strata"].items()
+        ]
+    if known:
+        rows.append(
+            (
+                "nearest mapping frame",
+                f"{median['distance']:.2f} {unit}, {median['angle_deg']:.1f} deg",
+            )
+        )
+    heights = summary["heights"]
+    if known and heights is not None:
+        (low, high), (lowest, highest) = heights["mapping"], heights["here"]
+        rows += [
+            ("height above it", f"{median['height']:+.2f} m"),
+            ("heights", f"{lowest:.1f} to {highest:.1f} m; mapping {low:.1f} to {high:.1f} m"),
+        ]
+    if known:
+        rows += [
+            ("view that the map has points for", f"{median['view_share']:.0%}"),
+            (
+                "best answer by looking up a frame",
+                f"off by {median['answer_distance']:.2f} {unit}, {median['answer_angle_deg']:.1f} deg",
+            ),
+        ]
+    console.table(f"{name}: coverage (medians over frames with a pose)", rows)
+
+
+def _show_stops(found: AreaCoverage, wanted: str) -> None:
+    if found.fly_again is None:
+        return
+    count = len(found.fly_again)
+    if count == 0:
+        console.out.print(f"Every frame with a pose has {wanted} coverage.\n")
+        return
+    columns = found.stops
+    height = "height_takeoff_m" if "height_takeoff_m" in columns else "z_m"
+    shown = ["stop", "lat_deg", "lon_deg", height, "heading_deg", "pitch_deg", "serves"]
+    rows = list(zip(*(columns[name] for name in shown), strict=True))[:_SHOWN_STOPS]
+    served = int(found.fly_again.serves.sum())
+    console.table(
+        f"Where to fly again: {count} places would bring {served} frames to {wanted} coverage",
+        [(a, b[:-2], c[:-2], d[:-2], e[:-2], f[:-2], g) for a, b, c, d, e, f, g in rows],
+        tuple(name.replace("_deg", "").replace("_m", " m").replace("_", " ") for name in shown),
+    )
+    if count > _SHOWN_STOPS:
+        console.out.print(f"... and {count - _SHOWN_STOPS} more; --fly-again writes all.\n")
