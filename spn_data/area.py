@@ -145,7 +145,7 @@ class Area:
         """Raises StageError where the stage is missing, FormatError where a newer version made it."""
         path = self.folder(stage) / _RECORD
         if not path.exists():
-            raise StageError(f"{self.folder(stage)} is missing; run {_command(stage)} first")
+            raise StageError(f"{self.folder(stage)} is missing; run {command_of(stage)} first")
         return read_record(path)
 
     def stale_because(self, stage: str) -> str | None:
@@ -171,7 +171,7 @@ class Area:
         reason = self.stale_because(stage)
         if reason:
             raise StageError(
-                f"{self.folder(stage)} is stale: {reason}; run {_command(stage)} again"
+                f"{self.folder(stage)} is stale: {reason}; run {command_of(stage)} again"
             )
 
     def begin(
@@ -331,7 +331,7 @@ class Area:
         shutil.rmtree(following)
 
 
-def _command(stage: str) -> str:
+def command_of(stage: str) -> str:
     """The command that makes a stage."""
     group, _, name = stage.partition("/")
     commands = {
