@@ -1,0 +1,279 @@
+"""dataset.h5 written: frame by frame, in memory that does not grow; the file appears whole or not at all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from spn_data.errors import InputError, StageError
+from spn_data.hdf5_disk import Disk
+from spn_data.hdf5_schema import (
+    COLUMNS,
+    IMAGES,
+    MASKS,
+    OFFSETS,
+    POINTS,
+    TEXT,
+    UNIT_TOLERANCE,
+    Column,
+    DatasetFrame,
+    DatasetInfo,
+    Role,
+)
+
+_FRAMES_A_BLOCK = 64  # held in memory without their images
+_POINTS_A_CHUNK = 16_384
+_MAX_ATTRIBUTE_BYTES = 60_000  # HDF5's own limit is 64 KiB
+_GROUP_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\- ]{0,99}")
+
+
+class DatasetWriter:
+    """Writes frames into groups, in any order of the groups.
+
+        with DatasetWriter(path, info, {"train": Role.TRAIN, "medium": Role.TEST}) as writer:
+            writer.append("train", frame)
+
+    The file appears at the end of the block; after an error there is none. Where a run was killed,
+    `<name>.part` lies about, which the next one replaces.
+    """
+
+    def __init__(self, path: Path, info: DatasetInfo, groups: Mapping[str, Role]):
+        self._path = path
+        self._part = path.with_name(path.name + ".part")
+        self._info = info
+        self._names: set[str] = set()
+        for name in groups:
+            if not _GROUP_NAME.fullmatch(name):
+                raise InputError(f"a group of a data set can't be named {name!r}", path=path)
+        try:
+            self._disk = Disk(self._part)
+        except OSError as error:
+            raise _unwritable(path, error) from error
+        self._file = h5py.File(self._disk, "w")
+        try:
+            for key, value in info.to_attributes().items():
+                if isinstance(value, str) and len(value.encode()) > _MAX_ATTRIBUTE_BYTES:
+                    raise ValueError(f"{key} takes more than {_MAX_ATTRIBUTE_BYTES} bytes")
+                self._file.attrs[key] = value
+            self._groups = {
+                name: _Group(self._file.create_group(name), Role(role), info.has_images)
+                for name, role in groups.items()
+            }
+        except BaseException:
+            self._abandon()
+            raise
+
+    def append(self, group: str, frame: DatasetFrame) -> None:
+        """Add a frame to a group.
+
+        Raises StageError where the disk does not take it, InputError for a second frame of that name or
+        an image of another size than the group's.
+        """
+        if frame.name in self._names:
+            raise InputError(f"two frames are named {frame.name}", path=self._path)
+        _check(frame, has_image=self._info.has_images)
+        try:
+            self._groups[group].append(frame)
+        except _OtherSize as error:
+            raise InputError(
+                f"images of group {group} are of {error.before} and of {error.now}: they need one "
+                "size; render all into one camera (without --native)",
+                path=self._path,
+            ) from error
+        if self._disk.error is not None:
+            raise _unwritable(self._path, self._disk.error)
+        self._names.add(frame.name)
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self._abandon()
+            return
+        try:
+            for group in self._groups.values():
+                group.finish()
+            self._file.close()
+            self._disk.sync()
+            self._disk.close()
+            self._part.replace(self._path)
+        except OSError as failure:
+            self._abandon()
+            raise _unwritable(self._path, failure) from failure
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        self._file.close()
+        self._disk.close()
+        self._part.unlink(missing_ok=True)
+
+
+class _OtherSize(Exception):
+    def __init__(self, before: tuple[int, ...], now: tuple[int, ...]):
+        self.before, self.now = f"{before[1]}x{before[0]}", f"{now[1]}x{now[0]}"
+
+
+class _Group:
+    """One group being written: images at once, the rest in blocks of frames."""
+
+    def __init__(self, group: h5py.Group, role: Role, has_images: bool):
+        self._group = group
+        self._frames: list[DatasetFrame] = []
+        self._mask_idx: list[int] = []
+        self._masks: dict[bytes, int] = {}
+        self._images: h5py.Dataset | None = None
+        self._count = 0
+        self._has_images = has_images
+        group.attrs["role"] = role.value
+        for name, column in COLUMNS.items():
+            _create(group, name, column, _FRAMES_A_BLOCK)
+        points = group.create_group("points")
+        points.attrs["for_training"] = int(role is Role.TRAIN)
+        for name, column in POINTS.items():
+            _create(points, name, column, _POINTS_A_CHUNK)
+        offsets = _create(points, "offsets", OFFSETS, _FRAMES_A_BLOCK)
+        _extend(offsets, np.zeros(1, np.int64))
+
+    def append(self, frame: DatasetFrame) -> None:
+        if frame.image is not None:
+            if self._images is None:
+                self._images = _create_images(self._group, frame.image.shape)
+            if self._images.shape[1:] != frame.image.shape:
+                raise _OtherSize(self._images.shape[1:], frame.image.shape)
+            self._images.resize(self._count + 1, axis=0)
+            self._images[self._count] = frame.image
+        self._mask_idx.append(self._mask_row(frame.valid))
+        self._frames.append(replace(frame, image=None, valid=None))  # what waits must be small
+        self._count += 1
+        if len(self._frames) == _FRAMES_A_BLOCK:
+            self._flush()
+
+    def _mask_row(self, valid: np.ndarray | None) -> int:
+        """Frames of one camera share a mask: each is stored once."""
+        if valid is None or valid.all():
+            return -1
+        packed = np.packbits(valid).tobytes()
+        if packed not in self._masks:
+            if "masks" not in self._group:
+                _create_masks(self._group, valid.shape)
+            _extend(self._group["masks"], valid[None].astype(np.uint8))
+            self._masks[packed] = len(self._masks)
+        return self._masks[packed]
+
+    def _flush(self) -> None:
+        frames = self._frames
+        if not frames:
+            return
+        rows: dict[str, Any] = {
+            "names": [f.name for f in frames],
+            "sequences": [f.sequence for f in frames],
+            "strata": [f.stratum for f in frames],
+            "time_s": [f.time_s for f in frames],
+            "dense": [int(f.dense) for f in frames],
+            "centers": [f.center for f in frames],
+            "quats_wxyz": [f.quat_wxyz for f in frames],
+            "covariance": [f.covariance for f in frames],
+            "intrinsics": [f.intrinsics for f in frames],
+            "mask_idx": self._mask_idx,
+        }
+        for name, values in rows.items():
+            _extend(self._group[name], np.array(values, dtype=self._group[name].dtype))
+        points = self._group["points"]
+        _extend(points["ids"], np.concatenate([f.point_ids for f in frames]))
+        _extend(points["pixels"], np.concatenate([f.point_pixels for f in frames]))
+        _extend(points["xyz"], np.concatenate([f.point_xyz for f in frames]))
+        counts = np.array([len(f.point_ids) for f in frames], dtype=np.int64)
+        _extend(points["offsets"], points["offsets"][-1] + np.cumsum(counts))
+        self._frames, self._mask_idx = [], []
+
+    def finish(self) -> None:
+        self._flush()
+        self._group.attrs["all_valid"] = int(not self._masks)
+
+
+def _check(frame: DatasetFrame, *, has_image: bool) -> None:
+    """ValueError where a frame breaks the format: a mistake of the caller's, never of the user's."""
+    numbers = np.concatenate([frame.center, frame.quat_wxyz])
+    if numbers.shape != (7,) or not np.isfinite(numbers).all():
+        raise ValueError(f"{frame.name}: no pose")
+    if abs(np.linalg.norm(frame.quat_wxyz) - 1) > UNIT_TOLERANCE or frame.quat_wxyz[0] < 0:
+        raise ValueError(f"{frame.name}: the quaternion is not canonical")
+    if frame.covariance.shape != (6, 6) or frame.intrinsics.shape != (3, 3):
+        raise ValueError(f"{frame.name}: covariance or intrinsics have another shape")
+    if frame.stratum not in ("high", "medium", "low", ""):
+        raise ValueError(f"{frame.name}: {frame.stratum!r} is no stratum")
+    k = len(frame.point_ids)
+    if frame.point_pixels.shape != (k, 2) or frame.point_xyz.shape != (k, 3):
+        raise ValueError(f"{frame.name}: points differ in length")
+    if (frame.image is None) == has_image:
+        raise ValueError(
+            f"{frame.name}: an image in a data set without, or none in one with images"
+        )
+    if frame.image is None:
+        return
+    if frame.image.dtype != np.uint8 or frame.image.ndim != 3 or frame.image.shape[2] != 3:
+        raise ValueError(f"{frame.name}: an image is (H, W, 3) uint8")
+    shape = frame.image.shape[:2]
+    if frame.valid is not None and frame.valid.shape != shape:
+        raise ValueError(f"{frame.name}: the mask has another shape than the image")
+    if k and not np.all((frame.point_pixels >= 0) & (frame.point_pixels < shape[::-1])):
+        raise ValueError(f"{frame.name}: a point outside the image")
+
+
+def _create(group: h5py.Group, name: str, column: Column, rows_a_chunk: int) -> h5py.Dataset:
+    dataset = group.create_dataset(
+        name,
+        shape=(0, *column.tail),
+        maxshape=(None, *column.tail),
+        chunks=(rows_a_chunk, *column.tail),
+        dtype=h5py.string_dtype() if column.dtype == TEXT else column.dtype,
+    )
+    dataset.attrs["description"] = column.says
+    return dataset
+
+
+def _create_images(group: h5py.Group, shape: tuple[int, ...]) -> h5py.Dataset:
+    """One chunk an image, not compressed: gzip saves a sixth of aerial images and reads 30 times slower."""
+    images = group.create_dataset(
+        "images", (0, *shape), np.uint8, maxshape=(None, *shape), chunks=(1, *shape)
+    )
+    images.attrs["description"] = IMAGES
+    return images
+
+
+def _create_masks(group: h5py.Group, shape: tuple[int, ...]) -> None:
+    masks = group.create_dataset(
+        "masks",
+        (0, *shape),
+        np.uint8,
+        maxshape=(None, *shape),
+        chunks=(1, *shape),
+        compression="gzip",
+    )
+    masks.attrs["description"] = MASKS
+
+
+def _extend(dataset: h5py.Dataset, rows: np.ndarray) -> None:
+    if len(rows):
+        before = len(dataset)
+        dataset.resize(before + len(rows), axis=0)
+        dataset[before:] = rows
+
+
+def _unwritable(path: Path, error: OSError) -> StageError:
+    return StageError(f"{path} cannot be written: {error.strerror}")

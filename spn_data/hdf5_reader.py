@@ -1,0 +1,320 @@
+"""dataset.h5 read: opened lazily, every shape and bound checked before it is relied on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from spn_data.errors import FormatError, InputError
+from spn_data.hdf5_schema import (
+    COLUMNS,
+    FORMAT,
+    OFFSETS,
+    POINTS,
+    TEXT,
+    UNIT_TOLERANCE,
+    VERSION,
+    Column,
+    DatasetInfo,
+    Role,
+)
+from spn_data.pose import Poses
+
+_MAX_GROUPS = 10_000
+_MAX_SIDE_PX = 65_536
+_MAX_TEXT = 4096
+_MAX_DEFLATION = 1100  # deflate compresses zeros by 1032 at most
+# HDF5 can load further filters from the disk, or read other files than this one.
+_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_LZF}
+_DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, eq=False)
+class FramePoints:
+    """Map points that one frame sees.
+
+    ids : (K,); pixels : (K, 2) float32 in its image, COLMAP's pixel convention; xyz : (K, 3) in the world.
+    """
+
+    ids: np.ndarray
+    pixels: np.ndarray
+    xyz: np.ndarray
+
+
+class Dataset:
+    """An open dataset.h5. Images and points are read when they are asked for; close it, or use `with`.
+
+    Raises InputError where there is no such file, FormatError where it is no data set, one of a newer
+    version, or damaged; the latter also later, when a damaged part is read.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        if not path.is_file():
+            raise InputError("does not exist" if not path.exists() else "is no file", path=path)
+        try:
+            self._file = h5py.File(path, "r", locking="best-effort")
+        except OSError as error:
+            raise FormatError(f"{path}: is no data set of this program ({error})") from error
+        try:
+            self.info = self._read_info()
+            self.groups = self._read_groups()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read_info(self) -> DatasetInfo:
+        attributes = _guarded(self.path, "its attributes", lambda: dict(self._file.attrs))
+        if attributes.get("format") != FORMAT:
+            raise FormatError(f"{self.path}: is no data set of this program")
+        version = _guarded(self.path, "its version", lambda: int(attributes["version"]))
+        if version != VERSION:
+            raise FormatError(
+                f"{self.path}: is of format {version}, this program reads {VERSION}; "
+                "make it anew, or update the program"
+            )
+        return _guarded(
+            self.path, "its attributes", lambda: DatasetInfo.from_attributes(attributes)
+        )
+
+    def _read_groups(self) -> dict[str, DatasetGroup]:
+        names = _guarded(self.path, "its groups", lambda: list(self._file))
+        if len(names) > _MAX_GROUPS:
+            raise FormatError(f"{self.path}: is damaged: {len(names)} groups")
+        return {name: self._read_group(name) for name in names}
+
+    def _read_group(self, name: str) -> DatasetGroup:
+        def read() -> DatasetGroup:
+            return DatasetGroup(self.path, name, _child(self._file, name, h5py.Group), self.info)
+
+        return _guarded(self.path, f"group {name}", read)
+
+    def of_role(self, role: Role) -> list[DatasetGroup]:
+        """Groups of one role, by name."""
+        return [group for group in self.groups.values() if group.role is role]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Dataset:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class DatasetGroup:
+    """Frames of one group. Columns are read at their first use and kept; images and points are not kept.
+
+    role : what it is for; image_size : (width, height), None without images; all_valid : no frame has an
+    invalid pixel; points_for_training : its points may be learnt from.
+    """
+
+    def __init__(self, path: Path, name: str, group: h5py.Group, info: DatasetInfo):
+        self._path, self.name = path, name
+        self.role = Role(group.attrs["role"])
+        self.all_valid = _is_set(group.attrs["all_valid"])
+        points = _child(group, "points", h5py.Group)
+        self.points_for_training = _is_set(points.attrs["for_training"])
+        if self.points_for_training and self.role is not Role.TRAIN:
+            raise ValueError(f"its points are marked for training, but it is of role {self.role}")
+        rows = len(_child(group, "names", h5py.Dataset))
+        self._length = rows
+        self._columns = {n: _table(group, n, column, rows) for n, column in COLUMNS.items()}
+        self._offsets = _table(points, "offsets", OFFSETS, rows + 1)
+        seen = len(_child(points, "ids", h5py.Dataset))
+        self._points = {n: _table(points, n, column, seen) for n, column in POINTS.items()}
+        self.image_size: tuple[int, int] | None = None
+        self._images, self._masks = None, None
+        if info.has_images and rows:
+            self._images = _pictures(group, "images", rows, (3,))
+            self.image_size = (self._images.shape[2], self._images.shape[1])
+        if not self.all_valid:
+            masks = len(_child(group, "masks", h5py.Dataset))
+            self._masks = _pictures(group, "masks", masks, ())
+            if self._images is None or self._masks.shape[1:] != self._images.shape[1:3]:
+                raise ValueError("masks have another size than the images")
+
+    def __len__(self) -> int:
+        return self._length
+
+    @cached_property
+    def names(self) -> np.ndarray:
+        """(N,) str."""
+        return self._texts("names")
+
+    @cached_property
+    def sequences(self) -> np.ndarray:
+        """(N,) str."""
+        return self._texts("sequences")
+
+    @cached_property
+    def strata(self) -> np.ndarray:
+        """(N,) str: high, medium, low, or empty."""
+        return self._texts("strata")
+
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        """(N,) seconds since the sequence's first frame."""
+        return self._column("time_s")
+
+    @cached_property
+    def dense(self) -> np.ndarray:
+        """(N,) bool: not chosen for the map."""
+        return self._column("dense") != 0
+
+    @cached_property
+    def poses(self) -> Poses:
+        """Of the N frames in the world; all finite, quaternions unit to 1e-5."""
+        centers, quats = self._column("centers"), self._column("quats_wxyz")
+        length = np.linalg.norm(quats, axis=1)
+        if not (np.isfinite(centers).all() and np.all(np.abs(length - 1) <= UNIT_TOLERANCE * 1.01)):
+            raise FormatError(f"{self._path}: group {self.name} holds a pose that is none")
+        return Poses(centers, quats)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(N, 6, 6), NaN where unknown."""
+        return self._column("covariance")
+
+    @cached_property
+    def intrinsics(self) -> np.ndarray:
+        """(N, 3, 3), COLMAP's pixel convention, NaN where unknown."""
+        return self._column("intrinsics")
+
+    @cached_property
+    def _mask_idx(self) -> np.ndarray:
+        index = self._column("mask_idx")
+        count = 0 if self._masks is None else len(self._masks)
+        if len(index) and not (index.min() >= -1 and index.max() < count):
+            raise FormatError(f"{self._path}: group {self.name} refers to masks that are not there")
+        return index
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        offsets = self._read("points", lambda: self._offsets[:])
+        total = len(self._points["ids"])
+        if offsets[0] != 0 or offsets[-1] != total or np.any(np.diff(offsets) < 0):
+            raise FormatError(f"{self._path}: offsets of the points of {self.name} are damaged")
+        return offsets
+
+    def image(self, row: int, out: np.ndarray | None = None) -> np.ndarray:
+        """(H, W, 3) uint8 RGB of a frame; into `out` where given."""
+        images = self._images
+        if images is None:
+            raise InputError("holds no images, only poses", path=self._path)
+        target = np.empty(images.shape[1:], np.uint8) if out is None else out
+        row = range(len(self))[row]
+        self._read(f"image {row}", lambda: images.read_direct(target, np.s_[row]))
+        return target
+
+    def valid(self, row: int) -> np.ndarray | None:
+        """(H, W) bool: pixels that show the scene; None where all of them do."""
+        masks, index = self._masks, int(self._mask_idx[row])
+        if index < 0 or masks is None:
+            return None
+        return self._read(f"mask {index}", lambda: masks[index]) != 0
+
+    def points(self, row: int) -> FramePoints:
+        """Map points that a frame sees."""
+        row = range(len(self))[row]
+        part = slice(int(self._ends[row]), int(self._ends[row + 1]))
+        read = self._read("points", lambda: {n: d[part] for n, d in self._points.items()})
+        return FramePoints(read["ids"], read["pixels"], read["xyz"])
+
+    def training_points(self, row: int) -> FramePoints:
+        """As `points`, where a network may learn from them. Raises InputError in any other group."""
+        if not self.points_for_training:
+            raise InputError(
+                f"the points of group {self.name} are not for training", path=self._path
+            )
+        return self.points(row)
+
+    def _column(self, name: str) -> np.ndarray:
+        return self._read(name, lambda: self._columns[name][:])
+
+    def _texts(self, name: str) -> np.ndarray:
+        found = self._read(name, lambda: self._columns[name].asstr()[:])
+        if any(len(text) > _MAX_TEXT for text in found):
+            raise FormatError(f"{self._path}: {self.name}/{name} holds a text without end")
+        return found.astype(np.str_)
+
+    def _read(self, what: str, read: Callable[[], _T]) -> _T:
+        return _guarded(self._path, f"{what} of {self.name}", read)
+
+
+def _guarded(path: Path, what: str, read: Callable[[], _T]) -> _T:
+    """FormatError for whatever a damaged file makes of a read."""
+    try:
+        return read()
+    except _DAMAGE as error:
+        raise FormatError(f"{path}: {what} cannot be read: {error}") from error
+
+
+def _child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
+    """ValueError for a link that leads out of the file, KeyError where there is nothing."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name} is a link")
+    found = group[name]
+    if not isinstance(found, kind):
+        raise ValueError(f"{name} is of another kind")
+    return found
+
+
+def _stored(group: h5py.Group, name: str) -> h5py.Dataset:
+    """A dataset whose values lie in this file, all of them, and need no filter but ours."""
+    dataset = _child(group, name, h5py.Dataset)
+    plist = dataset.id.get_create_plist()
+    filters = {plist.get_filter(k)[0] for k in range(plist.get_nfilters())}
+    if dataset.is_virtual or dataset.external or not filters <= _FILTERS:
+        raise ValueError(f"{name} is stored in a way that is not read")
+    if dataset.shape is None or dataset.chunks is None:
+        raise ValueError(f"{name} is no table of chunks")
+    stored = min(dataset.id.get_storage_size(), group.file.id.get_filesize())
+    if dataset.nbytes > stored * (_MAX_DEFLATION if filters else 1):
+        raise ValueError(f"{name} is cut short")
+    return dataset
+
+
+def _table(group: h5py.Group, name: str, column: Column, rows: int) -> h5py.Dataset:
+    dataset = _stored(group, name)
+    if column.dtype == TEXT:
+        text = h5py.check_string_dtype(dataset.dtype)
+        is_right = text is not None and text.length is None and text.encoding == "utf-8"
+    else:
+        is_right = dataset.dtype == np.dtype(column.dtype)
+    if not is_right or dataset.shape != (rows, *column.tail):
+        raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
+    return dataset
+
+
+def _pictures(group: h5py.Group, name: str, rows: int, tail: tuple[int, ...]) -> h5py.Dataset:
+    dataset = _stored(group, name)
+    height, width = dataset.shape[1:3] if len(dataset.shape) == 3 + len(tail) else (0, 0)
+    if (
+        dataset.dtype != np.uint8
+        or dataset.shape != (rows, height, width, *tail)
+        or not (0 < height <= _MAX_SIDE_PX and 0 < width <= _MAX_SIDE_PX)
+        or dataset.chunks != (1, height, width, *tail)
+    ):
+        raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
+    return dataset
+
+
+def _is_set(value: Any) -> bool:
+    if int(value) not in (0, 1):
+        raise ValueError(f"{value!r} is neither 0 nor 1")
+    return bool(int(value))
