@@ -1,0 +1,66 @@
+"""`spn-data export`: labels in other programs' formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cli import console, options
+
+FORMATS = ("tum", "nerfstudio", "kapture", "geojson", "kml", "colmap-text", "colmap", "nvm", "all")
+
+
+@click.command()
+@click.argument("format_name", metavar="FORMAT", type=click.Choice(FORMATS))
+@click.option(
+    "--to",
+    "target",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Folder to write; it must be new or empty.",
+)
+@options.area
+@click.option(
+    "--sequence",
+    "sequences",
+    multiple=True,
+    help="Sequence to export; may be repeated.  [default: all]",
+)
+@click.option(
+    "--all-frames", is_flag=True, help="Dense frames too, in formats that list no images."
+)
+@click.option("--no-images", is_flag=True, help="Copy no images beside the poses.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier export in that folder.")
+def export(
+    format_name: str,
+    target: Path,
+    area_folder: Path,
+    sequences: tuple[str, ...],
+    all_frames: bool,
+    no_images: bool,
+    overwrite: bool,
+) -> None:
+    """Write the poses of all registered frames for other programs.
+
+    FORMAT is tum, nerfstudio, kapture, geojson, kml, colmap-text, colmap, nvm, or all for a folder of
+    each. Mapping and evaluation frames are written; the area is left as it is.
+
+    \b
+    Example:
+        spn-data export nerfstudio --to north-nerf --area fields/north
+    """
+    from spn_data.pipeline import export as stage
+
+    area = options.open_area(area_folder)
+    chosen = stage.ExportOptions(sequences=sequences, all_frames=all_frames, images=not no_images)
+    with area.locked():
+        done = stage.export(area, stage.Format(format_name), target, chosen, overwrite=overwrite)
+    sequences_told = ", ".join(f"{name} {count}" for name, count in done.frames.items())
+    console.out.print(f"{target}: {', '.join(done.formats)}; frames: {sequences_told}")
+    if done.units != "m":
+        console.out.print(
+            "The area has no place in the world: lengths are in units of the model, not metres."
+        )
+    for name, reason in done.left_out.items():
+        console.out.print(f"{name} is left out: it {reason}.")

@@ -1,0 +1,70 @@
+"""A copy of a model with more images, which have poses and see points of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.colmap import pycolmap
+from spn_data.colmap.model import load_native, write_native
+from spn_data.colmap.verify import native_camera
+from spn_data.errors import StageError
+from spn_data.labels import Labels, SeenPoints
+
+
+def write_extended(
+    source: Path,
+    target: Path,
+    labels: Labels,
+    seen: SeenPoints,
+    cameras: dict[str, Camera],
+    *,
+    text: bool = False,
+) -> None:
+    """The model in `source`, and each frame of `labels` as one image more, in COLMAP's binary or text format.
+
+    labels : registered frames that the model does not hold; cameras : by their keys. Images, cameras and
+    positions of points in `source` stay as they are; a point's track gains the observations in `seen`.
+    Raises StageError where the disk is full.
+    """
+    native = load_native(source)
+    camera_ids = {}
+    first = max(native.cameras, default=0) + 1
+    for camera_id, key in enumerate(sorted(set(labels.cameras.tolist())), first):
+        camera_ids[key] = camera_id
+        native.add_camera_with_trivial_rig(
+            native_camera(cameras[key], camera_id=camera_id, focal_is_known=True)
+        )
+    quats_xyzw, translations = labels.poses.to_cam_from_world()
+    # A trivial frame has its image's id, which must not be that of another frame either.
+    first = max([*native.images, *native.frames], default=0) + 1
+    for row, name in enumerate(labels.names.tolist()):
+        image_id = first + row
+        point_ids, pixels = seen.of_frame(row)
+        image = pycolmap.Image(
+            name=name,
+            keypoints=np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2),
+            camera_id=camera_ids[str(labels.cameras[row])],
+            image_id=image_id,
+        )
+        rotation = pycolmap.Rotation3d(quats_xyzw[row])
+        native.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, translations[row]))
+        for point2d_idx, point_id in enumerate(point_ids.tolist()):
+            native.add_observation(point_id, pycolmap.TrackElement(image_id, point2d_idx))
+    if not text:
+        write_native(native, target)
+        return
+    target.mkdir(parents=True, exist_ok=True)
+    native.write_text(str(target))
+    # COLMAP does not notice a disk that is full.
+    try:
+        found = pycolmap.Reconstruction()
+        found.read_text(str(target))
+        whole = found.num_points3D() == native.num_points3D()
+        whole = whole and found.num_reg_images() == native.num_reg_images()
+    except (RuntimeError, ValueError, IndexError):
+        whole = False
+    if not whole:
+        raise StageError(f"{target}: cannot be written whole; is the disk full?")

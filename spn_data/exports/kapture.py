@@ -1,0 +1,58 @@
+"""A data set in the format of kapture 1.1: sensors, their trajectories, and the images they took.
+
+Poses lead from world to sensor: `qw qx qy qz` and the translation t = -R centre. Cameras have COLMAP's models
+and parameters. https://github.com/naver/kapture/blob/main/kapture_format.adoc
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.exports.frames import ExportedFrames, timestamps_us
+from spn_data.record import write_atomically
+
+FOLDER_OF_IMAGES = "sensors/records_data"
+_VERSION = "# kapture format: 1.1"
+
+
+def write_kapture(folder: Path, frames: ExportedFrames) -> None:
+    """sensors/sensors.txt, trajectories.txt and records_camera.txt.
+
+    A sequence is a sensor (one for each of its cameras), since sequences of one camera share timestamps:
+    microseconds since the sequence's first frame (`timestamps_us`).
+    No rigs: no camera is fixed to another.
+    """
+    labels = frames.labels
+    sensors: dict[str, str] = {}
+    trajectories, records = [], []
+    for sequence, rows in frames.sequences():
+        keys = sorted(set(labels.cameras[rows].tolist()))
+        for key in keys:
+            sensor = sequence if len(keys) == 1 else f"{sequence}/{key}"
+            camera = frames.cameras[key]
+            params = ", ".join(repr(float(value)) for value in camera.params)
+            sensors[sensor] = (
+                f"{key}, camera, {camera.model}, {camera.width}, {camera.height}, {params}"
+            )
+            mine = rows[labels.cameras[rows] == key]
+            quats_xyzw, translations = labels.poses[mine].to_cam_from_world()
+            numbers = np.concatenate([np.roll(quats_xyzw, 1, axis=1), translations], axis=1)
+            for k, stamp in enumerate(timestamps_us(labels.time_s[mine])):
+                pose = ", ".join(repr(float(value)) for value in numbers[k])
+                trajectories.append(f"{stamp}, {sensor}, {pose}")
+                records.append(f"{stamp}, {sensor}, {labels.names[mine[k]]}")
+    told = f"# {frames.world}"
+    tables = {
+        "sensors": (
+            "# sensor_id, name, sensor_type, [sensor_params]+",
+            [f"{sensor}, {rest}" for sensor, rest in sensors.items()],
+        ),
+        "trajectories": ("# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz", trajectories),
+        "records_camera": ("# timestamp, device_id, image_path", records),
+    }
+    (folder / FOLDER_OF_IMAGES).mkdir(parents=True)
+    for name, (head, rows_of_table) in tables.items():
+        text = "\n".join([_VERSION, told, head, *rows_of_table]) + "\n"
+        write_atomically(folder / "sensors" / f"{name}.txt", text)

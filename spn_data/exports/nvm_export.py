@@ -1,0 +1,30 @@
+"""The frames as a model of VisualSFM, as if their images were undistorted and centred."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.exports.frames import ExportedFrames
+from spn_data.nvm import nvm_model, offsets_from_center, write_nvm
+
+
+def write_nvm_export(folder: Path, frames: ExportedFrames) -> None:
+    """reconstruction.nvm: each camera without distortion, its focal length the mean of both."""
+    labels, seen = frames.labels, frames.seen
+    focal_px = np.array([np.mean(frames.camera_of(row).focal_px) for row in range(len(frames))])
+    offsets = np.empty((len(seen.pixels), 2))
+    ends = np.searchsorted(seen.frame_idx, np.arange(len(frames) + 1))
+    for row in range(len(frames)):
+        mine = slice(ends[row], ends[row + 1])
+        camera = frames.camera_of(row)
+        offsets[mine] = offsets_from_center(camera, seen.pixels[mine], float(focal_px[row]))
+    model = nvm_model(
+        tuple(labels.names.tolist()),
+        labels.poses,
+        focal_px,
+        (frames.points.xyz, frames.points.colors),
+        (frames.points.rows_of(seen.point_ids), seen.frame_idx, offsets),
+    )
+    write_nvm(folder / "reconstruction.nvm", model)

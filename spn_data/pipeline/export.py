@@ -1,0 +1,265 @@
+"""Exports: the area's labels in other programs' formats, in a folder of their own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.area import EVALUATION, FRAMES, Area
+from spn_data.errors import StageError
+from spn_data.exports.colmap_export import FOLDER_OF_IMAGES as COLMAP_IMAGES
+from spn_data.exports.colmap_export import write_colmap
+from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.geojson import write_geojson
+from spn_data.exports.kapture import FOLDER_OF_IMAGES as KAPTURE_IMAGES
+from spn_data.exports.kapture import write_kapture
+from spn_data.exports.kml import write_kml
+from spn_data.exports.nerfstudio import FOLDER_OF_IMAGES as NERFSTUDIO_IMAGES
+from spn_data.exports.nerfstudio import write_nerfstudio
+from spn_data.exports.nvm_export import write_nvm_export
+from spn_data.exports.tum import write_tum
+from spn_data.labels import Labels, SeenPoints
+from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area
+from spn_data.record import VERSION, write_json
+
+RECORD = "export.json"
+
+
+class Format(StrEnum):
+    """What labels can be exported as; ALL makes a folder of each that the area allows."""
+
+    TUM = "tum"
+    NERFSTUDIO = "nerfstudio"
+    KAPTURE = "kapture"
+    GEOJSON = "geojson"
+    KML = "kml"
+    COLMAP_TEXT = "colmap-text"
+    COLMAP = "colmap"
+    NVM = "nvm"
+    ALL = "all"
+
+
+# Formats that list images, with the folder where those are looked up.
+_IMAGES = {
+    Format.NERFSTUDIO: NERFSTUDIO_IMAGES,
+    Format.KAPTURE: KAPTURE_IMAGES,
+    Format.COLMAP_TEXT: COLMAP_IMAGES,
+    Format.COLMAP: COLMAP_IMAGES,
+}
+_NEED_ORIGIN = (Format.GEOJSON, Format.KML)
+_WITH_MAP = (Format.COLMAP_TEXT, Format.COLMAP)  # holds the map whole, whatever is chosen
+_WITH_DENSE = (Format.TUM, Format.GEOJSON, Format.KML)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What is exported.
+
+    sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames); all_frames : dense frames too, in formats that list no
+    images; images : copy the images that a format lists.
+    """
+
+    sequences: tuple[str, ...] = ()
+    all_frames: bool = False
+    images: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exported:
+    """What an export holds: frames by sequence, formats written, and formats left out, with the reason."""
+
+    units: str
+    frames: dict[str, int]
+    formats: tuple[str, ...]
+    left_out: dict[str, str]
+
+
+def export(
+    area: Area,
+    format_name: Format,
+    target: Path,
+    options: ExportOptions,
+    *,
+    overwrite: bool = False,
+) -> Exported:
+    """Write the registered frames to the folder `target`, which appears whole.
+
+    Raises StageError where the target holds something, where no frame has a pose, where a sequence is
+    unknown, and where a format needs a place in the world that the area does not have.
+    """
+    target = Path(os.path.abspath(target))
+    check_target(area, target, overwrite=overwrite)
+    labelled = read_labelled_area(area)
+    wanted = [f for f in Format if f != Format.ALL] if format_name == Format.ALL else [format_name]
+    left_out: dict[str, str] = {}
+    if format_name == Format.ALL and labelled.origin is None:
+        left_out = {f.value: "needs a place in the world" for f in _NEED_ORIGIN}
+        wanted = [f for f in wanted if f not in _NEED_ORIGIN]
+    if options.all_frames and format_name != Format.ALL and format_name not in _WITH_DENSE:
+        raise StageError(
+            f"{format_name.value} lists images, and --all-frames adds frames that are stored only in "
+            f"their video; export {', '.join(f.value for f in _WITH_DENSE)} with it"
+        )
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        counts: dict[str, int] = {}
+        for one in wanted:
+            folder = partial / one.value if format_name == Format.ALL else partial
+            dense = options.all_frames and one in _WITH_DENSE
+            frames = chosen_frames(
+                labelled, options.sequences, dense=dense, whole_map=one in _WITH_MAP
+            )
+            counts = {name: len(rows) for name, rows in frames.sequences()}
+            _write(area, one, folder, frames, images=options.images)
+        if format_name == Format.ALL:
+            write_json(partial / RECORD, {"version": VERSION, "format": Format.ALL.value})
+        _put_in_place(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Exported(
+        units=labelled.units,
+        frames=counts,
+        formats=tuple(f.value for f in wanted),
+        left_out=left_out,
+    )
+
+
+def check_target(area: Area, target: Path, *, overwrite: bool) -> None:
+    """Raises StageError unless the folder is free, or an export of ours that may be replaced."""
+    inside = target.resolve()
+    if inside == area.root.resolve() or any(
+        area.folder(stage.partition("/")[0]).resolve() in (inside, *inside.parents)
+        for stage in area.stages()
+    ):
+        raise StageError(f"{target} belongs to the area itself; name another folder with --to")
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise StageError(f"{target} is not a folder; name another with --to")
+    if not target.exists() or not any(target.iterdir()):
+        return
+    if not (target / RECORD).is_file():
+        raise StageError(f"{target} holds files that are no export; name another folder with --to")
+    if not overwrite:
+        raise StageError(f"{target} holds an export already; --overwrite replaces it")
+
+
+def chosen_frames(
+    labelled: LabelledArea,
+    sequences: Sequence[str],
+    *,
+    dense: bool = False,
+    whole_map: bool = False,
+) -> ExportedFrames:
+    """Frames with a pose, of the sequences named or of all, sorted by sequence and time.
+
+    dense : dense frames too; whole_map : all mapping frames, also those of other sequences.
+    """
+    parts: list[tuple[Labels, SeenPoints, bool]] = [
+        (labelled.mapping, labelled.mapping_seen, False),
+        (labelled.dense, labelled.dense_seen, False),
+    ]
+    for name, labels in labelled.evaluation.items():
+        parts.append((labels, labelled.evaluation_seen[name], True))
+    known = sorted({name for labels, _, _ in parts for name in labels.sequences.tolist()})
+    for name in sequences:
+        if name not in known:
+            raise StageError(f"there is no sequence {name!r}; there are {', '.join(known)}")
+    kept = []
+    for labels, seen, is_evaluation in parts:
+        mask = labels.registered & (dense | ~labels.dense)
+        if sequences and (is_evaluation or not whole_map):
+            mask &= np.isin(labels.sequences, list(sequences))
+        rows = np.flatnonzero(mask)
+        kept.append((labels.select(rows), seen.select(rows), np.full(len(rows), is_evaluation)))
+    labels = Labels.concatenate([part for part, _, _ in kept])
+    if len(labels) == 0:
+        raise StageError("no frame of " + (", ".join(sequences) or "the area") + " has a pose")
+    first = np.cumsum([0, *(len(part) for part, _, _ in kept)])
+    seen = SeenPoints(
+        np.concatenate([s.frame_idx + first[k] for k, (_, s, _) in enumerate(kept)]),
+        np.concatenate([s.point_ids for _, s, _ in kept]),
+        np.concatenate([s.pixels for _, s, _ in kept]),
+    )
+    order = np.lexsort((labels.names, labels.time_s, labels.sequences))
+    return ExportedFrames(
+        units=labelled.units,
+        origin=labelled.origin,
+        labels=labels.select(order),
+        is_evaluation=np.concatenate([flag for _, _, flag in kept])[order],
+        seen=seen.select(order),
+        points=labelled.points,
+        cameras=labelled.cameras,
+    )
+
+
+def _write(area: Area, one: Format, folder: Path, frames: ExportedFrames, *, images: bool) -> None:
+    folder.mkdir(parents=True)
+    writers: dict[Format, Callable[[Path, ExportedFrames], None]] = {
+        Format.TUM: write_tum,
+        Format.NERFSTUDIO: write_nerfstudio,
+        Format.KAPTURE: write_kapture,
+        Format.GEOJSON: write_geojson,
+        Format.KML: write_kml,
+        Format.NVM: write_nvm_export,
+    }
+    if one in writers:
+        writers[one](folder, frames)
+    else:
+        write_colmap(folder, frames, map_folder(area), text=one == Format.COLMAP_TEXT)
+    if images and one in _IMAGES:
+        _copy_images(area, folder / _IMAGES[one], frames)
+    write_json(folder / RECORD, {"version": VERSION, **_record(area, one, frames)})
+
+
+def _copy_images(area: Area, folder: Path, frames: ExportedFrames) -> None:
+    for name, is_evaluation in zip(frames.labels.names.tolist(), frames.is_evaluation, strict=True):
+        sequence, _, file = name.partition("/")
+        source = (
+            area.folder(f"{EVALUATION}/{sequence}") / "frames" / file
+            if is_evaluation
+            else area.folder(FRAMES) / name
+        )
+        (folder / sequence).mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, folder / name)
+
+
+def _record(area: Area, one: Format, frames: ExportedFrames) -> dict[str, Any]:
+    """What a folder holds, also where the format itself can't say it."""
+    origin = frames.origin
+    return {
+        "format": one.value,
+        "units": frames.units,
+        "origin": None
+        if origin is None
+        else {
+            "lat_deg": origin.lat_deg,
+            "lon_deg": origin.lon_deg,
+            "alt_m": origin.alt_m,
+            "height_reference": origin.height_reference.value,
+        },
+        "sequences": {
+            name: {
+                "frames": len(rows),
+                "role": "evaluation" if frames.is_evaluation[rows[0]] else "mapping",
+            }
+            for name, rows in frames.sequences()
+        },
+        "made_of": {stage: area.record(stage).fingerprint() for stage in area.stages()},
+    }
+
+
+def _put_in_place(partial: Path, target: Path) -> None:
+    """`target` is empty, missing, or an export that may be replaced."""
+    old = target.with_name(f".{target.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        target.rename(old)
+    partial.rename(target)
+    shutil.rmtree(old, ignore_errors=True)
