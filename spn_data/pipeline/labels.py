@@ -80,7 +80,7 @@ def read_labelled_area(area: Area) -> LabelledArea:
         parts = [_read_stage(area, stage, world_from_model)]
         if name in area.sequences(DENSE):
             parts.append(_read_stage(area, f"{DENSE}/{name}", world_from_model))
-        evaluation[name], evaluation_seen[name] = _together(parts)
+        evaluation[name], evaluation_seen[name] = together(parts)
         cameras[name] = _read_camera(area.folder(stage) / CAMERA)
     dense = [
         _read_stage(area, f"{DENSE}/{name}", world_from_model)
@@ -88,7 +88,7 @@ def read_labelled_area(area: Area) -> LabelledArea:
         if name not in evaluation
     ]
     nothing = (mapping.select(np.zeros(0, np.int64)), mapping_seen.select(np.zeros(0, np.int64)))
-    dense_labels, dense_seen = _together(dense) if dense else nothing
+    dense_labels, dense_seen = together(dense) if dense else nothing
     return LabelledArea(
         units="m" if area.has(GEO) else "model",
         origin=read_origin(area),
@@ -213,7 +213,7 @@ def _read_stage(area: Area, stage: str, world_from_model: Similarity) -> tuple[L
     return labels, read_seen_points(folder / SEEN)
 
 
-def _together(parts: list[tuple[Labels, SeenPoints]]) -> tuple[Labels, SeenPoints]:
+def together(parts: list[tuple[Labels, SeenPoints]]) -> tuple[Labels, SeenPoints]:
     """One after the other, sorted by sequence and time."""
     labels = Labels.concatenate([part for part, _ in parts])
     first = np.cumsum([0, *(len(part) for part, _ in parts)])
