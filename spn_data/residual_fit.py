@@ -207,11 +207,11 @@ def _normal(
         axis=1,
     )
     root = np.sqrt(weights)[:, None, None]
-    a = _rows_to_sparse(
+    a = rows_to_sparse(
         root * np.concatenate([per_frame, shared], axis=2), columns, first_shared + shared.shape[2]
     )
     count = int(point.max()) + 1
-    p = _rows_to_sparse(root * whitened, 3 * point[:, None] + np.arange(3), 3 * count)
+    p = rows_to_sparse(root * whitened, 3 * point[:, None] + np.arange(3), 3 * count)
     through_points = p.T @ a
     direct = a.T @ a
     normal = np.asarray((direct - through_points.T @ through_points).todense())
@@ -220,7 +220,8 @@ def _normal(
     return normal
 
 
-def _rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
+def rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
+    """(2 M, width) from blocks (M, 2, n) whose both rows have the columns (M, n)."""
     m, two, n = values.shape
     pointers = n * np.arange(two * m + 1)
     return sparse.csr_matrix(
