@@ -1,0 +1,80 @@
+"""The pose of one image from map points that it sees, from a near start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.residual_fit import projection_jacobians
+
+_MAX_STEPS = 20
+_CONVERGED_PX = 1e-3  # mean change of the projections
+_BEHIND_PX = 1e6  # residual of a point behind the camera
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """A pose fitted to K points.
+
+    poses : (1,); residuals_px : (K, 2) projected minus measured; inverse : (6, 6) of the robust normal
+    matrix, over the centre and a rotation vector in the camera frame, for residuals of one pixel.
+    """
+
+    poses: Poses
+    residuals_px: np.ndarray
+    inverse: np.ndarray
+
+    def inliers(self, max_error_px: float) -> np.ndarray:
+        """(K,) bool."""
+        return (self.residuals_px**2).sum(axis=1) < max_error_px**2
+
+
+def fit_pose(
+    camera: Camera,
+    start: Poses,
+    xyz: np.ndarray,
+    pixels: np.ndarray,
+    *,
+    first_px: float,
+    last_px: float,
+) -> PoseFit | None:
+    """Least robust cost (Cauchy) over points (K, 3) and pixels (K, 2); None where it does not converge.
+
+    The scale of the loss shrinks from first_px to last_px, so that a start some pixels off finds its way
+    and far outliers count little at the end.
+    """
+    center, rotation = start.centers[0], start.rotations[0]
+    scale = max(first_px, last_px)
+    for _ in range(_MAX_STEPS):
+        in_camera = (xyz - center) @ rotation.T
+        ahead = in_camera[:, 2] > 0
+        if np.count_nonzero(ahead) < 4:
+            return None
+        x, residuals = in_camera[ahead], camera.project(in_camera[ahead]) - pixels[ahead]
+        weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
+        by_point = projection_jacobians(camera, x)[0]
+        # A turn exp(v) moves a point x by v x x; a move of the centre, by -R of it.
+        by_pose = np.concatenate(
+            [-by_point @ rotation, np.cross(x[:, None, :], by_point)], axis=2
+        ).reshape(-1, 6)
+        weighted = by_pose * np.repeat(weights, 2)[:, None]
+        try:
+            inverse = np.linalg.inv(weighted.T @ by_pose)
+        except np.linalg.LinAlgError:
+            return None
+        step = -inverse @ (weighted.T @ residuals.ravel())
+        if not np.isfinite(step).all():
+            return None
+        center = center + step[:3]
+        rotation = rotations_from_vectors(step[3:]) @ rotation
+        if scale == last_px and np.abs(by_pose @ step).mean() < _CONVERGED_PX:
+            break
+        scale = max(last_px, scale / 2)
+    else:
+        return None
+    poses = Poses.from_rotations(center[None], rotation[None])
+    residuals = camera.project((xyz - center) @ rotation.T) - pixels
+    return PoseFit(poses, np.nan_to_num(residuals, nan=_BEHIND_PX), inverse)
