@@ -10,6 +10,7 @@ import click
 from cli import options
 from cli.console import Group
 from cli.coverage import coverage
+from cli.export import export
 
 
 @click.group(cls=Group)
@@ -104,6 +105,9 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
 
 
 main.add_command(coverage)
+
+
+main.add_command(export)
 
 
 @main.command()

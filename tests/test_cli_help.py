@@ -49,7 +49,7 @@ def command_lines(text: str) -> list[tuple[str, bool]]:
 
 def test_the_commands_are_those_of_this_version():
     """A command that comes or goes is noticed here, and then told in the README."""
-    assert COMMANDS == ["coverage", "georegister", "reconstruct", "simulate", "status"]
+    assert COMMANDS == ["coverage", "export", "georegister", "reconstruct", "simulate", "status"]
 
 
 def test_help_lists_the_commands_in_the_order_of_work():
@@ -57,7 +57,7 @@ def test_help_lists_the_commands_in_the_order_of_work():
     shown = CliRunner().invoke(main, ["--help"])
     assert shown.exit_code == 0
     listed = re.findall(r"^  (\w+) {2,}\S", shown.output.split("Commands:")[1], re.MULTILINE)
-    assert listed == ["reconstruct", "georegister", "coverage", "status", "simulate"]
+    assert listed == ["reconstruct", "georegister", "coverage", "export", "status", "simulate"]
 
 
 @pytest.mark.parametrize("group", [main, model_main])
