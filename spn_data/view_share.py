@@ -11,7 +11,6 @@ from spn_data.camera import Camera
 from spn_data.pose import Poses
 from spn_data.timing import Progress
 
-_FINER = 2  # cells in which points hide others, to a cell of the grid, in each direction
 _BORDER_STEPS = 17
 
 
@@ -24,7 +23,7 @@ class ViewOptions:
     # A point looks alike from two places only if they see it from about the same side,
     max_turn_deg: float = 40.0
     max_range_factor: float = 2.0  # and from about the same distance.
-    # A point is hidden if as many points in about its direction
+    # A point is hidden if as many points of its cell
     occluders: int = 3
     occluder_ratio: float = 0.75  # lie nearer than this share of its distance.
 
@@ -93,14 +92,14 @@ def _share(
     options: ViewOptions,
 ) -> float:
     points, x, y, ranges = _in_view(center, rotation, camera, border, seen.xyz)
-    fine_columns, fine_rows = options.columns * _FINER, options.rows * _FINER
-    column = (x * (fine_columns / camera.width)).astype(np.int64)
-    row = (y * (fine_rows / camera.height)).astype(np.int64)
-    free = ~_hidden(row * fine_columns + column, ranges, fine_columns * fine_rows, options)
-    points, ranges = points[free], ranges[free]
-    cells = (row[free] // _FINER) * options.columns + column[free] // _FINER
+    count = options.columns * options.rows
+    column = (x * (options.columns / camera.width)).astype(np.int64)
+    row = (y * (options.rows / camera.height)).astype(np.int64)
+    cells = row * options.columns + column
+    free = ~_hidden(cells, ranges, count, options)
+    points, ranges, cells = points[free], ranges[free], cells[free]
     known = _known(center, points, ranges, seen, options)
-    return len(np.unique(cells[known])) / (options.columns * options.rows)
+    return len(np.unique(cells[known])) / count
 
 
 def _border(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

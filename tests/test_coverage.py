@@ -1,0 +1,385 @@
+"""Coverage: nearest frames and strata, views with points, where to fly again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spn_data.cambridge import read_cambridge
+from spn_data.camera import Camera
+from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames, strata_of
+from spn_data.coverage_table import (
+    COLUMNS,
+    MappingFrames,
+    Queries,
+    cover,
+    remarks,
+    write_coverage,
+)
+from spn_data.errors import GeometryError
+from spn_data.pose import Poses, rotations_from_angles
+from spn_data.refly import ReflyOptions, where_to_fly_again
+from spn_data.simulate import preset, simulate_paths
+from spn_data.view_share import SeenMap, ViewOptions, view_shares
+
+CAMERA = Camera.from_horizontal_fov(1600, 900, 90.0)
+NORTH = (0.0, 0.0, 0.0)
+
+
+def looking(*rows: tuple[float, ...]) -> Poses:
+    """Poses of rows (x, y, z, heading, pitch, roll), angles that are left out being 0."""
+    full = np.array([(*row, *NORTH)[:6] for row in rows], dtype=np.float64)
+    return Poses.from_rotations(full[:, :3], rotations_from_angles(full[:, 3:]))
+
+
+def both(a: Poses, b: Poses) -> Poses:
+    return Poses(
+        np.concatenate([a.centers, b.centers]), np.concatenate([a.quats_wxyz, b.quats_wxyz])
+    )
+
+
+@pytest.fixture(scope="module")
+def flights() -> dict[int, tuple[Poses, dict[str, Poses]]]:
+    """By seed: every eighth mapping pose, and the poses of the evaluation flights."""
+    found = {}
+    for seed in (1, 2, 3):
+        paths = simulate_paths(preset("standard", seed=seed))
+        mapping = [path.poses[::8] for path in paths.values() if path.role == "mapping"]
+        evaluation = {name: paths[name].poses for name in ("medium", "low")}
+        found[seed] = (both(*mapping), evaluation)
+    return found
+
+
+class TestNearest:
+    def test_strata_end_at_their_limits(self):
+        """2 m and 15 degrees are high, 5 m and 40 degrees medium, a little more is not; both must hold."""
+        queries = looking(
+            (2, 0, 0), (2.001, 0, 0), (0, 0, 0, 14.999), (0, 0, 0, 15.001),
+            (5, 0, 0), (5.001, 0, 0), (0, 0, 0, 39.999), (0, 0, 0, 40.001),
+            (0, 0, 4.9, 0, -39.9), (0, 0, 1, 0, 0, 41),
+        )  # fmt: skip
+        expected = ["high", *["medium", "high", "medium"], *["medium", "low"] * 3]
+        assert strata_of(queries, looking((0, 0, 0))).tolist() == expected
+
+    def test_the_limits_are_options(self):
+        """Other limits give other strata."""
+        options = CoverageOptions(high_m=3.0, high_deg=20.0, medium_m=3.5, medium_deg=20.0)
+        found = strata_of(looking((2.9, 0, 0), (3.4, 0, 0), (3.6, 0, 0)), looking(NORTH), options)
+        assert found.tolist() == ["high", "medium", "low"]
+
+    def test_limits_of_high_lie_within_those_of_medium(self):
+        """Options by which a frame could be high and not medium are refused."""
+        with pytest.raises(ValueError, match="within those of medium"):
+            CoverageOptions(high_m=6.0)
+
+    def test_near_and_looking_elsewhere_is_not_near(self):
+        """The frame at the same place that looks the other way is not the nearest."""
+        mapping = looking((0, 0, 0, 180), (3, 0, 1, 10))
+        found = nearest_frames(looking((0, 0, 0)), mapping)
+        assert found.frame.tolist() == [1]
+        assert found.stratum.tolist() == ["medium"]
+        assert found.distance[0] == pytest.approx(np.sqrt(10))
+        assert found.angle_deg[0] == pytest.approx(10)
+        assert found.height[0] == pytest.approx(-1)  # the query lies 1 m below the frame
+
+    def test_the_better_stratum_counts_before_the_smaller_sum(self):
+        """1.9 m and 14 degrees is high; 0.1 m and 16 degrees is less in sum, but medium: the best answer."""
+        found = nearest_frames(looking((0, 0, 0)), looking((1.9, 0, 0, 14), (0.1, 0, 0, 16)))
+        assert found.stratum.tolist() == ["high"]
+        assert found.frame.tolist() == [0]
+        assert found.answer_distance[0] == pytest.approx(0.1)
+        assert found.answer_angle_deg[0] == pytest.approx(16)
+
+    def test_q_and_minus_q_are_one_direction(self):
+        """The sign of a quaternion says nothing."""
+        mapping = looking((0, 0, 0, 170))
+        turned = Poses(mapping.centers, -mapping.quats_wxyz)
+        assert nearest_frames(mapping, turned).angle_deg[0] < 1e-6
+
+    def test_blocks_change_nothing(self, monkeypatch):
+        """Frames are compared in blocks of bounded memory; the result is that of all at once."""
+        rng = np.random.default_rng(0)
+        rows = rng.uniform((-20, -20, 0, 0, -40, 0), (20, 20, 10, 360, 10, 0.1), (300, 6))
+        queries, mapping = looking(*rows[:120]), looking(*rows[120:])
+        whole = nearest_frames(queries, mapping)
+        monkeypatch.setattr("spn_data.coverage._PAIRS_AT_ONCE", 1000)
+        parts = nearest_frames(queries, mapping)
+        for column in ("stratum", "frame", "distance", "answer_distance", "answer_angle_deg"):
+            np.testing.assert_array_equal(getattr(whole, column), getattr(parts, column))
+        assert set(whole.stratum) == {"medium", "low"} or set(whole.stratum) == {*Stratum}
+
+    def test_frames_without_a_pose_have_no_stratum_and_cover_nothing(self):
+        """NaN among queries gives "", NaN among mapping frames is left out."""
+        queries, mapping = looking((1, 0, 0), (9, 0, 0)), looking((0, 0, 0), (9, 0, 0))
+        queries.centers[0], queries.quats_wxyz[0] = np.nan, np.nan
+        mapping.centers[1], mapping.quats_wxyz[1] = np.nan, np.nan
+        assert strata_of(queries, mapping).tolist() == ["", "low"]
+
+    def test_without_mapping_frames_there_is_no_answer(self):
+        """Nothing to compare with is an error, not infinity."""
+        with pytest.raises(GeometryError, match="no mapping frame"):
+            nearest_frames(looking((0, 0, 0)), looking((0, 0, 0))[:0])
+
+    def test_no_query_has_no_coverage(self):
+        """An empty sequence gives empty columns."""
+        assert len(nearest_frames(looking((0, 0, 0))[:0], looking((0, 0, 0)))) == 0
+
+    def test_heights_beyond_the_mapping_frames(self):
+        """Above the highest counts up, below the lowest down, between is zero."""
+        found = above_range(np.array([-1.0, 2.0, 5.0, 8.5]), np.array([2.0, 7.0, 3.0]))
+        assert found.tolist() == [-3.0, 0.0, 0.0, 1.5]
+
+    def test_the_best_answer_on_shop_facade(self, shared_data):
+        """The public lists of ShopFacade give 0.75 m and 8.5 degrees, and 90 % within 2 m and 20 degrees."""
+        lists = [
+            read_cambridge(shared_data / "cambridge" / "ShopFacade" / f"dataset_{part}.txt")
+            for part in ("train", "test")
+        ]
+        assert [len(found) for found in lists] == [231, 103]
+        options = CoverageOptions(high_deg=20.0)
+        found = nearest_frames(lists[1].poses, lists[0].poses, options)
+        assert np.median(found.answer_distance) == pytest.approx(0.746, abs=0.001)
+        assert np.median(found.answer_angle_deg) == pytest.approx(8.477, abs=0.001)
+        assert np.mean(found.stratum == Stratum.HIGH) == pytest.approx(0.903, abs=0.001)
+
+    def test_simulated_flights_are_what_their_names_say(self, flights):
+        """`medium` is mostly within 5 m and 40 degrees; `low` never is, and flies above all of the map."""
+        for mapping, evaluation in flights.values():
+            medium = strata_of(evaluation["medium"], mapping)
+            assert np.mean(medium != Stratum.LOW) > 0.7
+            low = evaluation["low"]
+            assert set(strata_of(low, mapping).tolist()) == {Stratum.LOW.value}
+            above = above_range(low.centers[:, 2], mapping.centers[:, 2])
+            assert above.min() > 2.0
+
+
+def wall(y: float, step: float = 0.25, half: float = 6.0) -> np.ndarray:
+    """Points of an upright wall that faces south, dense enough to fill every cell 5 m away."""
+    x, z = np.meshgrid(np.arange(-half, half, step), np.arange(-half, half, step))
+    return np.stack([x.ravel(), np.full(x.size, y), z.ravel()], axis=1)
+
+
+def seen_from(xyz: np.ndarray, *centers: tuple[float, float, float]) -> SeenMap:
+    """All points seen by each of some frames."""
+    places, points = np.array(centers, dtype=np.float64), np.arange(len(xyz))
+    return SeenMap.of(
+        xyz,
+        places,
+        np.repeat(np.arange(len(places)), len(xyz)),
+        np.tile(points, len(places)),
+    )
+
+
+class TestViews:
+    def test_a_wall_that_fills_the_view_is_covered(self):
+        """Every cell holds a point that was seen from where the camera is; half a wall covers half."""
+        here = looking((0, 0, 0))
+        assert view_shares(here, [CAMERA], seen_from(wall(5), (0.3, 0, 0)))[0] == 1.0
+        right = wall(5)[wall(5)[:, 0] > 0]
+        assert view_shares(here, [CAMERA], seen_from(right, (0.3, 0, 0)))[0] == 0.5
+
+    def test_behind_the_camera_there_is_nothing(self):
+        """Points behind the camera, and a map without points, cover nothing."""
+        south = looking((0, 0, 0, 180))
+        assert view_shares(south, [CAMERA], seen_from(wall(5), (0, 0, 0)))[0] == 0.0
+        assert view_shares(south, [CAMERA], seen_from(wall(5)[:0], (0, 0, 0)))[0] == 0.0
+
+    @pytest.mark.parametrize(("turn_deg", "share"), [(38.0, 1), (42.0, 0)])
+    def test_points_seen_from_another_side_do_not_count(self, turn_deg, share):
+        """A point far away that was seen from 38 degrees aside counts, from 42 degrees aside not."""
+        point = np.array([[0.0, 10.0, 0.0]])
+        angle = np.deg2rad(turn_deg)
+        aside = (10 * np.sin(angle), 10 - 10 * np.cos(angle), 0.0)
+        found = view_shares(looking((0, 0, 0)), [CAMERA], seen_from(point, aside))
+        assert found[0] * 16 * 9 == pytest.approx(share)
+
+    @pytest.mark.parametrize(
+        ("range_m", "share"), [(4.9, 0), (5.1, 1), (10.0, 1), (19.9, 1), (20.1, 0)]
+    )
+    def test_points_seen_from_another_distance_do_not_count(self, range_m, share):
+        """A point at 10 m that was seen from half to twice as far counts, from nearer or farther not."""
+        point = np.array([[0.0, 10.0, 0.0]])
+        found = view_shares(looking((0, 0, 0)), [CAMERA], seen_from(point, (0, 10 - range_m, 0)))
+        assert found[0] * 16 * 9 == pytest.approx(share)
+
+    def test_one_of_several_sightings_is_enough(self):
+        """Of frames that saw a point, one alike in direction and distance suffices."""
+        point = np.array([[0.0, 10.0, 0.0]])
+        frames = [(40.0, 10.0, 0.0), (0.0, 30.0, 0.0), (0.5, 1.0, 0.0)]
+        found = view_shares(looking((0, 0, 0)), [CAMERA], seen_from(point, *frames))
+        assert found[0] > 0
+
+    def test_points_behind_a_wall_do_not_count(self):
+        """What other frames saw beyond a wall is hidden by it: the wall itself was seen by nobody near."""
+        beyond = wall(20, half=18)
+        near = wall(5)
+        xyz = np.concatenate([near, beyond])
+        frames = np.array([[0.0, 8.0, 0.0]])  # between both walls
+        rows = np.arange(len(near), len(xyz))
+        seen = SeenMap.of(xyz, frames, np.zeros(len(rows), np.int64), rows)
+        assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
+        open_view = SeenMap.of(beyond, frames, np.zeros(len(rows), np.int64), rows - len(near))
+        assert view_shares(looking((0, 0, 0)), [CAMERA], open_view)[0] > 0.9
+
+    def test_two_stray_points_hide_nothing(self):
+        """Fewer than three points in a cell are no wall: maps hold points that are wrong."""
+        beyond = wall(20, half=21)
+        stray = np.repeat([[0.1, 1.0, 0.1]], 2, axis=0)
+        for count, share in ((2, 1.0), (3, None)):
+            xyz = np.concatenate([beyond, np.repeat(stray[:1], count, axis=0)])
+            found = view_shares(
+                looking((0, 0, 0)),
+                [CAMERA],
+                SeenMap.of(
+                    xyz, np.zeros((1, 3)), np.zeros(len(beyond), int), np.arange(len(beyond))
+                ),
+                ViewOptions(columns=8, rows=4),
+            )
+            assert found[0] == (share if share else pytest.approx(1.0, abs=0.04))
+
+    def test_a_lens_that_folds_back_shows_no_ghosts(self):
+        """Points far outside the image that a strong lens polynomial leads back into it are not in view."""
+        lens = Camera("SIMPLE_RADIAL", 1600, 900, np.array([800.0, 800.0, 450.0, -0.15]))
+        ghost = np.array([[2.6, 1.0, 0.0]])  # 69 degrees aside, the image ends at about 50
+        pixel = lens.project(ghost @ looking((0, 0, 0)).rotations[0].T)[0]
+        assert 0 <= pixel[0] < 1600
+        assert 0 <= pixel[1] < 900
+        seen = seen_from(ghost, (0, 0, 0))
+        assert view_shares(looking((0, 0, 0)), [lens], seen)[0] == 0.0
+
+    def test_each_pose_has_its_own_camera(self):
+        """A narrow lens sees less of a wall that is too small for a wide one."""
+        narrow = Camera.from_horizontal_fov(1600, 900, 30.0)
+        here = looking((0, 0, 0), (0, 0, 0))
+        found = view_shares(here, [CAMERA, narrow], seen_from(wall(5, 0.1, half=1.5), (0, 0, 0)))
+        assert found[0] < 0.3
+        assert found[1] == 1.0
+
+    def test_sightings_of_frames_without_a_pose_do_not_count(self):
+        """A frame whose centre is unknown saw from nowhere."""
+        point = np.array([[0.0, 10.0, 0.0]])
+        seen = SeenMap.of(point, np.full((1, 3), np.nan), np.zeros(1, int), np.zeros(1, int))
+        assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
+
+
+class TestFlyAgain:
+    @pytest.mark.parametrize("wanted", [Stratum.HIGH, Stratum.MEDIUM])
+    def test_frames_at_the_stops_close_all_gaps(self, flights, wanted):
+        """With mapping frames added at the stops, no frame stays below what is wanted, on all seeds."""
+        enough = {"high"} if wanted is Stratum.HIGH else {"high", "medium"}
+        for mapping, evaluation in flights.values():
+            queries = both(evaluation["medium"], evaluation["low"])
+            before = strata_of(queries, mapping)
+            needy = ~np.isin(before, list(enough))
+            found = where_to_fly_again(queries, before, refly=ReflyOptions(wanted=wanted))
+            after = strata_of(queries, both(mapping, found.poses))
+            assert set(after.tolist()) <= enough
+            assert needy.sum() > 200
+            assert len(found) < needy.sum() / 5
+            assert found.serves.sum() == needy.sum()
+            assert (found.serves > 0).all()
+            np.testing.assert_array_equal(found.query_stop >= 0, needy)
+
+    def test_the_margin_is_kept(self, flights):
+        """Each frame lies within 0.7 of the limits of the stop that serves it."""
+        mapping, evaluation = flights[1]
+        queries = evaluation["low"]
+        found = where_to_fly_again(queries, strata_of(queries, mapping))
+        options = CoverageOptions(high_m=1.4001, high_deg=10.501)
+        served = found.poses[found.query_stop]
+        for k in range(len(queries)):
+            assert strata_of(queries[k : k + 1], served[k : k + 1], options)[0] == "high"
+
+    def test_one_stop_serves_a_cluster(self):
+        """Ten frames within half a metre need one stop; one far away needs its own."""
+        rows = [(0.05 * k, 0.0, 3.0, 90.0 + 0.2 * k, -10.0) for k in range(10)]
+        queries = looking(*rows, (30, 0, 3, 90, -10))
+        found = where_to_fly_again(queries, np.full(11, "low"))
+        assert sorted(found.serves.tolist()) == [1, 10]
+        np.testing.assert_allclose(found.angles_deg[:, 1:], [[-10, 0]] * 2, atol=1e-9)
+
+    def test_what_is_covered_needs_no_stop(self):
+        """Frames of the wanted stratum are not served; none left gives no stop."""
+        found = where_to_fly_again(looking((0, 0, 0), (50, 0, 0)), np.array(["high", "high"]))
+        assert len(found) == 0
+        assert found.query_stop.tolist() == [-1, -1]
+
+    def test_a_camera_is_level_unless_the_frame_is_much_rolled(self):
+        """A roll of 2 degrees is left out, one of 90 degrees (an upright phone) is kept."""
+        queries = looking((0, 0, 0, 10, -5, 2), (20, 0, 0, 10, -5, 90))
+        found = where_to_fly_again(queries, np.array(["low", "low"]))
+        assert sorted(np.round(found.angles_deg[:, 2], 6).tolist()) == [0.0, 90.0]
+        assert set(strata_of(queries, found.poses).tolist()) == {"high"}
+
+    def test_the_order_is_a_short_path(self):
+        """Stops along a shuffled line come back in their order along it, from one end to the other."""
+        order = np.random.default_rng(3).permutation(30)
+        queries = looking(*[(5.0 * k, 0.0, 3.0) for k in order])
+        found = where_to_fly_again(queries, np.full(30, "low"))
+        steps = np.diff(found.poses.centers[:, 0])
+        np.testing.assert_allclose(np.abs(steps), 5.0)
+        assert len(set(np.sign(steps))) == 1
+
+    def test_crossing_paths_are_untangled(self):
+        """On a loop, the path is no longer than the loop, where always the nearest stop would jump across."""
+        angle = np.linspace(0, 2 * np.pi, 41)[:-1]
+        rng = np.random.default_rng(0)
+        radius = 20 + rng.uniform(-1.5, 1.5, 40)
+        rows = [(r * np.sin(a), r * np.cos(a), 5.0) for r, a in zip(radius, angle, strict=True)]
+        found = where_to_fly_again(looking(*rows), np.full(40, "low"))
+        flown = np.linalg.norm(np.diff(found.poses.centers, axis=0), axis=1).sum()
+        loop = np.linalg.norm(np.diff(np.array(rows), axis=0), axis=1).sum()
+        assert flown <= loop * 1.001
+
+
+class TestTable:
+    def table(self, *, has_up: bool = True, options: CoverageOptions | None = None):
+        queries = looking((0, 0, 0), (1, 0, 4), (9, 0, 0))
+        queries.centers[2], queries.quats_wxyz[2] = np.nan, np.nan
+        mapping = MappingFrames(
+            np.array(["a/1.jpg", "a/2.jpg"]),
+            looking((0, 0, -1), (1, 0, 1)),
+            seen_from(wall(5), (0, 0, 0)),
+            has_up,
+        )
+        names, reason = np.array(["e/1.jpg", "e/2.jpg", "e/3.jpg"]), np.array(["", "", "ambiguous"])
+        return cover(Queries(names, queries, [CAMERA] * 3, reason), mapping, options)
+
+    def test_failed_frames_are_counted_and_have_a_row(self, tmp_path):
+        """Three frames, one of them failed, are three rows and a count; medians are over the two others."""
+        found = self.table(options=CoverageOptions())
+        summary = found.summary()
+        assert (summary["frames"], summary["failed"]) == (3, 1)
+        assert summary["strata"] == {"high": 1, "medium": 1, "low": 0}
+        assert summary["median"]["distance"] == pytest.approx((1 + 3) / 2)
+        write_coverage(tmp_path / "c.csv", found)
+        rows = [line.split(",") for line in (tmp_path / "c.csv").read_text().splitlines()]
+        assert tuple(rows[0]) == COLUMNS
+        expected = "e/1.jpg,registered,high,a/1.jpg,1.0000,0.000,1.0000,0.0000"
+        assert ",".join(rows[1][:8]) == expected
+        assert rows[3] == ["e/3.jpg", "failed", *[""] * (len(COLUMNS) - 3), "ambiguous"]
+
+    def test_heights_that_were_never_mapped_are_told(self):
+        """A frame 3 m above the highest mapping frame is named with that figure."""
+        sentences = remarks("e", self.table(options=CoverageOptions()))
+        assert any("1 of 3 frames failed" in s for s in sentences)
+        assert any(
+            "1 of 2 lie above the highest mapping frame, by up to 3.0 m" in s for s in sentences
+        )
+
+    def test_without_metres_there_are_no_strata_and_no_heights(self):
+        """In units of the model distances stay, strata and heights are unknown."""
+        found = self.table(has_up=False)
+        assert set(found.stratum.tolist()) == {""}
+        assert np.isnan(found.height).all()
+        assert found.distance[1] == pytest.approx(3)
+        assert found.summary()["heights"] is None
+        assert not any("lie above" in s for s in remarks("e", found))
+
+    def test_a_plan_of_another_place_is_told(self):
+        """Frames kilometres away are rather a wrong sign than a plan."""
+        found = self.table(options=CoverageOptions())
+        far = replace(found, distance=found.distance + 7000.0)
+        assert any("7 km away" in s for s in remarks("e", far))
