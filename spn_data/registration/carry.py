@@ -1,0 +1,152 @@
+"""Poses for frames that see too little of the map, carried to them by their neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.colmap.resection import Resection, resect
+from spn_data.pose import Poses
+from spn_data.registration.options import RegisterOptions
+from spn_data.registration.solution import Sequence, reprojection_errors
+from spn_data.registration.tracks import triangulate
+
+_WEAK = 200  # map points below which a frame's other features are worth triangulating
+_MIN_ANGLE_DEG = 1.5  # at which the rays of the sequence's own points meet
+_ROUNDS = 10  # of carrying poses to neighbours
+
+
+def carry(
+    sequence: Sequence, found: dict[int, Resection], camera: Camera, options: RegisterOptions
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Let neighbours carry poses to frames that see too little of the map; `found` grows.
+
+    Returns putative matches with those that tracks bring, the sequence's own points (P, 3), and their
+    measurements (M, 3): frame, feature, own point.
+    """
+    putative = list(sequence.putative)
+    own_points, own = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    for _ in range(_ROUNDS):
+        putative = _carried_matches(sequence, found, putative, camera, options)
+        own_points, own = _own_points(sequence, found, putative, camera, options)
+        before = _total(found)
+        for row in range(len(putative)):
+            enough = row in found and found[row].inliers.sum() >= 2 * options.checks.min_inliers
+            if enough:
+                continue
+            mine = own[own[:, 0] == row]
+            pixels = sequence.pixels[row]
+            pose = resect(
+                np.concatenate([pixels[putative[row][:, 0]], pixels[mine[:, 1]]]),
+                np.concatenate([sequence.map_xyz[putative[row][:, 1]], own_points[mine[:, 2]]]),
+                camera,
+                max_error_px=options.max_error_px,
+                seed=options.seed,
+            )
+            if pose is not None and (
+                row not in found or pose.inliers.sum() > found[row].inliers.sum()
+            ):
+                found[row] = pose
+        if _total(found) == before:
+            break
+    return putative, own_points, own
+
+
+def _total(found: dict[int, Resection]) -> int:
+    return sum(int(pose.inliers.sum()) for pose in found.values())
+
+
+def _carried_matches(
+    sequence: Sequence,
+    found: dict[int, Resection],
+    putative: list[np.ndarray],
+    camera: Camera,
+    options: RegisterOptions,
+) -> list[np.ndarray]:
+    """Putative matches, and those with map points that other frames of a feature's track agree with."""
+    tracks = sequence.tracks
+    track_of = {
+        (int(f), int(k)): int(t)
+        for f, k, t in zip(tracks.frame, tracks.feature, tracks.track, strict=True)
+    }
+    points_of: dict[int, set[int]] = {}
+    for row, pose in found.items():
+        if pose.inliers.sum() < options.checks.min_inliers:
+            continue
+        matches = putative[row]
+        error_px = reprojection_errors(
+            pose.pose,
+            camera,
+            sequence.map_xyz[matches[:, 1]],
+            sequence.pixels[row][matches[:, 0]],
+        )
+        agreeing = matches[error_px <= options.max_error_px]
+        for feature, point in agreeing.tolist():
+            track = track_of.get((row, feature))
+            if track is not None:
+                points_of.setdefault(track, set()).add(point)
+    brought: dict[int, list[tuple[int, int]]] = {}
+    for f, k, t in zip(
+        tracks.frame.tolist(), tracks.feature.tolist(), tracks.track.tolist(), strict=True
+    ):
+        for point in points_of.get(t, ()):
+            brought.setdefault(f, []).append((k, point))
+    result = []
+    for row, matches in enumerate(putative):
+        known = set(map(tuple, matches.tolist()))
+        new = sorted(set(brought.get(row, [])) - known)
+        result.append(np.concatenate([matches, np.array(new, np.int64).reshape(-1, 2)]))
+    return result
+
+
+def _own_points(
+    sequence: Sequence,
+    found: dict[int, Resection],
+    putative: list[np.ndarray],
+    camera: Camera,
+    options: RegisterOptions,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of tracks that touch a weak frame and no map point; and their measurements in all frames."""
+    tracks = sequence.tracks
+    none = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    strong = np.array(
+        [
+            row in found and found[row].inliers.sum() >= options.checks.min_inliers
+            for row in range(len(putative))
+        ]
+    )
+    weak = np.array(
+        [row not in found or found[row].inliers.sum() < _WEAK for row in range(len(putative))]
+    )
+    in_map = np.zeros(tracks.count, bool)
+    matched = [set(matches[:, 0].tolist()) for matches in putative]
+    members = zip(
+        tracks.frame.tolist(), tracks.feature.tolist(), tracks.track.tolist(), strict=True
+    )
+    for f, k, t in members:
+        in_map[t] |= k in matched[f]
+    touches_weak = np.zeros(tracks.count, bool)
+    touches_weak[tracks.track[weak[tracks.frame]]] = True
+    wanted = (touches_weak & ~in_map)[tracks.track]
+    usable = np.flatnonzero(wanted & strong[tracks.frame])
+    if not len(usable):
+        return none
+    poses = Poses(np.full((len(putative), 3), np.nan), np.full((len(putative), 4), np.nan))
+    for row, pose in found.items():
+        poses.centers[row], poses.quats_wxyz[row] = pose.pose.centers[0], pose.pose.quats_wxyz[0]
+    pixels = sequence.pixels_of(tracks.frame[usable], tracks.feature[usable])
+    points = triangulate(
+        poses,
+        camera,
+        pixels,
+        tracks.frame[usable],
+        tracks.track[usable],
+        tracks.count,
+        max_error_px=options.max_error_px,
+        min_angle_deg=_MIN_ANGLE_DEG,
+    )
+    good = np.isfinite(points[:, 0])
+    row_of = np.cumsum(good) - 1
+    seen = np.flatnonzero(wanted & good[tracks.track])
+    own = np.column_stack([tracks.frame[seen], tracks.feature[seen], row_of[tracks.track[seen]]])
+    return points[good], own.astype(np.int64)
