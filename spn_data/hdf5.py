@@ -20,7 +20,6 @@ from spn_data.hdf5_schema import (
     MASKS,
     OFFSETS,
     POINTS,
-    TEXT,
     UNIT_TOLERANCE,
     Column,
     DatasetFrame,
@@ -59,9 +58,7 @@ class DatasetWriter:
         self._file = h5py.File(self._disk, "w")
         try:
             for key, value in info.to_attributes().items():
-                if isinstance(value, str) and len(value.encode()) > _MAX_ATTRIBUTE_BYTES:
-                    raise ValueError(f"{key} takes more than {_MAX_ATTRIBUTE_BYTES} bytes")
-                self._file.attrs[key] = value
+                _set_attribute(self._file, key, value)
             self._groups = {
                 name: _Group(self._file.create_group(name), Role(role), info.has_images)
                 for name, role in groups.items()
@@ -78,6 +75,10 @@ class DatasetWriter:
         """
         if frame.name in self._names:
             raise InputError(f"two frames are named {frame.name}", path=self._path)
+        for text, column in ((frame.name, "names"), (frame.sequence, "sequences")):
+            longest = int(COLUMNS[column].dtype[1:])
+            if len(text.encode()) > longest:
+                raise InputError(f"the name {text} has more than {longest} bytes", path=self._path)
         _check(frame, has_image=self._info.has_images)
         try:
             self._groups[group].append(frame)
@@ -139,7 +140,7 @@ class _Group:
         self._images: h5py.Dataset | None = None
         self._count = 0
         self._has_images = has_images
-        group.attrs["role"] = role.value
+        _set_attribute(group, "role", role.value)
         for name, column in COLUMNS.items():
             _create(group, name, column, _FRAMES_A_BLOCK)
         points = group.create_group("points")
@@ -180,9 +181,9 @@ class _Group:
         if not frames:
             return
         rows: dict[str, Any] = {
-            "names": [f.name for f in frames],
-            "sequences": [f.sequence for f in frames],
-            "strata": [f.stratum for f in frames],
+            "names": [f.name.encode() for f in frames],
+            "sequences": [f.sequence.encode() for f in frames],
+            "strata": [f.stratum.encode() for f in frames],
             "time_s": [f.time_s for f in frames],
             "dense": [int(f.dense) for f in frames],
             "centers": [f.center for f in frames],
@@ -241,9 +242,10 @@ def _create(group: h5py.Group, name: str, column: Column, rows_a_chunk: int) -> 
         shape=(0, *column.tail),
         maxshape=(None, *column.tail),
         chunks=(rows_a_chunk, *column.tail),
-        dtype=h5py.string_dtype() if column.dtype == TEXT else column.dtype,
+        dtype=_type_of(column.dtype),
+        compression="gzip" if column.dtype.startswith("S") else None,
     )
-    dataset.attrs["description"] = column.says
+    _set_attribute(dataset, "description", column.says)
     return dataset
 
 
@@ -252,7 +254,7 @@ def _create_images(group: h5py.Group, shape: tuple[int, ...]) -> h5py.Dataset:
     images = group.create_dataset(
         "images", (0, *shape), np.uint8, maxshape=(None, *shape), chunks=(1, *shape)
     )
-    images.attrs["description"] = IMAGES
+    _set_attribute(images, "description", IMAGES)
     return images
 
 
@@ -265,7 +267,20 @@ def _create_masks(group: h5py.Group, shape: tuple[int, ...]) -> None:
         chunks=(1, *shape),
         compression="gzip",
     )
-    masks.attrs["description"] = MASKS
+    _set_attribute(masks, "description", MASKS)
+
+
+def _type_of(dtype: str) -> np.dtype[Any]:
+    return h5py.string_dtype("utf-8", int(dtype[1:])) if dtype[0] == "S" else np.dtype(dtype)
+
+
+def _set_attribute(of: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
+    if isinstance(value, str):
+        text = value.encode()
+        if len(text) > _MAX_ATTRIBUTE_BYTES:
+            raise ValueError(f"{name} takes more than {_MAX_ATTRIBUTE_BYTES} bytes")
+        value = np.array(text, dtype=_type_of(f"S{max(1, len(text))}"))
+    of.attrs[name] = value
 
 
 def _extend(dataset: h5py.Dataset, rows: np.ndarray) -> None:

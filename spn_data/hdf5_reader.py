@@ -18,7 +18,6 @@ from spn_data.hdf5_schema import (
     FORMAT,
     OFFSETS,
     POINTS,
-    TEXT,
     UNIT_TOLERANCE,
     VERSION,
     Column,
@@ -29,7 +28,6 @@ from spn_data.pose import Poses
 
 _MAX_GROUPS = 10_000
 _MAX_SIDE_PX = 65_536
-_MAX_TEXT = 4096
 _MAX_DEFLATION = 1100  # deflate compresses zeros by 1032 at most
 # HDF5 can load further filters from the disk, or read other files than this one.
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_LZF}
@@ -72,7 +70,7 @@ class Dataset:
             raise
 
     def _read_info(self) -> DatasetInfo:
-        attributes = _guarded(self.path, "its attributes", lambda: dict(self._file.attrs))
+        attributes = _guarded(self.path, "its attributes", lambda: _attributes(self._file))
         if attributes.get("format") != FORMAT:
             raise FormatError(f"{self.path}: is no data set of this program")
         version = _guarded(self.path, "its version", lambda: int(attributes["version"]))
@@ -125,10 +123,11 @@ class DatasetGroup:
 
     def __init__(self, path: Path, name: str, group: h5py.Group, info: DatasetInfo):
         self._path, self.name = path, name
-        self.role = Role(group.attrs["role"])
-        self.all_valid = _is_set(group.attrs["all_valid"])
+        attributes = _attributes(group)
+        self.role = Role(attributes["role"])
+        self.all_valid = _is_set(attributes["all_valid"])
         points = _child(group, "points", h5py.Group)
-        self.points_for_training = _is_set(points.attrs["for_training"])
+        self.points_for_training = _is_set(_attributes(points)["for_training"])
         if self.points_for_training and self.role is not Role.TRAIN:
             raise ValueError(f"its points are marked for training, but it is of role {self.role}")
         rows = len(_child(group, "names", h5py.Dataset))
@@ -247,10 +246,7 @@ class DatasetGroup:
         return self._read(name, lambda: self._columns[name][:])
 
     def _texts(self, name: str) -> np.ndarray:
-        found = self._read(name, lambda: self._columns[name].asstr()[:])
-        if any(len(text) > _MAX_TEXT for text in found):
-            raise FormatError(f"{self._path}: {self.name}/{name} holds a text without end")
-        return found.astype(np.str_)
+        return self._read(name, lambda: np.strings.decode(self._columns[name][:], "utf-8"))
 
     def _read(self, what: str, read: Callable[[], _T]) -> _T:
         return _guarded(self._path, f"{what} of {self.name}", read)
@@ -291,12 +287,7 @@ def _stored(group: h5py.Group, name: str) -> h5py.Dataset:
 
 def _table(group: h5py.Group, name: str, column: Column, rows: int) -> h5py.Dataset:
     dataset = _stored(group, name)
-    if column.dtype == TEXT:
-        text = h5py.check_string_dtype(dataset.dtype)
-        is_right = text is not None and text.length is None and text.encoding == "utf-8"
-    else:
-        is_right = dataset.dtype == np.dtype(column.dtype)
-    if not is_right or dataset.shape != (rows, *column.tail):
+    if dataset.dtype != np.dtype(column.dtype) or dataset.shape != (rows, *column.tail):
         raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
     return dataset
 
@@ -312,6 +303,18 @@ def _pictures(group: h5py.Group, name: str, rows: int, tail: tuple[int, ...]) ->
     ):
         raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
     return dataset
+
+
+def _attributes(of: h5py.Group) -> dict[str, Any]:
+    """Numbers and texts; ValueError for values of other kinds, of which HDF5 may not survive the reading."""
+    found: dict[str, Any] = {}
+    for name in of.attrs:
+        attribute = of.attrs.get_id(name)
+        if attribute.shape != () or attribute.dtype.kind not in "ifS":
+            raise ValueError(f"attribute {name} is no single number or text")
+        value = of.attrs[name]
+        found[name] = value.decode() if isinstance(value, bytes) else value
+    return found
 
 
 def _is_set(value: Any) -> bool:

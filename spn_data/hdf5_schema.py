@@ -24,7 +24,8 @@ CONVENTIONS = (
     "right, y down, the centre of the upper-left pixel is (0.5, 0.5); so in intrinsics and points. Images "
     "are RGB, without distortion. NaN is unknown."
 )
-TEXT = "text"  # UTF-8 of any length
+# Texts have a fixed length, padded with zeros: HDF5 reads those of variable length through a heap, whose
+# damage it does not survive.
 UNIT_TOLERANCE = 1e-5  # of a quaternion: printed with six decimals, it is unit only to this
 
 
@@ -38,7 +39,10 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset of a group: one row a frame, or a point; tail : shape of a row; says : for its attribute."""
+    """A dataset of a group: one row a frame, or a point; tail : shape of a row; says : for its attribute.
+
+    dtype : of NumPy; S256 is UTF-8 of at most 256 bytes.
+    """
 
     dtype: str
     tail: tuple[int, ...]
@@ -46,9 +50,9 @@ class Column:
 
 
 COLUMNS: dict[str, Column] = {
-    "names": Column(TEXT, (), "<sequence>/<frame>, unique in the file"),
-    "sequences": Column(TEXT, (), "flight that the frame is from"),
-    "strata": Column(TEXT, (), "coverage by the mapping frames: high, medium, low; empty: unknown"),
+    "names": Column("S256", (), "<sequence>/<frame>, unique in the file"),
+    "sequences": Column("S128", (), "flight that the frame is from"),
+    "strata": Column("S8", (), "coverage by the mapping frames: high, medium, low; empty: unknown"),
     "time_s": Column("<f8", (), "seconds since the sequence's first frame"),
     "dense": Column("u1", (), "1: a video frame that was not chosen for the map"),
     "centers": Column("<f8", (3,), "camera centre in the world"),
@@ -96,7 +100,7 @@ class DatasetInfo:
     def to_attributes(self) -> dict[str, Any]:
         """Values of the root's attributes."""
         place = self.origin
-        texts = {
+        documents = {
             "camera": None if self.camera is None else camera_to_json(self.camera),
             "split": dict(self.split),
             "fingerprints": dict(self.fingerprints),
@@ -117,7 +121,7 @@ class DatasetInfo:
             "up_is_known": int(self.up_is_known),
             "has_images": int(self.has_images),
             "optimistic": int(self.optimistic),
-            **{name: json.dumps(value, sort_keys=True) for name, value in texts.items()},
+            **{name: json.dumps(value, sort_keys=True) for name, value in documents.items()},
         }
 
     @classmethod
