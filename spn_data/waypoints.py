@@ -202,7 +202,7 @@ def _number(name: str, cell: str) -> float:
     if cell.lower() in _UNKNOWN:
         return math.nan
     try:
-        value = float(cell)
+        value = math.inf if "_" in cell else float(cell)  # Python reads 1_0 as 10
     except ValueError:
         value = math.inf
     if not math.isfinite(value):
@@ -234,6 +234,9 @@ def _centers(
         lat_lon_alt = np.stack([table["lat_deg"], table["lon_deg"], alt], axis=1)
         stated.append(place.origin.enu_from_wgs84(lat_lon_alt))
     centers = stated[0]
+    unknown = np.isnan(centers)
+    half = unknown.any(axis=1) & ~unknown.all(axis=1)
+    _refuse(half, "has no position: only a part of x, y, z", lines, path)
     for other in stated[1:]:
         apart = np.linalg.norm(other - centers, axis=1)
         _refuse(

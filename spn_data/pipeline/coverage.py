@@ -280,8 +280,12 @@ def _write(area: Area, found: AreaCoverage, options: CoverageStageOptions, waypo
 
 
 def _stops(columns: Mapping[str, list[str]]) -> list[dict[str, float]]:
+    """A stop each, numbers and counts apart."""
+    convert = {name: int if name in ("stop", "serves") else float for name in columns}
     rows = zip(*columns.values(), strict=True)
-    return [dict(zip(columns, map(float, row), strict=True)) for row in rows]
+    return [
+        {name: convert[name](cell) for name, cell in zip(columns, row, strict=True)} for row in rows
+    ]
 
 
 def _without_nan(value: Any) -> Any:
