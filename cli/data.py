@@ -11,6 +11,7 @@ from cli import options
 from cli.console import Group
 from cli.coverage import coverage
 from cli.export import export
+from cli.report import report
 
 
 @click.group(cls=Group)
@@ -108,6 +109,9 @@ main.add_command(coverage)
 
 
 main.add_command(export)
+
+
+main.add_command(report)
 
 
 @main.command()

@@ -49,7 +49,15 @@ def command_lines(text: str) -> list[tuple[str, bool]]:
 
 def test_the_commands_are_those_of_this_version():
     """A command that comes or goes is noticed here, and then told in the README."""
-    assert COMMANDS == ["coverage", "export", "georegister", "reconstruct", "simulate", "status"]
+    assert COMMANDS == [
+        "coverage",
+        "export",
+        "georegister",
+        "reconstruct",
+        "report",
+        "simulate",
+        "status",
+    ]
 
 
 def test_help_lists_the_commands_in_the_order_of_work():
@@ -57,7 +65,15 @@ def test_help_lists_the_commands_in_the_order_of_work():
     shown = CliRunner().invoke(main, ["--help"])
     assert shown.exit_code == 0
     listed = re.findall(r"^  (\w+) {2,}\S", shown.output.split("Commands:")[1], re.MULTILINE)
-    assert listed == ["reconstruct", "georegister", "coverage", "export", "status", "simulate"]
+    assert listed == [
+        "reconstruct",
+        "georegister",
+        "coverage",
+        "export",
+        "report",
+        "status",
+        "simulate",
+    ]
 
 
 @pytest.mark.parametrize("group", [main, model_main])

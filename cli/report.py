@@ -1,0 +1,41 @@
+"""The command `spn-data report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cli import console, options
+
+
+@click.command()
+@options.area
+@click.option(
+    "--max-points",
+    type=click.IntRange(0, 2_000_000),
+    default=100_000,
+    show_default=True,
+    help="Points of the map that the page holds.",
+)
+@click.option(
+    "--max-frames",
+    type=click.IntRange(100, 200_000),
+    default=30_000,
+    show_default=True,
+    help="Frames that the page holds; failed and chosen ones always stay.",
+)
+def report(area_folder: Path, max_points: int, max_frames: int) -> None:
+    """Write report.html: whether the area is ready to train on, and why.
+
+    \b
+    Example:
+        spn-data report --area fields/north
+    """
+    from spn_data.pipeline.report import ReportOptions
+    from spn_data.pipeline.report import report as write
+
+    area = options.open_area(area_folder)
+    with area.locked():
+        path = write(area, ReportOptions(max_points=max_points, max_frames=max_frames))
+    console.out.print(f"{path} is written; any browser shows it, without a network.")

@@ -1,0 +1,237 @@
+"""report.html: what the area holds, and whether it is ready to train on."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.area import FRAMES, GEO, MODEL, SPLIT, Area, command_of
+from spn_data.camera import Camera
+from spn_data.errors import FormatError, StageError
+from spn_data.frames import Frames, read_frames
+from spn_data.georegister.result import GeoFit
+from spn_data.labels import Labels
+from spn_data.pipeline import coverage as coverage_stage
+from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
+from spn_data.pipeline.labels import LabelledArea, read_labelled_area
+from spn_data.pose import Poses
+from spn_data.record import read_json, versions, write_atomically
+from spn_data.report.data import CoverageFacts, FlyAgain, FrameTable, ReportData, StageFacts
+from spn_data.report.html import render
+from spn_data.split_file import read_split
+
+FILE = "report.html"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """How much one page holds; what is beyond is thinned out, and the page says so."""
+
+    max_points: int = 100_000
+    max_frames: int = 30_000
+
+
+def report(area: Area, options: ReportOptions | None = None) -> Path:
+    """Write report.html at the area's root, in place of an earlier one; gives its path.
+
+    Stale stages are named and otherwise left out. Raises StageError where the area holds no frames yet,
+    FormatError or InputError for a damaged file.
+    """
+    options = options or ReportOptions()
+    path = area.root / FILE
+    html = render(report_data(area), max_points=options.max_points, max_frames=options.max_frames)
+    write_atomically(path, html)
+    return path
+
+
+class _FreshStages(Area):
+    """The same area as if it did not hold its stale stages."""
+
+    def has(self, stage: str) -> bool:
+        return super().has(stage) and self.stale_because(stage) is None
+
+    def sequences(self, group: str) -> tuple[str, ...]:
+        return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
+
+
+def report_data(area: Area) -> ReportData:
+    """All that the report shows. Raises as `report` does."""
+    if not area.has(FRAMES):
+        raise StageError(f"{area.root} holds no frames; run {command_of(FRAMES)} first")
+    stages = tuple(
+        StageFacts(area.record(stage), area.stale_because(stage), command_of(stage))
+        for stage in area.stages()
+    )
+    fresh = _FreshStages(area.root)
+    labelled = read_labelled_area(fresh) if fresh.has(MODEL) else None
+    geo, residuals = None, {}
+    if fresh.has(GEO):
+        path = fresh.folder(GEO) / "geo.json"
+        value = read_json(path)
+        geo = GeoFit.from_json(value)
+        residuals = _residuals(path, value, geo)
+    coverage, stale_coverage, strata = _coverage(area)
+    split, checks = None, None
+    if fresh.has(SPLIT):
+        split = read_split(fresh.folder(SPLIT) / SPLIT_FILE)
+        path = fresh.folder(SPLIT) / AUDIT
+        checks = read_audit(path) if path.exists() else None
+    groups = dict(zip(split.names.tolist(), split.group.tolist(), strict=True)) if split else {}
+    candidates = read_frames(area.folder(FRAMES) / "frames.csv")
+    frames = frame_table(candidates, labelled, residuals, strata, groups)
+    return ReportData(
+        title=area.root.resolve().name,
+        path=str(area.root.resolve()),
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        version=versions()["squeezeposenet-toolkit"],
+        units="m" if geo is not None else "model",
+        stages=stages,
+        frames_record=area.record(FRAMES),
+        model_record=area.record(MODEL) if fresh.has(MODEL) else None,
+        geo=geo,
+        frames=frames,
+        points=labelled.points if labelled else None,
+        fov_tan={} if labelled is None else {k: _tangents(c) for k, c in labelled.cameras.items()},
+        coverage=coverage,
+        stale_coverage=stale_coverage,
+        split=split,
+        audit=checks,
+    )
+
+
+def frame_table(
+    candidates: Frames,
+    labelled: LabelledArea | None,
+    residuals: Mapping[str, tuple[np.ndarray, bool]],
+    strata: Mapping[str, str],
+    groups: Mapping[str, str],
+) -> FrameTable:
+    """One row a frame: mapping candidates, mapping's dense frames, evaluation frames, in this order.
+
+    labelled : None where there is no model; chosen frames are then just "chosen". residuals : (fix minus
+    pose, is an outlier) by name; strata, groups : by name.
+    """
+    if labelled is None:
+        return _of_candidates(candidates, candidates.names != "")
+    labelled_names = set(labelled.dense.names.tolist())
+    rest = ~candidates.chosen & ~np.isin(candidates.names, list(labelled_names))
+    parts = [
+        _of_labels(labelled.mapping, evaluation=False),
+        _of_labels(labelled.dense, evaluation=False),
+        _of_candidates(candidates, rest),
+        *(_of_labels(labels, evaluation=True) for labels in labelled.evaluation.values()),
+    ]
+    frames = FrameTable.concatenate(parts)
+    order = np.lexsort((frames.time_s, frames.sequences, frames.evaluation))
+    return frames.select(order).with_facts(residuals, strata, groups)
+
+
+def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
+    n = len(labels)
+    trace = np.diagonal(labels.covariance, axis1=1, axis2=2)
+    return FrameTable(
+        names=labels.names,
+        sequences=labels.sequences,
+        cameras=labels.cameras,
+        evaluation=np.full(n, evaluation),
+        dense=labels.dense,
+        time_s=labels.time_s,
+        status=labels.status,
+        reason=labels.reason,
+        poses=labels.poses,
+        sigma_m=np.sqrt(trace[:, :3].sum(axis=1)),
+        sigma_deg=np.rad2deg(np.sqrt(trace[:, 3:].sum(axis=1))),
+        inliers=labels.inliers,
+        error_px=labels.error_px,
+        **FrameTable.no_facts(n),
+    )
+
+
+def _of_candidates(frames: Frames, mask: np.ndarray) -> FrameTable:
+    """Candidates without a pose, with the reason why they were not chosen."""
+    found = frames.select(mask)
+    n = len(found)
+    unknown = np.full(n, np.nan)
+    return FrameTable(
+        names=found.names,
+        sequences=found.sequences,
+        cameras=found.cameras,
+        evaluation=np.zeros(n, bool),
+        dense=np.zeros(n, bool),
+        time_s=found.time_s,
+        status=found.status,
+        reason=found.reason,
+        poses=Poses(np.full((n, 3), np.nan), np.full((n, 4), np.nan)),
+        sigma_m=unknown,
+        sigma_deg=unknown,
+        inliers=np.zeros(n, np.int64),
+        error_px=unknown,
+        **FrameTable.no_facts(n),
+    )
+
+
+def _residuals(
+    path: Path, value: Mapping[str, Any], geo: GeoFit
+) -> dict[str, tuple[np.ndarray, bool]]:
+    names = value.get("frames", [])
+    if len(names) != len(geo.residuals_m):
+        raise FormatError(f"{path}: its residuals are not those of its frames")
+    return {
+        str(name): (residual, bool(outlier))
+        for name, residual, outlier in zip(names, geo.residuals_m, geo.outlier, strict=True)
+    }
+
+
+def _tangents(camera: Camera) -> tuple[float, float]:
+    """Of half the horizontal and vertical field of view."""
+    fx, fy = camera.focal_px
+    return camera.width / 2 / fx, camera.height / 2 / fy
+
+
+def _coverage(area: Area) -> tuple[CoverageFacts | None, str | None, dict[str, str]]:
+    """What was found, why it is stale, and the stratum of each frame by name."""
+    value = coverage_stage.read_coverage(area)
+    if value is None:
+        return None, None, {}
+    strata: dict[str, str] = {}
+    counts: dict[str, dict[str, int]] = {}
+    path = area.folder(coverage_stage.EVALUATED)
+    try:
+        for name, summary in value["sequences"].items():
+            counts[str(name)] = {**summary["strata"], "failed": summary["failed"]}
+        for table in sorted(path.glob("*.csv")):
+            with table.open(newline="", encoding="utf-8") as file:
+                strata |= {row["name"]: row["stratum"] for row in csv.DictReader(file)}
+        again = tuple(
+            FlyAgain(
+                (float(stop["x_m"]), float(stop["y_m"]), float(stop["z_m"])),
+                (float(stop["lat_deg"]), float(stop["lon_deg"])),
+                float(stop["heading_deg"]),
+                float(stop["pitch_deg"]),
+                int(stop["serves"]),
+            )
+            for stop in value["fly_again"] or ()
+        )
+        limits = _limits(value["options"])
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise FormatError(
+            f"{path}: cannot be read ({error!r}); run spn-data coverage again"
+        ) from error
+    stale = coverage_stage.stale_because(area, value)
+    return CoverageFacts(counts, again, limits), stale, strata
+
+
+def _limits(options: Mapping[str, Any] | None) -> str:
+    if options is None:
+        return "There are no strata: lengths of this map are no metres."
+    high, medium = (
+        f"at most {options[f'{s}_m']:g} m and {options[f'{s}_deg']:g} deg from a mapping frame"
+        for s in ("high", "medium")
+    )
+    return f"high: {high}; medium: {medium}; low: farther; failed: no pose."

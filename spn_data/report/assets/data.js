@@ -1,0 +1,66 @@
+// What the page was given: typed arrays, and the world as it is shown (z up, centred).
+const given = JSON.parse(document.getElementById("data").textContent);
+const KINDS = {f4: Float32Array, i2: Int16Array, i4: Int32Array, u1: Uint8Array};
+
+function unpack(packed) {
+  const text = atob(packed.base64), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return new KINDS[packed.kind](bytes.buffer);
+}
+
+// Columns of the frames: typed arrays; texts as functions of the row.
+const frames = {count: given.frames.count, name: i => given.frames.name[i]};
+for (const [column, value] of Object.entries(given.frames)) {
+  if (value.base64 !== undefined) frames[column] = unpack(value);
+  else if (value.texts) {
+    const which = unpack(value.which);
+    frames[column] = i => value.texts[which[i]];
+  }
+}
+const unit = given.units === "m" ? "m" : "units";
+const turn = given.display.rotation, middle = given.display.center, radius = given.display.radius;
+
+function rotated(x, y, z) {
+  return [turn[0] * x + turn[1] * y + turn[2] * z, turn[3] * x + turn[4] * y + turn[5] * z,
+          turn[6] * x + turn[7] * y + turn[8] * z];
+}
+
+function shown(x, y, z) { return rotated(x - middle[0], y - middle[1], z - middle[2]); }
+
+const hasPose = i => frames.status(i) === "registered";
+const centerOf = i => shown(frames.center[3 * i], frames.center[3 * i + 1], frames.center[3 * i + 2]);
+
+// Rotation from camera axes (x right, y down, z forward) to the shown world, from a quaternion w, x, y, z.
+function axesOf(i) {
+  const [w, x, y, z] = frames.quat.subarray(4 * i, 4 * i + 4);
+  const rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]];
+  return rows.map(row => rotated(...row));
+}
+
+// The same for a camera of a heading and pitch (degrees), in an East-North-Up world.
+function axesOfAngles(heading, pitch) {
+  const h = heading * Math.PI / 180, p = pitch * Math.PI / 180;
+  const forward = [Math.sin(h) * Math.cos(p), Math.cos(h) * Math.cos(p), Math.sin(p)];
+  const right = [Math.cos(h), -Math.sin(h), 0];
+  const down = [forward[1] * right[2] - forward[2] * right[1], forward[2] * right[0] - forward[0] * right[2],
+                forward[0] * right[1] - forward[1] * right[0]];
+  return [right, down, forward];
+}
+
+function roundDown(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return [5, 2, 1].find(m => m * power <= value * (1 + 1e-9)) * power;
+}
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(...children);
+  return made;
+}
+
+const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const rgb = name => [1, 3, 5].map(k => parseInt(css(name).slice(k, k + 2), 16));
+const figure = (value, digits) => Number.isFinite(value) ? value.toFixed(digits) : "\u2013";

@@ -1,0 +1,45 @@
+"""The page: one file with everything in it."""
+
+from __future__ import annotations
+
+from html import escape
+from importlib.resources import files
+from string import Template
+
+from spn_data.report import sections
+from spn_data.report.data import ReportData
+from spn_data.report.pack import script_json
+from spn_data.report.scene import pack_scene
+from spn_data.report.thinning import thin_frames
+from spn_data.report.verdict import verdict
+
+_SCRIPTS = ("data", "draw", "view", "timeline", "table", "main")
+
+
+def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_000) -> str:
+    """HTML of the report, in ASCII; it loads nothing from anywhere."""
+    frames, left_out = thin_frames(data.frames, max_frames)
+    judged = verdict(data)
+    shown = {
+        "title": escape(data.title),
+        "heading": sections.heading(data),
+        "verdict": sections.verdict_box(judged),
+        "figures": sections.key_figures(data),
+        "view": sections.view(data, max_points),
+        "residuals": sections.residuals(data),
+        "timeline": sections.timeline(data, left_out),
+        "coverage": sections.coverage(data),
+        "split": sections.split(data),
+        "table": sections.table(frames),
+        "stages": sections.stages(data),
+        "style": _asset("style.css"),
+        "data": script_json(pack_scene(data, frames, max_points)),
+        "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
+    }
+    page = Template(_asset("page.html")).substitute(shown)
+    # ASCII whatever encoding the file is written or served with; a name that is no valid text shows as "?".
+    return page.encode("ascii", "xmlcharrefreplace").decode("ascii")
+
+
+def _asset(name: str) -> str:
+    return files("spn_data.report").joinpath("assets", name).read_text(encoding="utf-8")

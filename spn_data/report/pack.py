@@ -1,0 +1,34 @@
+"""Arrays and texts inside a page: little-endian binary in base64, and JSON that no text can break out of."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import numpy as np
+
+_KINDS = {"f4": "<f4", "i2": "<i2", "i4": "<i4", "u1": "|u1"}
+
+
+def pack(values: np.ndarray, kind: str) -> dict[str, str]:
+    """An array, flattened, as {"kind", "base64"}; kind: f4, i2, i4 or u1. NaN stays NaN in f4."""
+    flat = np.ascontiguousarray(values).astype(_KINDS[kind]).ravel()
+    return {"kind": kind, "base64": base64.b64encode(flat.tobytes()).decode("ascii")}
+
+
+def unpack(packed: dict[str, str]) -> np.ndarray:
+    """What `pack` was given, flattened and rounded to its kind."""
+    return np.frombuffer(base64.b64decode(packed["base64"]), dtype=_KINDS[packed["kind"]])
+
+
+def pack_texts(values: np.ndarray) -> dict[str, Any]:
+    """Texts (N,) that repeat: the different ones once, and which of them each is."""
+    different, which = np.unique(values, return_inverse=True)
+    return {"texts": different.tolist(), "which": pack(which, "i4")}
+
+
+def script_json(value: Any) -> str:
+    """JSON to stand inside <script>: ASCII, and without `<`, `>` and `&` no tag can begin or end there."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

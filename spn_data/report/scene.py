@@ -1,0 +1,134 @@
+"""What the 3D view draws, packed: points thinned and quantised, cameras, GNSS fixes, places to fly again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spn_data.map_points import MapPoints
+from spn_data.report.data import FrameTable, ReportData
+from spn_data.report.pack import pack, pack_texts
+
+_STEPS = 32767  # of int16
+
+
+@dataclass(frozen=True, eq=False)
+class Display:
+    """How the world is turned for showing: ``shown = rotation @ (x - center)``, with up along z.
+
+    radius : distance from the centre within which points are shown, in the world's unit.
+    """
+
+    rotation: np.ndarray  # (3, 3)
+    center: np.ndarray  # (3,)
+    radius: float
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) as shown."""
+        return (points - self.center) @ self.rotation.T
+
+
+def display_of(frames: FrameTable, points: MapPoints | None, *, has_up: bool) -> Display:
+    """Centred on the cameras and the bulk of the points.
+
+    Without a known up, the cameras' mean upward direction stands in, for looking only.
+    """
+    centers = frames.poses.centers[frames.registered]
+    rotation = np.eye(3)
+    if not has_up and len(centers):
+        rotation = _turn_to_z(-frames.poses[frames.registered].rotations[:, 1].mean(axis=0))
+    bulk = points.xyz if points is not None and len(points) else centers
+    if len(bulk) == 0:
+        return Display(rotation, np.zeros(3), 1.0)
+    low, high = np.percentile(bulk, [5, 95], axis=0)
+    if len(centers):
+        low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
+    center = (low + high) / 2
+    # Some points of any map lie far beyond it: they would shrink all else to a dot.
+    radius = 1.5 * float(np.linalg.norm(high - low) / 2)
+    return Display(rotation, center, max(radius, 1e-6))
+
+
+def _turn_to_z(up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes a direction to z."""
+    z = up / max(float(np.linalg.norm(up)), 1e-12)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def thin(points: MapPoints, display: Display, limit: int) -> tuple[np.ndarray, int]:
+    """Rows of at most `limit` points to show, drawn evenly, and how many lie too far out to be shown."""
+    near = np.linalg.norm(points.xyz - display.center, axis=1) <= display.radius
+    rows = np.flatnonzero(near)
+    if len(rows) > limit:
+        rows = np.sort(np.random.default_rng(0).choice(rows, limit, replace=False))
+    return rows, int((~near).sum())
+
+
+def pack_points(points: MapPoints, display: Display, limit: int) -> dict[str, Any]:
+    """Positions in steps of `step`, colours, and what was left out."""
+    rows, far = thin(points, display, limit)
+    step = display.radius / _STEPS
+    return {
+        "xyz": pack(np.round(display.apply(points.xyz[rows]) / step), "i2"),
+        "rgb": pack(points.colors[rows], "u1"),
+        "step": step,
+        "shown": len(rows),
+        "all": len(points),
+        "far": far,
+    }
+
+
+def pack_frames(frames: FrameTable) -> dict[str, Any]:
+    """All columns of the table, for the page's script."""
+    numbers = {
+        "time_s": frames.time_s,
+        "center": frames.poses.centers,
+        "quat": frames.poses.quats_wxyz,
+        "sigma_m": frames.sigma_m,
+        "sigma_deg": frames.sigma_deg,
+        "error_px": frames.error_px,
+        "gnss_m": frames.gnss_m,
+    }
+    texts = {
+        "sequence": frames.sequences,
+        "camera": frames.cameras,
+        "status": frames.status,
+        "reason": frames.reason,
+        "stratum": frames.stratum,
+        "group": frames.group,
+    }
+    flags = {
+        "evaluation": frames.evaluation,
+        "dense": frames.dense,
+        "outlier": frames.gnss_outlier,
+    }
+    return {
+        "count": len(frames),
+        "name": frames.names.tolist(),
+        "inliers": pack(frames.inliers, "i4"),
+        **{name: pack(values, "f4") for name, values in numbers.items()},
+        **{name: pack_texts(values) for name, values in texts.items()},
+        **{name: pack(values, "u1") for name, values in flags.items()},
+    }
+
+
+def pack_scene(data: ReportData, frames: FrameTable, max_points: int) -> dict[str, Any]:
+    """Everything that the page's script needs."""
+    display = display_of(data.frames, data.points, has_up=data.units == "m")
+    again = data.coverage.fly_again if data.coverage else ()
+    return {
+        "units": data.units,
+        "display": {
+            "rotation": display.rotation.ravel().tolist(),
+            "center": display.center.tolist(),
+            "radius": display.radius,
+        },
+        "fov": {name: list(tangents) for name, tangents in data.fov_tan.items()},
+        "frames": pack_frames(frames),
+        "points": None if data.points is None else pack_points(data.points, display, max_points),
+        "again": [[*place.east_north_up_m, place.heading_deg, place.pitch_deg] for place in again],
+    }

@@ -1,0 +1,378 @@
+"""Sections of the page that are plain HTML; all text of the area is escaped here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from spn_data import audit
+from spn_data.record import StageRecord
+from spn_data.report.data import FAILED, STRATA, FrameTable, ReportData
+from spn_data.report.residual_map import residual_map
+from spn_data.report.verdict import Finding, Level, Verdict
+from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN
+from spn_data.split_file import statements
+
+_MOST_EVIDENCE = 50  # lines shown of one check
+_MARKS = {
+    Level.GOOD: ("&#10003;", "good"),
+    Level.CAUTION: ("!", "but"),
+    Level.STOP: ("&#10005;", "stop"),
+}
+
+
+def heading(data: ReportData) -> str:
+    """Name of the area, where it is, when this was written."""
+    unit = "" if data.units == "m" else ' <span class="unit">units: model</span>'
+    return (
+        f"<h1>{escape(data.title)}{unit}</h1>"
+        f'<p class="note">{escape(data.path)} &middot; written {escape(data.made)} by spn-data '
+        f"{escape(data.version)}</p>"
+    )
+
+
+def verdict_box(verdict: Verdict) -> str:
+    """The answer, what to do next, and the reasons."""
+    mark = _MARKS[verdict.level][0]
+    step = verdict.next_step
+    following = f'<p class="next"><b>Next:</b> {_what_to_do(step)}</p>' if step else ""
+    findings = "".join(_finding(f, is_next=f is step) for f in verdict.findings)
+    return (
+        f'<section id="verdict" class="{verdict.level}"><h2><span class="mark">{mark}</span>'
+        f"{escape(verdict.headline)}</h2>{following}<ul>{findings}</ul></section>"
+    )
+
+
+def _finding(finding: Finding, *, is_next: bool) -> str:
+    mark, word = _MARKS[finding.level]
+    do = "" if is_next else _what_to_do(finding)
+    return (
+        f'<li class="{finding.level}"><span class="mark" title="{word}">{mark}</span>'
+        f"<span>{escape(finding.text)}{f' <em>{do}</em>' if do else ''}</span></li>"
+    )
+
+
+def _what_to_do(finding: Finding) -> str:
+    code = f"<code>{escape(finding.command)}</code>" if finding.command else ""
+    return f"{escape(finding.do)}{': ' if finding.do and code else '.' if finding.do else ''}{code}"
+
+
+def key_figures(data: ReportData) -> str:
+    """Tiles with the figures that matter, each with its unit."""
+    tiles = []
+    unit = "m" if data.units == "m" else "model units"
+    if data.model_record is not None:
+        c = data.model_record.counts
+        tiles.append(
+            _tile(
+                "Map",
+                f"{c['registered']:,} of {c['frames']:,}",
+                "chosen frames have a pose",
+                [f"{c['points']:,} points", f"{c['mean_error_px']:.2f} px reprojection error"],
+            )
+        )
+    if data.geo is not None:
+        stated, summary = data.geo.uncertainty, data.geo.summary
+        origin = data.geo.origin
+        tiles.append(
+            _tile(
+                "Place in the world",
+                f"{_figure(2 * stated.horizontal_m, '.2f')} m",
+                "horizontal uncertainty of the whole map (2 sigma)",
+                [
+                    f"vertical {_figure(2 * stated.vertical_m, '.2f')} m (2 sigma)",
+                    f"tilt {_figure(stated.tilt_deg, '.2f')} deg, "
+                    f"heading {_figure(stated.heading_deg, '.2f')} deg (1 sigma)",
+                    f"scale {_figure(stated.scale, '.2%')} (1 sigma)",
+                    f"origin {origin.lat_deg:.6f}, {origin.lon_deg:.6f}, height {origin.alt_m:.2f} m "
+                    f"({origin.height_reference})",
+                ],
+            )
+        )
+        tiles.append(
+            _tile(
+                "GNSS residuals",
+                f"{_figure(summary.horizontal_rmse_m, '.2f')} m",
+                "horizontal (RMSE): noise of the receiver, not the error of poses",
+                [
+                    f"vertical {_figure(summary.vertical_rmse_m, '.2f')} m",
+                    f"CE90 {_figure(summary.ce90_m, '.2f')} m, LE90 {_figure(summary.le90_m, '.2f')} m",
+                    f"{summary.fixes:,} fixes, {summary.outliers:,} outliers",
+                ],
+            )
+        )
+    elif data.model_record is not None:
+        tiles.append(
+            _tile(
+                "Place in the world",
+                "units: model",
+                "lengths are no metres; north and up are unknown",
+                [],
+            )
+        )
+    for name in data.evaluation_sequences:
+        tiles.append(_sequence_tile(data.frames, name, unit))
+    dense = data.frames.dense & ~data.frames.evaluation & data.frames.tried
+    if dense.any():
+        tiles.append(_labels_tile("Dense frames of mapping", data.frames, dense, unit))
+    if data.split is not None:
+        counts = data.split.counts()
+        others = [f"{n:,} {group}" for group, n in counts.items() if group != TRAIN]
+        optimistic = [OPTIMISTIC] if data.split.optimistic else []
+        tiles.append(
+            _tile("Split", f"{counts.get(TRAIN, 0):,}", "frames to train on", others + optimistic)
+        )
+    return f'<section class="tiles">{"".join(tiles)}</section>' if tiles else ""
+
+
+def _sequence_tile(frames: FrameTable, name: str, unit: str) -> str:
+    mine = frames.evaluation & (frames.sequences == name) & frames.tried
+    return _labels_tile(f"Evaluation: {name}", frames, mine, unit)
+
+
+def _labels_tile(title: str, frames: FrameTable, mask: np.ndarray, unit: str) -> str:
+    registered = mask & frames.registered
+    lines = []
+    for values, text, form in (
+        (frames.sigma_m[registered], f"{unit} position, 1 sigma (median)", ".3f"),
+        (frames.sigma_deg[registered], "deg rotation, 1 sigma (median)", ".3f"),
+        (frames.error_px[registered], "px reprojection error (median)", ".2f"),
+    ):
+        known = values[np.isfinite(values)]
+        if len(known):
+            lines.append(f"{np.median(known):{form}} {text}")
+    chosen, dense = mask & ~frames.dense, mask & frames.dense
+    if chosen.any() and dense.any():
+        lines.append(f"of these dense: {(dense & frames.registered).sum():,} of {dense.sum():,}")
+    return _tile(title, f"{registered.sum():,} of {mask.sum():,}", "frames have a pose", lines)
+
+
+def _tile(title: str, value: str, what: str, lines: Iterable[str]) -> str:
+    more = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return (
+        f'<div class="tile"><h3>{escape(title)}</h3><p class="value">{escape(value)}</p>'
+        f"<p>{escape(what)}</p><ul>{more}</ul></div>"
+    )
+
+
+def view(data: ReportData, max_points: int) -> str:
+    """Place of the 3D view; the script draws it."""
+    thinned = ""
+    if data.points is not None and len(data.points) > max_points:
+        thinned = f" {max_points:,} of {len(data.points):,} points are shown."
+    frame = (
+        "Grid in metres; the arrow points north."
+        if data.units == "m"
+        else "Grid in units of the model; up is a guess from the cameras, north is unknown."
+    )
+    return (
+        '<section><h2>Map</h2><div class="view"><canvas id="view" tabindex="0" '
+        'aria-label="3D view of the map"></canvas><div id="legend"></div><div id="picked"></div></div>'
+        f'<p class="note">Drag to turn, right button or two fingers to move, wheel (after a click) or '
+        f"pinch to zoom; click a camera for its figures. {frame}{thinned}"
+        '<span id="fallback"></span></p></section>'
+    )
+
+
+def residuals(data: ReportData) -> str:
+    """Plan view of GNSS residuals."""
+    if data.geo is None:
+        return ""
+    drawn = residual_map(data.frames)
+    if not drawn:
+        return ""
+    held_out = data.geo.held_out_blocks
+    extra = ""
+    if held_out.frames:
+        extra = (
+            f'<p class="note">On fixes that the fit has not seen ({held_out.folds} blocks of time): '
+            f"{_figure(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
+            f"{_figure(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
+        )
+    return f"<section><h2>GNSS residuals from above</h2>{drawn}{extra}</section>"
+
+
+def timeline(data: ReportData, left_out: dict[str, int]) -> str:
+    """Frames over time (drawn by the script), and why frames failed."""
+    frames = data.frames
+    if not len(frames):
+        return ""
+    rows = []
+    for name in np.unique(frames.sequences).tolist():
+        mine = frames.sequences == name
+        for reason, n in frames.reasons(mine):
+            rows.append((name, reason, f"{n:,}"))
+    failures = (
+        _table(("sequence", "why frames have no pose", "frames"), rows, "failures")
+        if rows
+        else '<p class="note">No frame that was tried is without a pose.</p>'
+    )
+    return (
+        '<section><h2>Frames over time</h2><div id="timeline"></div>'
+        f"{_left_out(left_out)}{failures}</section>"
+    )
+
+
+def _left_out(left_out: dict[str, int]) -> str:
+    if not left_out:
+        return ""
+    what = " and ".join(f"{n:,} {kind}" for kind, n in left_out.items())
+    return f'<p class="note">Thinned out: {escape(what)} are neither drawn nor listed.</p>'
+
+
+def coverage(data: ReportData) -> str:
+    """Strata of each sequence as bars, and the places to fly again."""
+    if data.coverage is None:
+        return ""
+    bars = "".join(
+        _strata_bar(name, counts) for name, counts in sorted(data.coverage.strata.items())
+    )
+    again = ""
+    if data.coverage.fly_again:
+        rows = []
+        for k, place in enumerate(data.coverage.fly_again, 1):
+            e, n, u = place.east_north_up_m
+            rows.append(
+                (
+                    str(k),
+                    f"{place.lat_lon_deg[0]:.7f}, {place.lat_lon_deg[1]:.7f}",
+                    f"{e:.1f}, {n:.1f}, {u:.1f}",
+                    f"{place.heading_deg:.0f}",
+                    f"{place.pitch_deg:.0f}",
+                    f"{place.frames:,}",
+                )
+            )
+        header = (
+            "",
+            "latitude, longitude",
+            "east, north, up (m)",
+            "heading (deg)",
+            "pitch (deg)",
+            "frames helped",
+        )
+        again = "<h3>Where to fly again</h3>" + _table(header, rows, "again")
+    limits = f'<p class="note">{escape(data.coverage.limits)}</p>' if data.coverage.limits else ""
+    return f"<section><h2>Coverage</h2>{bars}{limits}{again}</section>"
+
+
+def _strata_bar(name: str, counts: dict[str, int]) -> str:
+    total = sum(counts.values())
+    if not total:
+        return ""
+    known = [s for s in STRATA if counts.get(s)]
+    others = [s for s in counts if s not in STRATA and counts[s]]
+    pieces = "".join(
+        f'<span class="{escape(s) if s in STRATA else "none"}" style="flex:{counts[s]}" '
+        f'title="{escape(s)}: {counts[s]:,} of {total:,}"></span>'
+        for s in known + others
+    )
+    text = ", ".join(f"{escape(s)} {counts[s] / total:.0%} ({counts[s]:,})" for s in known + others)
+    return f'<div class="strata"><b>{escape(name)}</b> {text}<div class="bar">{pieces}</div></div>'
+
+
+def split(data: ReportData) -> str:
+    """Groups of the split, and what the audit found."""
+    if data.split is None:
+        return ""
+    left_out = int((data.split.group == LEFT_OUT).sum())
+    rows = [*data.split.counts().items(), *([("left out", left_out)] if left_out else [])]
+    parts = [
+        "<section><h2>Split and audit</h2>",
+        _table(("group", "frames"), [(group, f"{n:,}") for group, n in rows], "groups"),
+    ]
+    said = (*data.split.notes, *statements(data.split))
+    parts += [f'<p class="note">{escape(note)}</p>' for note in said]
+    return "".join(parts) + "".join(_check(check) for check in data.audit or ()) + "</section>"
+
+
+def _check(check: audit.Finding) -> str:
+    """One line of the audit; its evidence folds out."""
+    level = {
+        audit.Verdict.PASS: Level.GOOD,
+        audit.Verdict.NOTICE: Level.CAUTION,
+        audit.Verdict.FAIL: Level.STOP,
+    }[check.verdict]
+    mark, word = _MARKS[level]
+    text = f"<b>{escape(check.check)}</b>: {escape(check.text)}"
+    if check.evidence:
+        more = len(check.evidence) - _MOST_EVIDENCE
+        lines = [*check.evidence[:_MOST_EVIDENCE], *([f"and {more:,} more"] if more > 0 else [])]
+        listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
+        text = f"<details><summary>{text}</summary><ul>{listed}</ul></details>"
+    return (
+        f'<div class="rule {level}"><span class="mark" title="{word}">{mark}</span>'
+        f"<div>{text}</div></div>"
+    )
+
+
+def table(frames: FrameTable) -> str:
+    """Place of the table of all frames; the script fills it."""
+    failed = int((frames.status == FAILED).sum())
+    return (
+        f'<section><h2>All frames</h2><div id="table" data-frames="{len(frames)}" '
+        f'data-failed="{failed}"></div></section>'
+    )
+
+
+def stages(data: ReportData) -> str:
+    """What each stage was made with, folded up."""
+    parts = ["<section><h2>How it was made</h2>"]
+    for stage in data.stages:
+        record = stage.record
+        state = f'<span class="warn">stale: {escape(stage.stale)}</span>' if stage.stale else ""
+        parts.append(
+            f"<details><summary><b>{escape(record.stage)}</b> {escape(record.finished)} "
+            f"{_seconds(record)} {state}</summary>{_record(record)}</details>"
+        )
+    return "".join(parts) + "</section>"
+
+
+def _record(record: StageRecord) -> str:
+    notes = "".join(f"<li>{escape(note)}</li>" for note in record.notes)
+    options = _table(("option", "value"), list(_flat(record.options)), "options")
+    versions = ", ".join(f"{escape(k)} {escape(v)}" for k, v in sorted(record.versions.items()))
+    steps = ", ".join(f"{escape(name)} {s:.1f} s" for name, s in record.seconds.items())
+    inputs = _table(("file", "fingerprint"), sorted(record.inputs.items()), "inputs")
+    return (
+        (f"<ul>{notes}</ul>" if notes else "")
+        + f'<p class="note">{versions}<br>{steps}</p>'
+        + options
+        + (
+            f"<details><summary>{len(record.inputs):,} source files</summary>{inputs}</details>"
+            if record.inputs
+            else ""
+        )
+    )
+
+
+def _flat(value: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    for name, item in sorted(value.items()):
+        if isinstance(item, dict) and item:
+            yield from _flat(item, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", json.dumps(item)
+
+
+def _seconds(record: StageRecord) -> str:
+    total = sum(record.seconds.values())
+    return f"({total:.0f} s)" if total < 90 else f"({total / 60:.0f} min)"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], kind: str) -> str:
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return (
+        f'<div class="wide"><table class="{kind}"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _figure(value: float, form: str) -> str:
+    """A figure for people; NaN and infinity are unknown."""
+    return format(value, form) if np.isfinite(value) else "unknown"

@@ -1,0 +1,306 @@
+"""Whether an area is ready to train on, why, and what to do next; the rules stand in docs/report.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+from spn_data import audit
+from spn_data.report.data import STRATA, ReportData
+from spn_data.split import OPTIMISTIC, TRAIN, VALIDATION
+
+
+class Level(StrEnum):
+    """How much a finding weighs."""
+
+    GOOD = "good"
+    CAUTION = "caution"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One reason; do : what to do about it, command : to type, both may be empty."""
+
+    level: Level
+    text: str
+    do: str = ""
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """level : that of the worst finding; findings : worst first."""
+
+    level: Level
+    headline: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def next_step(self) -> Finding | None:
+        """The first finding that something can be done about."""
+        return next((f for f in self.findings if f.do or f.command), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictLimits:
+    """Where a figure becomes a reservation, or a reason not to train."""
+
+    good_map_share: float = 0.95  # of the chosen frames that have a pose
+    min_map_share: float = 0.80
+    max_error_px: float = 1.0  # mean reprojection error
+    max_held_out_ratio: float = 2.0  # of errors on fixes that the fit has not seen to its residuals
+    max_heading_sigma_deg: float = 3.0
+    max_scale_sigma: float = 0.03
+    good_evaluation_share: float = 0.90  # of a sequence's frames that have a pose
+    min_evaluation_share: float = 0.50
+    max_low_share: float = 0.20  # of a sequence's covered frames in the lowest stratum
+    min_training_frames: int = 100
+
+
+def verdict(data: ReportData, limits: VerdictLimits | None = None) -> Verdict:
+    """By the rules of docs/report.md."""
+    limits = limits or VerdictLimits()
+    found = [
+        *_stages(data),
+        *_map(data, limits),
+        *_place(data, limits),
+        *_evaluation(data, limits),
+        *_coverage(data, limits),
+        *_split(data, limits),
+        *_audit(data),
+    ]
+    order = [Level.STOP, Level.CAUTION, Level.GOOD]
+    found.sort(key=lambda finding: order.index(finding.level))
+    level = found[0].level if found else Level.GOOD
+    n = sum(finding.level == level for finding in found)
+    headline = {
+        Level.GOOD: "Ready to train",
+        Level.CAUTION: f"Ready to train, with {_count(n, 'reservation')}",
+        Level.STOP: f"Not ready to train: {_count(n, 'thing')} to do first",
+    }[level]
+    return Verdict(level, headline, tuple(found))
+
+
+def _stages(data: ReportData) -> Iterator[Finding]:
+    for stage in data.stages:
+        if stage.stale:
+            yield Finding(
+                Level.STOP,
+                f"{stage.record.stage} is out of date: {stage.stale}.",
+                "Make this stage anew",
+                f"{stage.command} --overwrite",
+            )
+    for sentence in data.unread:
+        yield Finding(Level.STOP, sentence)
+
+
+def _map(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    if data.model_record is None:
+        yield Finding(
+            Level.STOP,
+            "There is no model.",
+            "Make the model",
+            "spn-data reconstruct VIDEO --fov DEGREES",
+        )
+        return
+    counts = data.model_record.counts
+    registered, frames = int(counts["registered"]), int(counts["frames"])
+    share = registered / frames
+    text = f"The map holds {registered:,} of {frames:,} chosen frames ({share:.0%})"
+    if share < limits.good_map_share:
+        stop = share < limits.min_map_share
+        yield Finding(
+            Level.STOP if stop else Level.CAUTION,
+            text + ": it is not complete.",
+            "See which passages are missing and why (below); fly them again and add them",
+            "spn-data reconstruct VIDEO --add",
+        )
+    else:
+        yield Finding(Level.GOOD, text + ".")
+    error = float(counts["mean_error_px"])
+    text = f"Its mean reprojection error is {error:.2f} px"
+    if error > limits.max_error_px:
+        yield Finding(
+            Level.CAUTION,
+            f"{text}, more than {limits.max_error_px:g} px: motion blur, rolling shutter or stabilization.",
+            "Fly with a short exposure and electronic stabilization off",
+        )
+    else:
+        yield Finding(Level.GOOD, text + ".")
+    rolling = [s["sequence"] for s in counts.get("shutter", []) if s.get("rolls")]
+    if rolling:
+        yield Finding(
+            Level.CAUTION,
+            f"A rolling shutter shows in {', '.join(rolling)}: poses of fast passages are worse.",
+            "Fly slower, or with another camera",
+        )
+
+
+def _place(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    if data.model_record is None:
+        return
+    if data.geo is None:
+        yield Finding(
+            Level.CAUTION,
+            "The map is not georegistered: lengths are units of the model, not metres, and north and up "
+            "are unknown. Errors of a trained model will have no metres either.",
+            "Give telemetry with the flight (.SRT, .gpx, .csv or EXIF)",
+            "spn-data georegister",
+        )
+        return
+    stated, summary, held_out = data.geo.uncertainty, data.geo.summary, data.geo.held_out_blocks
+    yield Finding(
+        Level.GOOD,
+        f"The map is georegistered; as a whole it may lie {2 * stated.horizontal_m:.2f} m beside and "
+        f"{2 * stated.vertical_m:.2f} m above or below its true place (2 sigma).",
+    )
+    if stated.heading_deg > limits.max_heading_sigma_deg or stated.scale > limits.max_scale_sigma:
+        yield Finding(
+            Level.CAUTION,
+            f"Its heading is known to {stated.heading_deg:.1f} deg and its scale to {stated.scale:.1%} only "
+            "(1 sigma).",
+            "Add a longer flight with a cross leg",
+            "spn-data reconstruct VIDEO --add",
+        )
+    if held_out.horizontal_rmse_m > limits.max_held_out_ratio * summary.horizontal_rmse_m:
+        yield Finding(
+            Level.CAUTION,
+            f"GNSS fixes that the fit has not seen lie {held_out.horizontal_rmse_m:.2f} m away, those that "
+            f"it has seen {summary.horizontal_rmse_m:.2f} m (RMSE): too few data to trust the place.",
+            "Add a longer flight",
+            "spn-data reconstruct VIDEO --add",
+        )
+
+
+def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    frames = data.frames
+    for name in data.evaluation_sequences:
+        mine = frames.evaluation & (frames.sequences == name) & ~frames.dense & frames.tried
+        total, registered = int(mine.sum()), int((mine & frames.registered).sum())
+        if not total:
+            continue
+        share = registered / total
+        text = f"Evaluation sequence {name}: {registered:,} of {total:,} frames have a pose ({share:.0%})"
+        if registered == 0:
+            yield Finding(
+                Level.STOP,
+                text + ". It is of another place, or the map lacks its views.",
+                "Map those views, or remove the sequence's folder",
+            )
+        elif share < limits.good_evaluation_share:
+            few = "; a test on so few says little" if share < limits.min_evaluation_share else ""
+            yield Finding(
+                Level.CAUTION,
+                f"{text}{few}. Frames without a pose are the hard ones: tests look better than they are.",
+                "Fly again where coverage is low and add it to the map",
+                "spn-data reconstruct VIDEO --add",
+            )
+        else:
+            yield Finding(Level.GOOD, text + ".")
+
+
+def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    names = data.evaluation_sequences
+    if data.coverage is None:
+        if names:
+            yield Finding(
+                Level.CAUTION,
+                "How well mapping covers the evaluation sequences is not known.",
+                "Measure it",
+                "spn-data coverage",
+            )
+        return
+    if data.stale_coverage:
+        yield Finding(
+            Level.CAUTION,
+            f"Coverage is out of date: {data.stale_coverage}.",
+            "Measure it again",
+            "spn-data coverage",
+        )
+    for name, counts in data.coverage.strata.items():
+        total = sum(counts.get(stratum, 0) for stratum in STRATA)
+        share = counts.get("low", 0) / total if total else 0.0
+        if share > limits.max_low_share:
+            again = len(data.coverage.fly_again)
+            yield Finding(
+                Level.CAUTION,
+                f"{share:.0%} of {name} are views that no mapping frame is near to: a network has to "
+                "extrapolate there.",
+                f"Fly the {_count(again, 'place')} listed below and add them" if again else "",
+                "spn-data reconstruct VIDEO --add",
+            )
+        elif total:
+            near = counts.get("high", 0) / total
+            yield Finding(
+                Level.GOOD,
+                f"Mapping covers {name}: {near:.0%} of its frames closely, {share:.0%} hardly.",
+            )
+
+
+def _split(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    if data.model_record is None:
+        return
+    if data.split is None:
+        yield Finding(
+            Level.STOP,
+            "Frames are not split into training, validation and test, and there is no dataset.h5.",
+            "Split the frames",
+            "spn-data split",
+        )
+        return
+    counts = data.split.counts()
+    train = counts.get(TRAIN, 0)
+    text = f"{_count(train, 'frame')} to train on, {counts.get(VALIDATION, 0):,} to validate"
+    if train == 0:
+        yield Finding(
+            Level.STOP,
+            "No frame is left to train on.",
+            "Hold out less",
+            "spn-data split --overwrite",
+        )
+    elif train < limits.min_training_frames:
+        yield Finding(
+            Level.CAUTION,
+            f"{text}: fewer than {limits.min_training_frames} for training.",
+            "Take all frames of the video",
+            "spn-data register --all-frames",
+        )
+    else:
+        yield Finding(Level.GOOD, text + ".")
+    if data.split.optimistic:
+        yield Finding(
+            Level.CAUTION,
+            "The test is of the same flight as training: optimistic.",
+            "Register a flight of another day as an evaluation sequence",
+            "spn-data register VIDEO --name NAME",
+        )
+
+
+def _audit(data: ReportData) -> Iterator[Finding]:
+    if data.audit is None:
+        if data.split is not None:
+            yield Finding(
+                Level.STOP,
+                "Whether test frames have leaked into training is not checked.",
+                "Check the split",
+                "spn-data audit",
+            )
+        return
+    for check in data.audit:
+        if check.verdict is audit.Verdict.FAIL:
+            yield Finding(
+                Level.STOP,
+                f"The audit failed ({check.check}): {check.text}.",
+                "Split anew",
+                "spn-data split --overwrite",
+            )
+        elif check.verdict is audit.Verdict.NOTICE and check.text != OPTIMISTIC:
+            yield Finding(Level.CAUTION, f"Audit, {check.check}: {check.text}.")
+    if not audit.has_failed(data.audit):
+        yield Finding(Level.GOOD, f"The audit passed ({_count(len(data.audit), 'check')}).")
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n:,} {what}{'' if n == 1 else 's'}"
