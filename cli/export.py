@@ -56,8 +56,9 @@ def export(
     chosen = stage.ExportOptions(sequences=sequences, all_frames=all_frames, images=not no_images)
     with area.locked():
         done = stage.export(area, stage.Format(format_name), target, chosen, overwrite=overwrite)
-    sequences_told = ", ".join(f"{name} {count}" for name, count in done.frames.items())
-    console.out.print(f"{target}: {', '.join(done.formats)}; frames: {sequences_told}")
+    rows = [(name, str(count)) for name, count in done.frames.items()]
+    console.table("Poses", rows, ("sequence", "frames"))
+    console.out.print(f"Written to {target}: {', '.join(done.formats)}.")
     if done.units != "m":
         console.out.print(
             "The area has no place in the world: lengths are in units of the model, not metres."
