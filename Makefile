@@ -12,6 +12,11 @@ $(VENV)/installed: pyproject.toml requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
 	touch $@
 
+# 410 MB that only the tests of exports need.
+$(VENV)/readers: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[readers]'
+	touch $@
+
 # Simulated flights with exact truth, from video to a georeferenced model.
 demo: $(VENV)/installed
 	rm -rf $(DEMO)
@@ -20,7 +25,7 @@ demo: $(VENV)/installed
 	$(BIN)/spn-data status --area $(DEMO)/area
 	$(BIN)/python benchmarks/truth.py $(DEMO)/area $(DEMO)/flights
 
-test: $(VENV)/installed
+test: $(VENV)/readers
 	$(BIN)/python -m pytest -m 'not slow'
 
 test-slow: $(VENV)/installed
