@@ -31,5 +31,6 @@ document.getElementById("theme").onclick = () => {
   parts.view.redraw();
   parts.timeline.draw();
 };
+window.spnReport = parts;  // for a look from the console
 root.dataset.drawn = parts.view.kind;
 root.dataset.milliseconds = Math.round(performance.now());
