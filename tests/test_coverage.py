@@ -263,6 +263,21 @@ class TestViews:
         seen = SeenMap.of(point, np.full((1, 3), np.nan), np.zeros(1, int), np.zeros(1, int))
         assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
 
+    def test_what_is_skipped_for_speed_changes_nothing(self, monkeypatch):
+        """Shares are equal where no block is ruled out and every point is looked at."""
+        rng = np.random.default_rng(4)
+        xyz = np.concatenate([wall(9, 0.6, 12), rng.uniform(-15, 15, (3000, 3))])
+        frames = rng.uniform(-8, 8, (40, 3))
+        sightings = rng.integers(0, 40, 9000), rng.integers(0, len(xyz), 9000)
+        rows = rng.uniform((-9, -9, -2, 0, -80, -20), (9, 9, 9, 360, 30, 20), (40, 6))
+        poses = looking(*rows)
+        quick = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
+        monkeypatch.setattr("spn_data.view_share._BLOCK", 10_000)
+        monkeypatch.setattr("spn_data.view_share._FIRST", 10_000)
+        slow = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
+        np.testing.assert_array_equal(quick, slow)
+        assert 0.1 < quick.mean() < 0.9
+
 
 class TestFlyAgain:
     @pytest.mark.parametrize("wanted", [Stratum.HIGH, Stratum.MEDIUM])
