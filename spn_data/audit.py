@@ -22,6 +22,7 @@ from spn_data.split import (
 )
 
 REVISIT_M, REVISIT_DEG = 1.0, 10.0
+_NOT_IN_MAP = "no evaluation frame in the map"
 # Views of a point by training frames from which on it may be given for training.
 MIN_TRAINING_VIEWS = 2
 
@@ -83,8 +84,10 @@ def check_not_in_map(
         if sequence not in evaluation_sources:
             bad.append(f"{sequence}: its source is not recorded")
     frames = sum(len(labels) for labels in evaluation.values())
+    if not evaluation:
+        return Finding(_NOT_IN_MAP, Verdict.PASS, "there is no evaluation sequence")
     return finding_of(
-        "no evaluation frame in the map",
+        _NOT_IN_MAP,
         bad,
         f"none of {frames} evaluation frames is among the map's {len(in_map)} images or from its sources",
         "the map has seen what it is to be tested on",
@@ -102,7 +105,9 @@ def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> Fin
     return finding_of(
         "map unchanged",
         bad,
-        f"the map's hash is {now}, as at each of {len(registrations)} registrations",
+        f"its hash is {now}, as before and after each of {len(registrations)} registrations"
+        if registrations
+        else "nothing was registered in it",
         "the map is not the one that sequences were registered in",
     )
 

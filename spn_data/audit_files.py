@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,6 +93,12 @@ class PoseList:
     def select(self, rows: np.ndarray) -> PoseList:
         return PoseList(tuple(self.names[k] for k in rows), self.poses[rows])
 
+    def with_more(self, other: PoseList) -> PoseList:
+        """These, then the others."""
+        centers = np.concatenate([self.poses.centers, other.poses.centers])
+        quats = np.concatenate([self.poses.quats_wxyz, other.poses.quats_wxyz])
+        return PoseList(self.names + other.names, Poses(centers, quats))
+
 
 def check_dataset(
     stored: Mapping[str, PoseList], parts: Mapping[str, Labels], split: Split
@@ -126,34 +132,56 @@ def check_dataset(
 def check_cambridge(listed: Mapping[str, PoseList], stored: Mapping[str, PoseList]) -> Finding:
     """Lists of Cambridge Landmarks agree with dataset.h5 to the printed digits.
 
-    listed : by file, as read back; stored : by the same file, what should stand in it, in its order. Names
-    are compared without their suffix.
+    listed : by file, as read back; stored : by the same file, what should stand in it. Names are compared
+    without their suffix; their order means nothing.
     """
     bad, images = [], 0
     for file in sorted({*listed, *stored}):
+        found = _by_stem(listed[file]) if file in listed else {}
+        wanted = _by_stem(stored[file]) if file in stored else {}
+        images += len(found)
         if file not in listed:
             bad.append(f"{file} is missing")
             continue
-        if file not in stored:
-            bad.append(f"{file} is more than there should be")
-            continue
-        found, wanted = listed[file], stored[file]
-        images += len(found.names)
-        if [_stem(n) for n in found.names] != [_stem(n) for n in wanted.names]:
-            bad.append(f"{file} lists other images, or in another order")
-            continue
-        apart = np.abs(found.poses.centers - wanted.poses.centers).max(axis=1)
-        # Either sign is the same rotation where the scalar part is zero.
-        signs = np.sign(np.einsum("ni,ni->n", found.poses.quats_wxyz, wanted.poses.quats_wxyz))
-        turned = np.abs(signs[:, None] * found.poses.quats_wxyz - wanted.poses.quats_wxyz)
-        off = np.maximum(apart, turned.max(axis=1)) > _PRINTED
-        bad += [f"{file}: {found.names[k]} has another pose" for k in np.flatnonzero(off)]
+        bad += [f"{file}: {name} is missing" for name in sorted(wanted.keys() - found.keys())]
+        for name in sorted(found):
+            if name not in wanted:
+                bad.append(f"{file}: {name} does not belong there")
+            elif not _is_same_to_the_digits(found[name], wanted[name]):
+                bad.append(f"{file}: {name} has another pose")
     return finding_of(
         "Cambridge lists agree with dataset.h5",
         bad,
         f"{images} poses in {len(listed)} lists agree to the printed digits",
         "lists and dataset.h5 do not agree",
     )
+
+
+def check_measured(measured: Sequence[str], split: Split) -> Finding:
+    """The model beside the lists holds measurements of training frames alone.
+
+    measured : images that have any; compared without their suffix.
+    """
+    group = {_stem(n): g for n, g in zip(split.names.tolist(), split.group.tolist(), strict=True)}
+    return finding_of(
+        "model measured in training frames",
+        [f"{n} has measurements" for n in measured if group.get(_stem(n)) != TRAIN],
+        f"points of the model are measured in {len(measured)} training frames and in no other",
+        "the model beside the lists tells where held-out frames are",
+    )
+
+
+def _by_stem(listed: PoseList) -> dict[str, np.ndarray]:
+    """(7,) centre and quaternion by name without suffix."""
+    rows = np.concatenate([listed.poses.centers, listed.poses.quats_wxyz], axis=1)
+    return {_stem(name): row for name, row in zip(listed.names, rows, strict=True)}
+
+
+def _is_same_to_the_digits(found: np.ndarray, wanted: np.ndarray) -> bool:
+    # Either sign of a quaternion is the same rotation.
+    sign = -1.0 if found[3:] @ wanted[3:] < 0 else 1.0
+    apart = np.concatenate([found[:3] - wanted[:3], sign * found[3:] - wanted[3:]])
+    return bool(np.abs(apart).max() <= _PRINTED)
 
 
 def _stem(name: str) -> str:

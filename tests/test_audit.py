@@ -315,12 +315,22 @@ def test_lists_that_differ_from_the_data_set_are_found(parts, split):
     assert audit_files.check_cambridge(listed, stored).verdict is Verdict.PASS
     off = Poses(rounded.centers + 1.1e-6, rounded.quats_wxyz)
     found = audit_files.check_cambridge({"dataset_train.txt": PoseList(png, off)}, stored)
-    assert_fails(found, png[0], "another pose")
-    swapped = listed["dataset_train.txt"].select(np.r_[1, 0, 2 : len(png)])
-    found = audit_files.check_cambridge({"dataset_train.txt": swapped}, stored)
-    assert_fails(found, "another order")
+    assert_fails(found, png[0].removesuffix(".png"), "another pose")
+    fewer = {"dataset_train.txt": listed["dataset_train.txt"].select(np.arange(1, len(png)))}
+    assert_fails(audit_files.check_cambridge(fewer, stored), "f00000 is missing")
+    found = audit_files.check_cambridge(listed, {**fewer})
+    assert_fails(found, "f00000 does not belong there")
     assert_fails(audit_files.check_cambridge({}, stored), "dataset_train.txt is missing")
-    assert_fails(audit_files.check_cambridge(listed, {}), "more than there should be")
+
+
+def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split):
+    """A validation frame and one of the evaluation sequence, beside training frames."""
+    group = split.of(mapping.names)
+    train, held = mapping.names[group == TRAIN][:5].tolist(), mapping.names[group == VALIDATION][0]
+    png = [name.replace(".jpg", ".png") for name in train]
+    assert audit_files.check_measured(png, split).verdict is Verdict.PASS
+    assert_fails(audit_files.check_measured([*png, held], split), held)
+    assert_fails(audit_files.check_measured([*png, "medium/f00001.png"], split), "medium/f00001")
 
 
 def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
