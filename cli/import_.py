@@ -1,0 +1,63 @@
+"""`spn-data import`: a data set from somebody else's lists."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cli import console
+
+
+@click.command(name="import")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--to",
+    "target",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="File to write, such as shop.h5.",
+)
+@click.option(
+    "--size",
+    "width_px",
+    type=click.IntRange(16, 16_384),
+    default=480,
+    show_default=True,
+    help="Width in pixels of the images in it.",
+)
+@click.option(
+    "--units",
+    type=click.Choice(["m", "model"]),
+    default="m",
+    show_default=True,
+    help="What the positions are in, which the format does not say: metres, or no known unit.",
+)
+@click.option(
+    "--keep-outliers",
+    is_flag=True,
+    help="Keep frames whose position is absurdly far from all others.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace the file where it exists.")
+def import_(
+    folder: Path, target: Path, width_px: int, units: str, keep_outliers: bool, overwrite: bool
+) -> None:
+    """Make a data set from a folder in the format of Cambridge Landmarks.
+
+    FOLDER holds dataset_train.txt, and as far as they exist dataset_test.txt, dataset_validation.txt, the
+    images that they list, and reconstruction.nvm.
+
+    \b
+    Example:
+        spn-data import ShopFacade --to shop.h5
+    """
+    from spn_data.pipeline.import_cambridge import ImportOptions, import_cambridge
+
+    options = ImportOptions(width_px=width_px, units=units, keep_outliers=keep_outliers)
+    with console.progress() as progress:
+        done = import_cambridge(folder, target, options, progress, overwrite=overwrite)
+    for note in done.notes:
+        console.note(note)
+    frames = ", ".join(f"{name} {count}" for name, count in done.counts.items())
+    what = "images" if done.has_images else "poses without images"
+    console.out.print(f"{target}: {what}: {frames}; focal length known of {done.with_focal}.")

@@ -1,0 +1,269 @@
+"""A data set from a folder in the format of Cambridge Landmarks: lists, images, reconstruction.nvm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+
+from spn_data.cambridge import CambridgeList, far_positions, oddities, read_cambridge
+from spn_data.camera import Camera
+from spn_data.errors import GeometryError, InputError
+from spn_data.hdf5 import DatasetWriter
+from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.nvm import read_nvm
+from spn_data.nvm_frames import NvmFrames
+from spn_data.photos import decode_photo
+from spn_data.pose import Poses
+from spn_data.record import content_fingerprint
+from spn_data.rendering import Renderer, RenderingOptions, canonical_camera
+from spn_data.timing import Progress
+
+LISTS = {
+    Role.TRAIN: "dataset_train.txt",
+    Role.VALIDATION: "dataset_validation.txt",
+    Role.TEST: "dataset_test.txt",
+}
+NVM = "reconstruction.nvm"
+_NO_PLACE = (
+    "the world of these lists has no known origin and no known up: it can't be flown by as it is"
+)
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """Of `spn-data import`."""
+
+    # Of the images in dataset.h5, in pixels; the height follows.
+    width_px: int = 480
+    # What the lists' positions are in: "m", or "model" where it means nothing.
+    units: str = "m"
+    # Whether positions absurdly far from all others are written too.
+    keep_outliers: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """What was written. counts : frames by group; with_focal : those with known intrinsics."""
+
+    counts: dict[str, int]
+    has_images: bool
+    with_focal: int
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """N frames of all lists: names, (N,) role of each, poses, image files (None: there are none)."""
+
+    names: tuple[str, ...]
+    roles: np.ndarray
+    poses: Poses
+    files: tuple[Path | None, ...]
+
+    def select(self, index: np.ndarray) -> _Frames:
+        return _Frames(
+            tuple(self.names[k] for k in index),
+            self.roles[index],
+            self.poses[index],
+            tuple(self.files[k] for k in index),
+        )
+
+
+def import_cambridge(
+    folder: Path,
+    target: Path,
+    options: ImportOptions,
+    progress: Progress,
+    *,
+    overwrite: bool = False,
+) -> Imported:
+    """Write `target` from dataset_train.txt, and what lies beside it of the other lists, images and NVM.
+
+    Images are reduced to the options' width and freed of the distortion that the NVM model states; none is
+    cut to a common view, for VisualSFM gives each image a focal length of its own. Raises InputError where
+    a list is missing or damaged, or `target` exists and `overwrite` is false.
+    """
+    if target.exists() and not overwrite:
+        raise InputError("exists already; --overwrite replaces it", path=target)
+    frames, notes = _read_lists(folder, options)
+    model = None
+    if (folder / NVM).is_file():
+        is_training = frames.roles == Role.TRAIN
+        model = NvmFrames(read_nvm(folder / NVM), frames.names, frames.poses, is_training)
+        notes += _of_model(frames, model)
+    else:
+        notes.append(f"no {NVM}: focal lengths are unknown, and there are no points")
+    has_images = any(file is not None for file in frames.files)
+    info = DatasetInfo(
+        units=options.units,
+        origin=None,
+        up_is_known=False,
+        camera=None,
+        has_images=has_images,
+        split={"lists": [name for name in LISTS.values() if (folder / name).is_file()]},
+        fingerprints={
+            name: content_fingerprint(folder / name)
+            for name in (*LISTS.values(), NVM)
+            if (folder / name).is_file()
+        },
+        notes=tuple(notes),
+    )
+    groups = {role.value: role for role in LISTS if (folder / LISTS[role]).is_file()}
+    counts = dict.fromkeys(groups, 0)
+    with_focal = 0
+    with DatasetWriter(target, info, groups) as writer:
+        for k in range(len(frames.names)):
+            progress("images" if has_images else "poses", k, len(frames.names))
+            frame = _frame(frames, k, model, options)
+            writer.append(str(frames.roles[k]), frame)
+            counts[str(frames.roles[k])] += 1
+            with_focal += bool(np.isfinite(frame.intrinsics).all())
+        progress("images" if has_images else "poses", len(frames.names), len(frames.names))
+    return Imported(counts, has_images, with_focal, tuple(notes))
+
+
+def _read_lists(folder: Path, options: ImportOptions) -> tuple[_Frames, list[str]]:
+    """Frames of all lists that are there, and sentences on all that is odd about them."""
+    if not folder.is_dir():
+        raise InputError("is no folder", path=folder)
+    lists = {
+        role: read_cambridge(folder / name)
+        for role, name in LISTS.items()
+        if role is Role.TRAIN or (folder / name).is_file()
+    }
+    notes = [_NO_PLACE]
+    if Role.TEST not in lists:
+        notes.append(f"no {LISTS[Role.TEST]}: there is nothing to evaluate on")
+    listed: dict[str, str] = {}
+    kept = []
+    for role, found in lists.items():
+        for name in found.names:
+            if name in listed:
+                raise InputError(f"{name} is in {listed[name]} too", path=folder / LISTS[role])
+            listed[name] = LISTS[role]
+        notes += [f"{LISTS[role]}: {sentence}" for sentence in oddities(found)]
+        far = far_positions(found.poses.centers)
+        if far.any() and not options.keep_outliers:
+            names = [name for name, is_far in zip(found.names, far, strict=True) if is_far]
+            notes.append(f"{_some(names)}: left out for that position; --keep-outliers keeps it")
+        kept.append(_frames(folder, found, role, far & (not options.keep_outliers)))
+    frames = _Frames(
+        tuple(name for part in kept for name in part.names),
+        np.concatenate([part.roles for part in kept]),
+        Poses(
+            np.concatenate([part.poses.centers for part in kept]),
+            np.concatenate([part.poses.quats_wxyz for part in kept]),
+        ),
+        tuple(file for part in kept for file in part.files),
+    )
+    return _without_missing_images(frames, notes), notes
+
+
+def _frames(folder: Path, found: CambridgeList, role: Role, dropped: np.ndarray) -> _Frames:
+    files = tuple(_image_file(folder, name) for name in found.names)
+    roles = np.full(len(found), role.value)
+    return _Frames(found.names, roles, found.poses, files).select(np.flatnonzero(~dropped))
+
+
+def _image_file(folder: Path, name: str) -> Path | None:
+    """The image as it is listed, or converted to another format since."""
+    path = folder / name
+    candidates = [path, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _without_missing_images(frames: _Frames, notes: list[str]) -> _Frames:
+    there = np.array([file is not None for file in frames.files], dtype=bool)
+    if not there.any():
+        notes.append("no image of the lists is there: poses alone, which can't be trained on")
+        return frames
+    if not there.all():
+        gone = [name for name, is_there in zip(frames.names, there, strict=True) if not is_there]
+        notes.append(f"{_some(gone)}: left out, the image is missing")
+    return frames.select(np.flatnonzero(there))
+
+
+def _of_model(frames: _Frames, model: NvmFrames) -> list[str]:
+    notes = []
+    for rows, what in (
+        (~model.is_known, f"not in {NVM}, so the focal length is unknown"),
+        (
+            model.is_known & ~model.has_points,
+            f"the pose in {NVM} is another; its points are left out",
+        ),
+    ):
+        if rows.any():
+            notes.append(f"{_some([frames.names[k] for k in np.flatnonzero(rows)])}: {what}")
+    return notes
+
+
+def _frame(
+    frames: _Frames, k: int, model: NvmFrames | None, options: ImportOptions
+) -> DatasetFrame:
+    name, file = frames.names[k], frames.files[k]
+    sequence = str(PurePosixPath(name).parent)
+    frame = DatasetFrame(
+        name=name,
+        sequence="" if sequence == "." else sequence,
+        time_s=np.nan,
+        center=frames.poses.centers[k],
+        quat_wxyz=frames.poses.quats_wxyz[k],
+        intrinsics=np.full((3, 3), np.nan),
+    )
+    if file is None:
+        return frame
+    image = decode_photo(file)
+    height, width = image.shape[:2]
+    try:
+        camera = None if model is None else model.camera(k, width, height)
+    except GeometryError as error:
+        raise InputError(
+            f"its lens in {NVM} can't be used: {error}; without that file the images are taken as they are",
+            path=file,
+        ) from error
+    # Any focal length will do to reduce an image without knowing its own.
+    assumed = Camera.from_horizontal_fov(width, height, 60.0)
+    renderer = _renderer(_Key(assumed if camera is None else camera), options.width_px)
+    frame = replace(frame, image=cv2.cvtColor(renderer.render(image), cv2.COLOR_BGR2RGB))
+    if camera is None or model is None:
+        return frame
+    ids, pixels, xyz = model.points(k, width, height)
+    moved, is_seen = renderer.move(pixels)
+    return replace(
+        frame,
+        intrinsics=renderer.target.matrix,
+        point_ids=ids[is_seen],
+        point_pixels=moved[is_seen],
+        point_xyz=xyz[is_seen],
+    )
+
+
+class _Key:
+    """A camera by its values, to keep its renderer by."""
+
+    def __init__(self, camera: Camera):
+        self.camera = camera
+        self._values = (camera.model, camera.width, camera.height, camera.params.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self._values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._values == other._values
+
+
+@lru_cache(maxsize=4)
+def _renderer(key: _Key, width_px: int) -> Renderer:
+    camera = key.camera
+    return Renderer(camera, canonical_camera([camera], RenderingOptions(width_px=width_px)))
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first name, and how many more."""
+    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
