@@ -168,7 +168,7 @@ def _in_view(
     inside = _inside(rays, border, np.zeros(1))
     points, rays = points[inside], rays[inside]
     pixels = camera.project(rays)
-    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1))
     ranges = np.linalg.norm(rays[inside], axis=1)
     return points[inside], pixels[inside, 0], pixels[inside, 1], ranges
 
@@ -179,11 +179,11 @@ def _inside(
     """Rows of points (N, 3) in the camera frame of which a sphere of that radius reaches into the view."""
     x, y, z = rays.T
     (left, top), (right, bottom) = border
-    inside = np.asarray(z > -radius)
+    inside = [z > -radius]
     for across, low, high in ((x, left, right), (y, top, bottom)):
-        inside &= across - low * z >= -radius * np.hypot(1, low)
-        inside &= high * z - across >= -radius * np.hypot(1, high)
-    return np.flatnonzero(inside)
+        inside.append(across - low * z >= -radius * np.hypot(1, low))
+        inside.append(high * z - across >= -radius * np.hypot(1, high))
+    return np.flatnonzero(np.logical_and.reduce(inside))
 
 
 def _hidden(cells: np.ndarray, ranges: np.ndarray, count: int, options: ViewOptions) -> np.ndarray:

@@ -157,20 +157,23 @@ def test_a_plan_is_covered_instead(area, tmp_path):
 
 
 def test_a_camera_of_waypoints_may_be_given(area, labelled, tmp_path):
-    """A file with a narrow camera gives another share of the view than the mapping camera."""
+    """A narrow camera, as a file or by its field of view, is that of waypoints that name none."""
     pose = labelled.mapping.poses[labelled.mapping.registered][:1]
     x, y, z = pose.centers[0]
     plan = tmp_path / "plan.csv"
     heading, pitch, roll = angles_from_rotations(pose.rotations)[0]
-    plan.write_text(f"x,y,z,heading,pitch,roll\n{x},{y},{z},{heading},{pitch},{roll}\n")
-    (tmp_path / "c.json").write_text(
-        json.dumps(camera_to_json(Camera.from_horizontal_fov(320, 180, 8.0)))
-    )
+    row = f"{x},{y},{z},{heading},{pitch},{roll}"
+    plan.write_text(f"x,y,z,heading,pitch,roll,camera\n{row},\n{row},near\n")
+    narrow = camera_to_json(Camera.from_horizontal_fov(320, 180, 8.0))
+    (tmp_path / "c.json").write_text(json.dumps(narrow))
     shares = []
-    for words in ((), ("--camera", tmp_path / "c.json")):
+    for words in ((), ("--camera", tmp_path / "c.json"), ("--fov", "8")):
         run("--area", area, "--waypoints", plan, *words)
-        shares.append(float(rows_of(area / PLANNED / "waypoints.csv")[0]["view_share"]))
-    assert shares[0] > shares[1] > 0
+        rows = rows_of(area / PLANNED / "waypoints.csv")
+        shares.append([float(row["view_share"]) for row in rows])
+    assert shares[1] == shares[2]
+    assert shares[0][0] > shares[1][0] > 0
+    assert shares[0][1] == shares[1][1] > shares[1][0]
 
 
 def test_limits_are_options(area):

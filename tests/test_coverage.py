@@ -315,6 +315,12 @@ class TestFlyAgain:
         assert sorted(found.serves.tolist()) == [1, 10]
         np.testing.assert_allclose(found.angles_deg[:, 1:], [[-10, 0]] * 2, atol=1e-9)
 
+    def test_stops_that_became_superfluous_are_left_out(self):
+        """The stop in the middle serves most and is taken first; the two beside it make it needless."""
+        queries = looking(*[(x, 0, 3) for x in (0.0, -1.3, 1.3, -0.9, 0.9, -2.5, 2.5)])
+        found = where_to_fly_again(queries, np.full(7, "low"))
+        assert sorted(found.poses.centers[:, 0].tolist()) == [-1.3, 1.3]
+
     def test_what_is_covered_needs_no_stop(self):
         """Frames of the wanted stratum are not served; none left gives no stop."""
         found = where_to_fly_again(looking((0, 0, 0), (50, 0, 0)), np.array(["high", "high"]))
@@ -336,6 +342,17 @@ class TestFlyAgain:
         steps = np.diff(found.poses.centers[:, 0])
         np.testing.assert_allclose(np.abs(steps), 5.0)
         assert len(set(np.sign(steps))) == 1
+
+    def test_the_path_is_shorter_than_by_the_nearest_next_stop(self, monkeypatch):
+        """Turning stretches round saves a tenth of the way among scattered stops."""
+        rng = np.random.default_rng(2)
+        queries = looking(*np.column_stack([rng.uniform(0, 80, (60, 2)), np.full(60, 5.0)]))
+        ways = []
+        for limit in (400, 0):
+            monkeypatch.setattr("spn_data.refly._MAX_SHORTENED", limit)
+            centers = where_to_fly_again(queries, np.full(60, "low")).poses.centers
+            ways.append(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+        assert ways[0] < 0.9 * ways[1]
 
     def test_crossing_paths_are_untangled(self):
         """On a loop, the path is no longer than the loop, where always the nearest stop would jump across."""
