@@ -105,7 +105,7 @@ def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> Fin
     return finding_of(
         "map unchanged",
         bad,
-        f"its hash is {now}, as before and after each of {len(registrations)} registrations"
+        f"its hash is {now[:16]}…, as before and after each of {len(registrations)} registrations"
         if registrations
         else "nothing was registered in it",
         "the map is not the one that sequences were registered in",

@@ -128,6 +128,26 @@ def seconds_apart(labels: Labels, held: np.ndarray) -> np.ndarray:
     return apart
 
 
+def next_to(labels: Labels, held: np.ndarray) -> np.ndarray:
+    """(N,) bool: frames that no chosen frame with a pose separates in time from one of their sequence held.
+
+    Chosen frames are some motion apart: a guard that reaches over one has seen the camera move, also
+    where it hovered, and where photos are farther apart than any gap in seconds.
+    """
+    near = np.zeros(len(labels), dtype=bool)
+    for sequence in np.unique(labels.sequences[held]):
+        mine = labels.sequences == sequence
+        chosen = np.sort(labels.time_s[mine & labels.registered & ~labels.dense])
+        times, own = np.sort(labels.time_s[mine & held]), labels.time_s[mine]
+        after = np.searchsorted(times, own)
+        before = after - 1
+        later, earlier = times[after.clip(max=len(times) - 1)], times[before.clip(min=0)]
+        since = np.searchsorted(chosen, own) - np.searchsorted(chosen, earlier, side="right")
+        until = np.searchsorted(chosen, later) - np.searchsorted(chosen, own, side="right")
+        near[mine] = ((before >= 0) & (since < 1)) | ((after < len(times)) & (until < 1))
+    return near & ~held
+
+
 def cells_of(labels: Labels, cell_m: float) -> list[tuple[int, int] | None]:
     """The cell in plan view of each frame; None without a pose."""
     plan_view = labels.poses.centers[:, :2]

@@ -24,11 +24,14 @@ from spn_data.split import (
     Split,
     SplitOptions,
     cells_of,
+    next_to,
     seconds_apart,
 )
 
 # Of the frames that a block is taken from, so many must stay with training where that can be had.
 _ENOUGH_LEFT = 0.5
+# A block in time has so many frames, where validation has as many at all: photos are seconds apart.
+_MIN_FRAMES = 4
 # So many places for a block are tried at most.
 _MAX_CANDIDATES = 64
 
@@ -106,11 +109,14 @@ class _Plan:
         held = block.holds(self.flights) & (self.group == TRAIN)
         group = np.where(held, block.group, self.group)
         reason = self.reason.copy()
-        for near, why in (
-            (seconds_apart(self.flights, held) < self.options.gap_s - SLACK, GUARD_GAP),
+        near = seconds_apart(self.flights, held) < self.options.gap_s - SLACK
+        if self.options.gap_s > 0:
+            near |= next_to(self.flights, held)
+        for left_out, why in (
+            (near, GUARD_GAP),
             (_within_guard(self.flights, held, block, self.options), GUARD_DISTANCE),
         ):
-            left_out = near & (group == TRAIN)
+            left_out = left_out & (group == TRAIN)
             group[left_out], reason[left_out] = LEFT_OUT, why
         return replace(self, group=group, reason=reason, blocks=(*self.blocks, block))
 
@@ -186,7 +192,7 @@ def _validate_sequence(plan: _Plan, sequence: str) -> _Plan:
     free = rows[plan.trained[rows]]
     wanted_s = options.validation_share * float(np.ptp(plan.flights.time_s[free]))
     wanted = max(1, round(options.validation_share * len(free)))
-    count = int(np.clip(round(wanted_s / options.block_s), 1, wanted))
+    count = int(np.clip(round(wanted_s / options.block_s), 1, max(1, wanted // _MIN_FRAMES)))
     for part in np.array_split(free, count):
         windows = _windows(plan, rows, part, VALIDATION, max(1, round(wanted / count)))
         plan = _hold_out_one(plan, windows, rng, part)

@@ -201,6 +201,40 @@ def test_the_same_input_gives_the_same_split_in_any_order(area, evaluation):
     assert len({other.blocks for other in others}) > 2
 
 
+def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
+    """Photos 10 s apart: blocks of several, and the photo on each side is left out, though 10 s away."""
+    photos = flight("photos", line(100, step_m=10.0), every_s=10.0)
+    split = make_split(photos, nothing(), evaluation, SplitOptions())
+    group = split.of(photos.names)
+    assert len(split.blocks) == 2
+    for block in split.blocks:
+        inside = np.flatnonzero(block.holds(photos))
+        assert len(inside) >= 4
+        beside = [k for k in (inside[0] - 1, inside[-1] + 1) if 0 <= k < 100]
+        assert (group[beside] == LEFT_OUT).all()
+    assert (group == LEFT_OUT).sum() <= 4
+    without = make_split(photos, nothing(), evaluation, SplitOptions(gap_s=0.0))
+    assert (without.of(photos.names) != LEFT_OUT).all()
+
+
+def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
+    """Dense frames of a hover of 20 s are in no group where a block ends as it begins: nothing moved."""
+    moving = flight("one", line(40))
+    after = flight("one", line(40) + np.array([40.0, 0.0, 0.0]), start_s=40.0)
+    names = np.char.replace(after.names, "/f", "/g")
+    chosen = Labels.concatenate([moving, replace(after, names=names)])
+    hover = flight(
+        "one", np.tile([39.0, 0.0, 8.0], (180, 1)), every_s=0.1, start_s=20.0, dense=True
+    )
+    for seed in range(30):
+        split = make_split(chosen, hover, evaluation, SplitOptions(seed=seed))
+        held = chosen.time_s[split.of(chosen.names) == VALIDATION]
+        if (held == 19.5).any():
+            assert TRAIN not in split.of(hover.names)
+            return
+    pytest.fail("no seed placed a block before the hover")
+
+
 def test_a_short_flight_beside_a_long_one_trains_as_a_whole(area, evaluation):
     """Of 3 s, block and guard would leave nothing: the flight gives no block, and a note says so."""
     mapping = Labels.concatenate([area[0], flight("short", line(6, north_m=40.0))])
