@@ -116,7 +116,7 @@ RULES = {
         Level.CAUTION,
         "Coverage is out of date: 4-eval/medium",
     ),
-    "coverage low": (lambda d: replace(d, coverage=LOW), Level.CAUTION, "38% of medium are views"),
+    "coverage low": (lambda d: replace(d, coverage=LOW), Level.CAUTION, "38% of sequence medium are views"),
     "no split": (lambda d: replace(d, split=None, audit=None), Level.STOP, "are not split"),
     "nothing to train on": (nothing_to_train_on, Level.STOP, "No frame is left"),
     "optimistic": (optimistic, Level.CAUTION, "same flight as training: optimistic"),

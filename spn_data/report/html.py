@@ -8,6 +8,7 @@ from string import Template
 
 from spn_data.report import sections
 from spn_data.report.data import ReportData
+from spn_data.report.figures import key_figures
 from spn_data.report.pack import script_json
 from spn_data.report.scene import pack_scene
 from spn_data.report.thinning import thin_frames
@@ -24,7 +25,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "title": escape(data.title),
         "heading": sections.heading(data),
         "verdict": sections.verdict_box(judged),
-        "figures": sections.key_figures(data),
+        "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data),
         "timeline": sections.timeline(data, left_out),

@@ -12,9 +12,10 @@ import numpy as np
 from spn_data import audit
 from spn_data.record import StageRecord
 from spn_data.report.data import FAILED, STRATA, FrameTable, ReportData
+from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import Finding, Level, Verdict
-from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN
+from spn_data.split import LEFT_OUT
 from spn_data.split_file import statements
 
 _MOST_EVIDENCE = 50  # lines shown of one check
@@ -61,104 +62,6 @@ def _what_to_do(finding: Finding) -> str:
     return f"{escape(finding.do)}{': ' if finding.do and code else '.' if finding.do else ''}{code}"
 
 
-def key_figures(data: ReportData) -> str:
-    """Tiles with the figures that matter, each with its unit."""
-    tiles = []
-    unit = "m" if data.units == "m" else "model units"
-    if data.model_record is not None:
-        c = data.model_record.counts
-        tiles.append(
-            _tile(
-                "Map",
-                f"{c['registered']:,} of {c['frames']:,}",
-                "chosen frames have a pose",
-                [f"{c['points']:,} points", f"{c['mean_error_px']:.2f} px reprojection error"],
-            )
-        )
-    if data.geo is not None:
-        stated, summary = data.geo.uncertainty, data.geo.summary
-        origin = data.geo.origin
-        tiles.append(
-            _tile(
-                "Place in the world",
-                f"{_figure(2 * stated.horizontal_m, '.2f')} m",
-                "horizontal uncertainty of the whole map (2 sigma)",
-                [
-                    f"vertical {_figure(2 * stated.vertical_m, '.2f')} m (2 sigma)",
-                    f"tilt {_figure(stated.tilt_deg, '.2f')} deg, "
-                    f"heading {_figure(stated.heading_deg, '.2f')} deg (1 sigma)",
-                    f"scale {_figure(stated.scale, '.2%')} (1 sigma)",
-                    f"origin {origin.lat_deg:.6f}, {origin.lon_deg:.6f}, height {origin.alt_m:.2f} m "
-                    f"({origin.height_reference})",
-                ],
-            )
-        )
-        tiles.append(
-            _tile(
-                "GNSS residuals",
-                f"{_figure(summary.horizontal_rmse_m, '.2f')} m",
-                "horizontal (RMSE): noise of the receiver, not the error of poses",
-                [
-                    f"vertical {_figure(summary.vertical_rmse_m, '.2f')} m",
-                    f"CE90 {_figure(summary.ce90_m, '.2f')} m, LE90 {_figure(summary.le90_m, '.2f')} m",
-                    f"{summary.fixes:,} fixes, {summary.outliers:,} outliers",
-                ],
-            )
-        )
-    elif data.model_record is not None:
-        tiles.append(
-            _tile(
-                "Place in the world",
-                "units: model",
-                "lengths are no metres; north and up are unknown",
-                [],
-            )
-        )
-    for name in data.evaluation_sequences:
-        tiles.append(_sequence_tile(data.frames, name, unit))
-    dense = data.frames.dense & ~data.frames.evaluation & data.frames.tried
-    if dense.any():
-        tiles.append(_labels_tile("Dense frames of mapping", data.frames, dense, unit))
-    if data.split is not None:
-        counts = data.split.counts()
-        others = [f"{n:,} {group}" for group, n in counts.items() if group != TRAIN]
-        optimistic = [OPTIMISTIC] if data.split.optimistic else []
-        tiles.append(
-            _tile("Split", f"{counts.get(TRAIN, 0):,}", "frames to train on", others + optimistic)
-        )
-    return f'<section class="tiles">{"".join(tiles)}</section>' if tiles else ""
-
-
-def _sequence_tile(frames: FrameTable, name: str, unit: str) -> str:
-    mine = frames.evaluation & (frames.sequences == name) & frames.tried
-    return _labels_tile(f"Evaluation: {name}", frames, mine, unit)
-
-
-def _labels_tile(title: str, frames: FrameTable, mask: np.ndarray, unit: str) -> str:
-    registered = mask & frames.registered
-    lines = []
-    for values, text, form in (
-        (frames.sigma_m[registered], f"{unit} position, 1 sigma (median)", ".3f"),
-        (frames.sigma_deg[registered], "deg rotation, 1 sigma (median)", ".3f"),
-        (frames.error_px[registered], "px reprojection error (median)", ".2f"),
-    ):
-        known = values[np.isfinite(values)]
-        if len(known):
-            lines.append(f"{np.median(known):{form}} {text}")
-    chosen, dense = mask & ~frames.dense, mask & frames.dense
-    if chosen.any() and dense.any():
-        lines.append(f"of these dense: {(dense & frames.registered).sum():,} of {dense.sum():,}")
-    return _tile(title, f"{registered.sum():,} of {mask.sum():,}", "frames have a pose", lines)
-
-
-def _tile(title: str, value: str, what: str, lines: Iterable[str]) -> str:
-    more = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    return (
-        f'<div class="tile"><h3>{escape(title)}</h3><p class="value">{escape(value)}</p>'
-        f"<p>{escape(what)}</p><ul>{more}</ul></div>"
-    )
-
-
 def view(data: ReportData, max_points: int) -> str:
     """Place of the 3D view; the script draws it."""
     thinned = ""
@@ -171,7 +74,8 @@ def view(data: ReportData, max_points: int) -> str:
     )
     return (
         '<section><h2>Map</h2><div class="view"><canvas id="view" tabindex="0" '
-        'aria-label="3D view of the map"></canvas><div id="legend"></div><div id="picked"></div></div>'
+        'aria-label="3D view of the map"></canvas><div id="north" hidden>N</div>'
+        '<details id="legend"></details><div id="picked"></div></div>'
         f'<p class="note">Drag to turn, right button or two fingers to move, wheel (after a click) or '
         f"pinch to zoom; click a camera for its figures. {frame}{thinned}"
         '<span id="fallback"></span></p></section>'
@@ -190,8 +94,8 @@ def residuals(data: ReportData) -> str:
     if held_out.frames:
         extra = (
             f'<p class="note">On fixes that the fit has not seen ({held_out.folds} blocks of time): '
-            f"{_figure(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
-            f"{_figure(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
+            f"{figure(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
+            f"{figure(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
         )
     return f"<section><h2>GNSS residuals from above</h2>{drawn}{extra}</section>"
 
@@ -371,8 +275,3 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]], kind: str) -> s
         f'<div class="wide"><table class="{kind}"><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
-
-
-def _figure(value: float, form: str) -> str:
-    """A figure for people; NaN and infinity are unknown."""
-    return format(value, form) if np.isfinite(value) else "unknown"

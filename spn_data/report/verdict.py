@@ -226,17 +226,14 @@ def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
             again = len(data.coverage.fly_again)
             yield Finding(
                 Level.CAUTION,
-                f"{share:.0%} of {name} are views that no mapping frame is near to: a network has to "
-                "extrapolate there.",
+                f"{share:.0%} of sequence {name} are views that no mapping frame is near to: a network has "
+                "to extrapolate there.",
                 f"Fly the {_count(again, 'place')} listed below and add them" if again else "",
                 "spn-data reconstruct VIDEO --add",
             )
         elif total:
-            near = counts.get("high", 0) / total
-            yield Finding(
-                Level.GOOD,
-                f"Mapping covers {name}: {near:.0%} of its frames closely, {share:.0%} hardly.",
-            )
+            parts = ", ".join(f"{counts.get(s, 0) / total:.0%} {s}" for s in STRATA)
+            yield Finding(Level.GOOD, f"Coverage of {name} by mapping frames: {parts}.")
 
 
 def _split(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:

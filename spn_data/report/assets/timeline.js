@@ -59,9 +59,10 @@ function makeTimeline(onPick) {
       for (const i of [...mine].sort((a, b) => weight(a) - weight(b))) {
         const status = frames.status(i);
         const color = status === "registered" && frames.evaluation[i] ? "--evaluation" : colors[status];
-        const [top, height] = !tried(i) ? [0.72, 0.28] : frames.dense[i] ? [0.36, 0.3] : [0, 0.66];
+        const failed = status === "failed";
+        const [top, height] = !tried(i) ? [0.72, 0.28] : frames.dense[i] ? [0.36, 0.3] : [0, failed ? 1 : 0.66];
         context.fillStyle = css(color);
-        context.fillRect(4 * scale + frames.time_s[i] / last * w - scale / 2, top * h, Math.max(1, 1.2 * scale), height * h);
+        context.fillRect(4 * scale + frames.time_s[i] / last * w - scale / 2, top * h, Math.max(1, (failed ? 2.5 : 1.2) * scale), height * h);
       }
       if (mine.includes(marked)) {
         context.fillStyle = css("--picked");

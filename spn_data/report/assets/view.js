@@ -37,7 +37,7 @@ function usualSize() {
   return Math.min(Math.max(0.8 * step, 0.008 * radius), 0.04 * radius);
 }
 
-const EVALUATION_COLORS = ["--evaluation", "--again", "--unreadable"];
+const EVALUATION_COLORS = ["--evaluation", "--evaluation2", "--evaluation3"];
 
 function makeLayers(size) {
   const made = [];
@@ -52,7 +52,7 @@ function makeLayers(size) {
   };
   if (given.points) {
     const points = given.points;
-    add("points", null, {xyz: unpack(points.xyz), step: points.step, rgb: unpack(points.rgb), size: 2});
+    add("points", null, {xyz: unpack(points.xyz), step: points.step, rgb: unpack(points.rgb), size: innerWidth < 600 ? 1.4 : 2});
   }
   cameras("mapping cameras", "--mapping", i => !frames.evaluation[i]);
   const sequences = [...new Set(rows.filter(i => frames.evaluation[i]).map(i => frames.sequence(i)))];
@@ -89,7 +89,7 @@ function makeLayers(size) {
   add("fly again", "--again", {lines: true, xyz: new Float32Array(again), rgb: "--again"});
   const grid = gridLines();
   add(`grid, ${grid.spacing} ${unit}`, "--skipped", {lines: true, xyz: grid.xyz, rgb: "--line"});
-  if (given.units === "m") add("north", "--text", {lines: true, xyz: northLines(), rgb: "--text", free: true});
+  if (given.units === "m") add("north", "--text", {lines: true, xyz: northLines(), rgb: "--text", });
   return made;
 }
 
@@ -116,14 +116,12 @@ function gridLines() {
   return {spacing: Number(spacing.toPrecision(3)), xyz: new Float32Array(out)};
 }
 
-// An arrow and an N at the grid's northern edge.
+// An arrow beyond the grid's northern edge; the letter N is a label over its tip.
+const northTip = [0, half * 1.4, floor];
+
 function northLines() {
-  const s = half * 0.07, y = half * 1.1, z = floor;
-  const flat = (...xy) => { const out = []; for (let k = 0; k < xy.length; k += 2) out.push(xy[k], xy[k + 1], z); return out; };
-  return new Float32Array([
-    ...flat(0, y, 0, y + 3 * s, 0, y + 3 * s, -s / 2, y + 2.2 * s, 0, y + 3 * s, s / 2, y + 2.2 * s),
-    ...flat(-s / 2, y + 3.5 * s, -s / 2, y + 5 * s, -s / 2, y + 5 * s, s / 2, y + 3.5 * s, s / 2, y + 3.5 * s, s / 2, y + 5 * s),
-  ]);
+  const s = half * 0.05, [x, y, z] = northTip;
+  return new Float32Array([x, half * 1.1, z, ...northTip, ...northTip, x - s, y - 2 * s, z, ...northTip, x + s, y - 2 * s, z]);
 }
 
 function multiply(a, b) {
@@ -134,7 +132,7 @@ function multiply(a, b) {
 }
 
 function makeView(onPick) {
-  let canvas = document.getElementById("view");
+  const canvas = document.getElementById("view");
   const drawing = glDrawing(canvas) || flatDrawing(canvas);
   if (drawing.kind === "2d")
     document.getElementById("fallback").textContent = " This browser has no WebGL: drawn simply, with fewer points.";
@@ -172,13 +170,18 @@ function makeView(onPick) {
     const scale = window.devicePixelRatio || 1;
     const w = Math.max(1, Math.round(canvas.clientWidth * scale)), h = Math.max(1, Math.round(canvas.clientHeight * scale));
     if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
-    drawing.draw(matrix(), [...layers.filter(l => l.on), ...(mark ? [mark] : [])], scale);
+    const m = matrix();
+    drawing.draw(m, [...layers.filter(l => l.on), ...(mark ? [mark] : [])], scale);
+    const [x, y, depth] = onScreen(m, ...northTip), label = document.getElementById("north");
+    label.hidden = depth <= 0 || x < 0 || y < 0 || x > canvas.clientWidth || y > canvas.clientHeight
+      || !layers.some(l => l.label === "north" && l.on);
+    label.style.transform = `translate(${x}px, ${y}px) translate(-50%, -110%)`;
   }
   const redraw = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
 
   function legend() {
     const box = document.getElementById("legend");
-    box.textContent = "";
+    box.replaceChildren(element("summary", {}, "Shown"));
     for (const layer of layers) {
       const tick = element("input", {type: "checkbox"});
       tick.checked = layer.on;
@@ -217,16 +220,19 @@ function makeView(onPick) {
     redraw();
   }
 
+  function onScreen(m, px, py, pz) {
+    const w = m[3] * px + m[7] * py + m[11] * pz + m[15];
+    return [(1 + (m[0] * px + m[4] * py + m[8] * pz + m[12]) / w) * canvas.clientWidth / 2,
+            (1 - (m[1] * px + m[5] * py + m[9] * pz + m[13]) / w) * canvas.clientHeight / 2, w];
+  }
+
   function nearest(x, y) {
     const m = matrix();
     let best = -1, least = 16;
     for (const i of posed) {
-      const [px, py, pz] = centerOf(i);
-      const w = m[3] * px + m[7] * py + m[11] * pz + m[15];
+      const [px, py, w] = onScreen(m, ...centerOf(i));
       if (w <= 0) continue;
-      const dx = (1 + (m[0] * px + m[4] * py + m[8] * pz + m[12]) / w) * canvas.clientWidth / 2 - x;
-      const dy = (1 - (m[1] * px + m[5] * py + m[9] * pz + m[13]) / w) * canvas.clientHeight / 2 - y;
-      const far = Math.hypot(dx, dy) + (frames.dense[i] ? 4 : 0);
+      const far = Math.hypot(px - x, py - y) + (frames.dense[i] ? 4 : 0);
       if (far < least) { least = far; best = i; }
     }
     return best;
@@ -283,6 +289,7 @@ function makeView(onPick) {
   });
   new ResizeObserver(redraw).observe(canvas);
   reset();
+  document.getElementById("legend").open = canvas.clientWidth > 500;  // on a phone it would hide the map
   legend();
   draw();
   return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas};
