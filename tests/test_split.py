@@ -219,16 +219,16 @@ def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
 
 def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
     """Dense frames of a hover of 20 s are in no group where a block ends as it begins: nothing moved."""
-    moving = flight("one", line(40))
-    after = flight("one", line(40) + np.array([40.0, 0.0, 0.0]), start_s=40.0)
+    moving = flight("one", line(30))
+    after = flight("one", line(30) + np.array([30.0, 0.0, 0.0]), start_s=35.0)
     names = np.char.replace(after.names, "/f", "/g")
     chosen = Labels.concatenate([moving, replace(after, names=names)])
     hover = flight(
-        "one", np.tile([39.0, 0.0, 8.0], (180, 1)), every_s=0.1, start_s=20.0, dense=True
+        "one", np.tile([29.0, 0.0, 8.0], (180, 1)), every_s=0.1, start_s=15.0, dense=True
     )
     for seed in range(60):
         split = make_split(chosen, hover, evaluation, SplitOptions(seed=seed))
-        if any(block.seconds[1] == 19.5 for block in split.blocks):
+        if any(block.seconds[1] == 14.5 for block in split.blocks):
             assert TRAIN not in split.of(hover.names)
             return
     pytest.fail("no seed placed a block before the hover")
