@@ -84,8 +84,8 @@ class DatasetWriter:
             self._groups[group].append(frame)
         except _OtherSize as error:
             raise InputError(
-                f"images of group {group} are of {error.before} and of {error.now}: they need one "
-                "size; render all into one camera (without --native)",
+                f"images of group {group} are of {error.before} and of {error.now}: a group "
+                "holds one size",
                 path=self._path,
             ) from error
         if self._disk.error is not None:
