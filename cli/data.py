@@ -8,10 +8,14 @@ from typing import Any
 import click
 
 from cli import options
+from cli.audit import audit
 from cli.console import Group
 from cli.coverage import coverage
 from cli.export import export
+from cli.import_ import import_
+from cli.register import register
 from cli.report import report
+from cli.split import split
 
 
 @click.group(cls=Group)
@@ -105,9 +109,13 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
         live.stage(stage(area, options.geo_options(**chosen), live.progress, overwrite=overwrite))
 
 
+main.add_command(register)
 main.add_command(coverage)
+main.add_command(split)
+main.add_command(audit)
 
 
+main.add_command(import_)
 main.add_command(export)
 
 

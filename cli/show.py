@@ -6,8 +6,8 @@ import math
 from contextlib import AbstractContextManager
 from typing import Any
 
-from cli import console
-from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area
+from cli import console, show_labels
+from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, STAGES, Area
 from spn_data.errors import StageError
 from spn_data.pipeline.frames import Plan
 from spn_data.record import StageRecord
@@ -17,7 +17,8 @@ from spn_data.telemetry.track import TelemetrySummary
 class Live:
     """Shows stages while they are made: progress on a terminal, tables when one is done."""
 
-    def __init__(self) -> None:
+    def __init__(self, unit: str = "m") -> None:
+        self.unit = unit  # of lengths in labels
         self._bars: AbstractContextManager[Any] | None = None
         self._progress: Any = None
 
@@ -54,9 +55,10 @@ class Live:
             console.note(f"ignored: {shown}{more}")
         cost = found.cost
         seconds, disk_bytes = model_cost
+        choosing, mapping = console.duration(cost.seconds), console.duration(seconds)
         console.out.print(
-            f"Expected: about {cost.chosen} frames of {cost.candidates} images; {duration(cost.seconds)} to "
-            f"choose them and {duration(seconds)} for the model; "
+            f"Expected: about {cost.chosen} frames of {cost.candidates} images; {choosing} to "
+            f"choose them and {mapping} for the model; "
             f"{(cost.disk_bytes + disk_bytes) / 1e6:.0f} MB on disk.\n"
         )
 
@@ -81,7 +83,12 @@ class Live:
 
     def stage(self, record: StageRecord) -> None:
         self._close()
-        {FRAMES: frames, MODEL: model, GEO: georegistration}[record.stage](record)
+        group = record.stage.partition("/")[0]
+        if group == EVALUATION:
+            show_labels.evaluation(record, self.unit)
+        else:
+            tables = {FRAMES: frames, MODEL: model, GEO: georegistration, DENSE: show_labels.dense}
+            tables[group](record)
 
     def unchanged(self, record: StageRecord) -> None:
         self._close()
@@ -99,10 +106,10 @@ def frames(record: StageRecord) -> None:
             ("sequences", str(counts["sequences"])),
             ("with a fix", str(counts["with_fix"])),
             *([("unreadable", str(counts["unreadable"]))] if counts["unreadable"] else []),
-            _time(record),
+            show_labels.time_row(record),
         ],
     )
-    _notes(record)
+    show_labels.notes(record)
 
 
 def model(record: StageRecord) -> None:
@@ -118,10 +125,10 @@ def model(record: StageRecord) -> None:
                 (f"camera {key}", f"{camera['focal_px']:.1f} px, {camera['fov_deg']:.1f} deg wide")
                 for key, camera in counts["cameras"].items()
             ),
-            _time(record),
+            show_labels.time_row(record),
         ],
     )
-    _notes(record)
+    show_labels.notes(record)
 
 
 def georegistration(record: StageRecord) -> None:
@@ -150,10 +157,10 @@ def georegistration(record: StageRecord) -> None:
             ),
             ("from", ", ".join(c["observations"])),
             ("origin", f"{lat:.6f}, {lon:.6f}, height {alt:.2f} m ({c['height_reference']})"),
-            _time(record),
+            show_labels.time_row(record),
         ],
     )
-    _notes(record)
+    show_labels.notes(record)
 
 
 def status(area: Area) -> None:
@@ -163,7 +170,7 @@ def status(area: Area) -> None:
             f"{area.root.resolve()} is no area: spn-data reconstruct VIDEO --area ... makes one"
         )
     rows = []
-    for stage in STAGES:
+    for stage in (*STAGES, *(s for s in area.stages() if s not in STAGES)):
         if not area.has(stage):
             state = (
                 "unfinished: the same command goes on"
@@ -206,31 +213,16 @@ def verdict(area: Area) -> None:
     console.out.print(sentence)
 
 
-def duration(seconds: float) -> str:
-    """Seconds for people."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
 def _summary(record: StageRecord) -> str:
     c = record.counts
     if record.stage == FRAMES:
         return f"{c['chosen']} frames of {c['sequences']} sequences"
     if record.stage == MODEL:
         return f"{c['registered']} of {c['frames']} frames, {c['points']} points"
-    return f"{_m(c['horizontal_rmse_m'])} horizontal, {_m(c['vertical_rmse_m'])} vertical residual (RMSE)"
-
-
-def _notes(record: StageRecord) -> None:
-    for note in record.notes:
-        console.note(note)
-
-
-def _time(record: StageRecord) -> tuple[str, str]:
-    steps = ", ".join(f"{name} {duration(s)}" for name, s in record.seconds.items() if s >= 1)
-    total, cpu = sum(record.seconds.values()), sum(record.cpu_seconds.values())
-    return "time", f"{duration(total)} ({cpu:.0f} s of CPU){f': {steps}' if steps else ''}"
+    if record.stage == GEO:
+        horizontal, vertical = _m(c["horizontal_rmse_m"]), _m(c["vertical_rmse_m"])
+        return f"{horizontal} horizontal, {vertical} vertical residual (RMSE)"
+    return show_labels.summary(record)
 
 
 def _files(parts: tuple[Any, ...]) -> str:

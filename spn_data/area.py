@@ -8,7 +8,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ _GROUPS = (EVALUATION, DENSE)
 SCRATCH: dict[str, tuple[str, ...]] = {
     FRAMES: (".analysis",),
     MODEL: ("mapping-*", "database-*", "refined"),
-    EVALUATION: (".analysis", "found.npz"),
+    EVALUATION: (".analysis", ".matches"),
 }
 
 _FACTS = "area.toml"
@@ -52,9 +52,11 @@ class Facts:
     """What the user says of the area: facts, not tuning.
 
     sources : folders and files that were reconstructed, in the order in which they were given.
+    evaluation : what each evaluation sequence was registered from, by its name.
     """
 
     sources: tuple[str, ...] = ()
+    evaluation: Mapping[str, str] = field(default_factory=dict)
 
 
 class StageWork:
@@ -284,7 +286,10 @@ class Area:
     def write_facts(self, facts: Facts) -> None:
         if facts == self.facts and (self.root / _FACTS).exists():
             return
-        text = tomli_w.dumps({"version": VERSION, "sources": list(facts.sources)})
+        table = {"version": VERSION, "sources": list(facts.sources)}
+        if facts.evaluation:
+            table["evaluation"] = dict(sorted(facts.evaluation.items()))
+        text = tomli_w.dumps(table)
         write_atomically(self.root / _FACTS, text)
         self.facts = facts
 
@@ -295,8 +300,9 @@ class Area:
         try:
             table = tomllib.loads(path.read_text())
             check_version(path, table["version"])
-            return Facts(sources=tuple(str(s) for s in table["sources"]))
-        except (tomllib.TOMLDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
+            evaluation = {str(k): str(v) for k, v in dict(table.get("evaluation", {})).items()}
+            return Facts(sources=tuple(str(s) for s in table["sources"]), evaluation=evaluation)
+        except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path}: not an area file of this program ({error!r})") from error
 
     def next_area(self) -> Area:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, LabelStatus, SeenPoints, read_labels, read_seen_points
+from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
 from spn_data.pose import Poses, Similarity
 from spn_data.record import read_json
@@ -57,8 +58,10 @@ def map_folder(area: Area) -> Path:
     return area.folder(GEO if area.has(GEO) else MODEL)
 
 
-def read_labelled_area(area: Area) -> LabelledArea:
+def read_labelled_area(area: Area, *, mapping_covariance: bool = True) -> LabelledArea:
     """All labels, in metres where the area is georegistered.
+
+    mapping_covariance : false leaves the covariances of mapping frames unknown (NaN), which is quicker.
 
     Raises StageError for a stage that is missing or stale, FormatError or InputError for a damaged file.
     """
@@ -69,6 +72,8 @@ def read_labelled_area(area: Area) -> LabelledArea:
     scene, observations, points = read_map(map_folder(area))
     chosen = chosen_frames(area)
     mapping, mapping_seen = _mapping_labels(area, scene, observations, points, chosen)
+    if mapping_covariance:
+        mapping = _with_covariance(mapping, scene, observations)
     cameras = {
         str(key): scene.cameras[int(scene.camera_ids[scene.names.index(name)])]
         for key, name in _camera_samples(chosen, scene).items()
@@ -155,7 +160,6 @@ def _mapping_labels(
     rows = np.array([row_of[name] for name in scene.names], dtype=np.int64)
     centers, quats = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
     centers[rows], quats[rows] = scene.poses.centers, scene.poses.quats_wxyz
-    covariance = np.full((n, 6, 6), np.nan)
     status = np.full(n, LabelStatus.FAILED.value, dtype="<U10")
     status[rows] = LabelStatus.REGISTERED.value
     inliers, coverage, error_px = np.zeros(n, np.int64), np.zeros(n), np.full(n, np.nan)
@@ -179,7 +183,7 @@ def _mapping_labels(
         status=status,
         reason=np.array([reasons.get(name, "") for name in chosen.names.tolist()], dtype=np.str_),
         poses=Poses(centers, quats),
-        covariance=covariance,
+        covariance=np.full((n, 6, 6), np.nan),
         inliers=inliers,
         coverage=coverage,
         error_px=error_px,
@@ -191,6 +195,14 @@ def _mapping_labels(
         observations.pixels[order],
     )
     return labels, seen
+
+
+def _with_covariance(labels: Labels, scene: Scene, observations: Observations) -> Labels:
+    covariance = labels.covariance.copy()
+    row_of = {name: k for k, name in enumerate(labels.names.tolist())}
+    rows = [row_of[name] for name in scene.names]
+    covariance[rows] = MapCovariance.of(scene, observations).pose_covariances()
+    return replace(labels, covariance=covariance)
 
 
 def _missing_reasons(area: Area) -> dict[str, str]:

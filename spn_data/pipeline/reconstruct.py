@@ -110,7 +110,8 @@ def _stages(
     )
     earlier = () if extended is None else extended.facts.sources
     given = [str(path).encode(errors="backslashreplace").decode() for path in inputs]
-    area.write_facts(Facts(sources=(*earlier, *given)))
+    kept = (area if extended is None else extended).facts.evaluation
+    area.write_facts(Facts(sources=(*earlier, *given), evaluation=kept))
     tell(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
     tell(model, before.get(MODEL))

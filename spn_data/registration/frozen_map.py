@@ -10,8 +10,9 @@ from typing import Self
 
 import numpy as np
 
-from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.map_features import MapFeatures
 from spn_data.colmap.model import Observations, Scene, read_feature_points, read_map
+from spn_data.errors import FormatError
 from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
 
@@ -30,21 +31,21 @@ class MapFrame:
 class FrozenMap:
     """A model and its database, opened for reading."""
 
-    def __init__(self, folder: Path, database: MapDatabase):
+    def __init__(self, folder: Path, features: MapFeatures):
         self.scene: Scene
         self.observations: Observations
         self.points: MapPoints
         self.scene, self.observations, self.points = read_map(folder)
         self._feature_points = read_feature_points(folder)
-        self._database = database
-        described = [database.read_features(name).descriptors for name in self.scene.names]
+        self._features = features
+        described = [features.descriptors(name) for name in self.scene.names]
         self.vocabulary = appearance_vocabulary(described, PairOptions())
         self._appearance = np.stack([describe_appearance(d, self.vocabulary) for d in described])
 
     @classmethod
     @contextmanager
     def open(cls, folder: Path, database: Path) -> Iterator[Self]:
-        with MapDatabase.open(database) as opened:
+        with MapFeatures.open(database) as opened:
             yield cls(folder, opened)
 
     def similar(self, descriptors: np.ndarray, count: int) -> list[str]:
@@ -54,10 +55,12 @@ class FrozenMap:
         return [self.scene.names[k] for k in order]
 
     def frame(self, name: str) -> MapFrame:
-        features = self._database.read_features(name)
+        descriptors = self._features.descriptors(name)
         point_ids = self._feature_points[name]
+        if len(point_ids) != len(descriptors):
+            raise FormatError(f"{name}: the model and its database hold different features of it")
         is_point = np.flatnonzero(point_ids >= 0)
-        return MapFrame(features.descriptors[is_point], self.points.rows_of(point_ids[is_point]))
+        return MapFrame(descriptors[is_point], self.points.rows_of(point_ids[is_point]))
 
     def frames(self, names: Sequence[str]) -> dict[str, MapFrame]:
         return {name: self.frame(name) for name in names}

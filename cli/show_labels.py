@@ -1,0 +1,84 @@
+"""What registering a sequence found, as tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cli import console
+from spn_data.area import DENSE, EVALUATION, SPLIT
+from spn_data.record import StageRecord
+
+
+def evaluation(record: StageRecord, unit: str) -> None:
+    """unit : of lengths, "m" or "units of the model"."""
+    c = record.counts
+    console.table(
+        f"{record.stage}: poses in the frozen map",
+        [
+            ("registered", f"{_share(c['registered'], c['frames'])} frames"),
+            *((f"failed: {kind}", f"{n} frames") for kind, n in c["failed"].items()),
+            ("lens", f"{c['focal_px']:.1f} px, {c['fov_deg']:.1f} deg wide"),
+            *(
+                [
+                    ("map points a frame", f"{c['inliers']:.0f} (median)"),
+                    ("residual", f"{c['error_px']:.2f} px (median of RMS)"),
+                    (
+                        "uncertainty (1 sigma)",
+                        f"{_length(c['sigma'], unit)}, {c['sigma_deg']:.3f} deg to the map (median)",
+                    ),
+                ]
+                if c["registered"]
+                else []
+            ),
+            time_row(record),
+        ],
+    )
+    notes(record)
+
+
+def dense(record: StageRecord) -> None:
+    c = record.counts
+    console.table(
+        f"{record.stage}: frames between",
+        [
+            ("registered", f"{_share(c['registered'], c['frames'])} frames"),
+            ("with those chosen", f"{_share(c['registered_of_all'], c['of_all'])} video frames"),
+            *((f"failed: {reason}", f"{n} frames") for reason, n in c["failed"].items()),
+            time_row(record),
+        ],
+    )
+    notes(record)
+
+
+def summary(record: StageRecord) -> str:
+    """What a stage holds, in a few words."""
+    c = record.counts
+    group = record.stage.partition("/")[0]
+    if group in (EVALUATION, DENSE):
+        return f"{_share(c['registered'], c['frames'])} frames"
+    assert group == SPLIT, group
+    return ", ".join(f"{name} {n}" for name, n in c["groups"].items())
+
+
+def notes(record: StageRecord) -> None:
+    for note in record.notes:
+        console.note(note)
+
+
+def time_row(record: StageRecord) -> tuple[str, str]:
+    steps = ", ".join(
+        f"{name} {console.duration(s)}" for name, s in record.seconds.items() if s >= 1
+    )
+    total, cpu = sum(record.seconds.values()), sum(record.cpu_seconds.values())
+    return (
+        "time",
+        f"{console.duration(total)} ({cpu:.0f} s of CPU){f': {steps}' if steps else ''}",
+    )
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part} of {whole} ({part / max(whole, 1):.1%})"
+
+
+def _length(value: Any, unit: str) -> str:
+    return f"{100 * value:.1f} cm" if unit == "m" else f"{value:.4g} {unit}"

@@ -1,0 +1,56 @@
+"""Descriptors in a COLMAP database that must not change: COLMAP itself writes when it only opens one."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Self
+from urllib.parse import quote
+
+import numpy as np
+
+from spn_data.errors import FormatError
+
+_BYTES = 128  # of a descriptor
+_MAX_ROWS = 1_000_000
+
+
+class MapFeatures:
+    """Descriptors by image name, read through SQLite as an immutable file."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection):
+        self._path = path
+        self._connection = connection
+
+    @classmethod
+    @contextmanager
+    def open(cls, path: Path) -> Iterator[Self]:
+        """Raises FormatError where there is no such database."""
+        try:
+            uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+            connection = sqlite3.connect(uri, uri=True)
+        except sqlite3.Error as error:
+            raise FormatError(f"{path}: cannot be opened ({error})") from error
+        try:
+            yield cls(path, connection)
+        finally:
+            connection.close()
+
+    def descriptors(self, name: str) -> np.ndarray:
+        """(K, 128) uint8, in the order of the image's features in the model."""
+        query = (
+            "SELECT d.rows, d.cols, d.data FROM descriptors d JOIN images i USING (image_id) "
+            "WHERE i.name = ?"
+        )
+        try:
+            row = self._connection.execute(query, (name,)).fetchone()
+        except sqlite3.Error as error:
+            raise FormatError(f"{self._path}: cannot be read ({error})") from error
+        if row is None:
+            raise FormatError(f"{self._path}: holds no features of {name}")
+        rows, columns, data = row
+        if columns != _BYTES or not 0 <= rows <= _MAX_ROWS or len(data or b"") != rows * columns:
+            raise FormatError(f"{self._path}: the descriptors of {name} are damaged")
+        return np.frombuffer(data or b"", np.uint8).reshape(-1, _BYTES)

@@ -1,0 +1,198 @@
+"""Stage 4-dense/<sequence>: poses of the video frames between those that have one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.area import DENSE, EVALUATION, FRAMES, MODEL, Area
+from spn_data.camera import Camera
+from spn_data.colmap.model import read_map
+from spn_data.dense import dense_labels
+from spn_data.dense_tracking import DenseOptions
+from spn_data.errors import FormatError, InputError, StageError
+from spn_data.frames import Frames, read_frames
+from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.map_covariance import MapCovariance
+from spn_data.map_hash import map_hash
+from spn_data.map_points import MapPoints
+from spn_data.pipeline.labels import (
+    CAMERA,
+    POSES,
+    REGISTRATION,
+    SEEN,
+    LabelledArea,
+    map_folder,
+    read_labelled_area,
+    read_world_from_model,
+    similarity_to_json,
+)
+from spn_data.pipeline.register import FRAMES_FILE
+from spn_data.pipeline.videos import find_videos
+from spn_data.record import VERSION, StageRecord, read_json, write_json
+from spn_data.registration.adjustment import lens_parameters
+from spn_data.registration.frame_covariance import (
+    FramePoints,
+    LensUncertainty,
+    frame_covariances,
+)
+from spn_data.timing import Progress, Stopwatch
+
+
+def sequences_with_video(area: Area) -> list[str]:
+    """Mapping and evaluation sequences that are made of video."""
+    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    names = np.unique(frames.sequences[frames.video_frame >= 0]).tolist()
+    for name in area.sequences(EVALUATION):
+        own = read_frames(area.folder(f"{EVALUATION}/{name}") / FRAMES_FILE)
+        names += [name] if (own.video_frame >= 0).any() else []
+    return [str(name) for name in names]
+
+
+def densify(
+    area: Area,
+    sequence: str,
+    progress: Progress,
+    *,
+    workers: int,
+    options: DenseOptions | None = None,
+    video: Path | None = None,
+    overwrite: bool = False,
+) -> StageRecord:
+    """Label the other frames of a mapping or evaluation sequence. The map is only read.
+
+    video : where to look for its files besides where they were. Raises StageError where the sequence is
+    unknown, is not made of video, or its video is not found.
+    """
+    options = options or DenseOptions()
+    frames = _frames_of(area, sequence)
+    work = area.begin(f"{DENSE}/{sequence}", asdict(options), {}, overwrite=overwrite)
+    if isinstance(work, StageRecord):
+        return work
+    stopwatch = Stopwatch()
+    before = map_hash(area.folder(MODEL))
+    videos = find_videos(area, sequence, video)
+    labelled = read_labelled_area(area, mapping_covariance=False)
+    known, seen_by_known = _known(labelled, sequence)
+    with stopwatch.step("tracking"):
+        labels, seen = dense_labels(
+            videos,
+            frames,
+            known,
+            seen_by_known,
+            labelled.cameras,
+            labelled.points,
+            options,
+            workers=workers,
+            progress=progress,
+        )
+    with stopwatch.step("covariance"):
+        labels = _with_covariances(area, labelled, labels, seen, sequence)
+    with stopwatch.step("write"):
+        write_labels(work.path / POSES, labels)
+        write_seen_points(work.path / SEEN, seen)
+        after = map_hash(area.folder(MODEL))
+        if after != before:
+            raise StageError(f"{area.root}: the map changed while {sequence} was labelled")
+        write_json(
+            work.path / REGISTRATION,
+            {
+                "version": VERSION,
+                "world_from_model": similarity_to_json(read_world_from_model(area)),
+                "map_before": before,
+                "map_after": after,
+            },
+        )
+    return work.finish(
+        counts=_counts(labels, known),
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+    )
+
+
+def _frames_of(area: Area, sequence: str) -> Frames:
+    if area.has(f"{EVALUATION}/{sequence}"):
+        frames = read_frames(area.folder(f"{EVALUATION}/{sequence}") / FRAMES_FILE)
+    else:
+        frames = read_frames(area.folder(FRAMES) / "frames.csv")
+        frames = frames.select(frames.sequences == sequence)
+    if not len(frames):
+        raise InputError(f"there is no sequence {sequence!r} in {area.root}")
+    return frames
+
+
+def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, SeenPoints]:
+    """Labels of the frames that were chosen, and the points that they see."""
+    if sequence in labelled.evaluation:
+        labels, seen = labelled.evaluation[sequence], labelled.evaluation_seen[sequence]
+        rows = np.flatnonzero(~labels.dense)
+    else:
+        labels, seen = labelled.mapping, labelled.mapping_seen
+        rows = np.flatnonzero(labels.sequences == sequence)
+    return labels.select(rows), seen.select(rows)
+
+
+def _with_covariances(
+    area: Area, labelled: LabelledArea, labels: Labels, seen: SeenPoints, sequence: str
+) -> Labels:
+    """The labels with what their points, the map's errors and the lens leave uncertain."""
+    scene, observations, points = read_map(map_folder(area))
+    map_covariance = MapCovariance.of(scene, observations)
+    covariance = np.full((len(labels), 6, 6), np.nan)
+    registered = np.flatnonzero(labels.registered)
+    for key in np.unique(labels.cameras[registered]).tolist():
+        rows = registered[labels.cameras[registered] == key]
+        camera = labelled.cameras[key]
+        lens = (
+            _own_lens(area, sequence, camera)
+            if sequence in labelled.evaluation
+            else LensUncertainty(camera_id=_camera_id(labelled, key, scene.names, scene.camera_ids))
+        )
+        frames = [_points_of(seen, row, points) for row in rows.tolist()]
+        covariance[rows] = frame_covariances(
+            labels.poses[rows], camera, frames, lens, map_covariance
+        )
+    return replace(labels, covariance=covariance)
+
+
+def _points_of(seen: SeenPoints, row: int, points: MapPoints) -> FramePoints:
+    point_ids, pixels = seen.of_frame(row)
+    rows = points.rows_of(point_ids)
+    return FramePoints(pixels, rows, points.xyz[rows])
+
+
+def _camera_id(
+    labelled: LabelledArea, key: str, names: tuple[str, ...], camera_ids: np.ndarray
+) -> int:
+    """COLMAP's id of a mapping lens."""
+    mine = set(labelled.mapping.names[labelled.mapping.cameras == key].tolist())
+    return next(int(i) for name, i in zip(names, camera_ids, strict=True) if name in mine)
+
+
+def _own_lens(area: Area, sequence: str, camera: Camera) -> LensUncertainty:
+    path = area.folder(f"{EVALUATION}/{sequence}") / CAMERA
+    value = read_json(path)
+    try:
+        names = lens_parameters(camera)
+        matrix = np.array(value["covariance"], np.float64)
+        if tuple(value["estimated"]) not in (names, ()) or matrix.shape != (len(matrix),) * 2:
+            raise ValueError("its covariance is of other parameters")
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{path}: cannot be read ({error})") from error
+    return LensUncertainty(covariance=matrix)
+
+
+def _counts(labels: Labels, known: Labels) -> dict[str, Any]:
+    registered = labels.registered
+    reasons, counts = np.unique(labels.reason[~registered], return_counts=True)
+    order = np.argsort(-counts)[:8]
+    return {
+        "frames": len(labels),
+        "registered": int(registered.sum()),
+        "failed": {str(reasons[k]): int(counts[k]) for k in order},
+        "of_all": len(labels) + len(known),
+        "registered_of_all": int(registered.sum() + known.registered.sum()),
+    }

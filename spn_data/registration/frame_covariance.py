@@ -1,0 +1,101 @@
+"""How uncertain single frames are, relative to the map, when their lens is known from elsewhere.
+
+The same sum as in `covariance`, for frames that share nothing but the lens: noise of the frame's own
+measurements, errors of the map's points, and of the lens (a mapping lens together with the map's points).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.map_covariance import Functional, MapCovariance
+from spn_data.pose import Poses
+from spn_data.registration.adjustment import (
+    POSE,
+    SequenceObservations,
+    SequenceState,
+    cauchy_weights,
+    lens_parameters,
+    linearize,
+)
+from spn_data.registration.solution import SCALE_PX
+from spn_data.residual_fit import LENS, projection_jacobians
+
+_FRAMES_AT_ONCE = 32
+
+
+@dataclass(frozen=True, eq=False)
+class LensUncertainty:
+    """camera_id : of the map, where it is a mapping lens; else covariance (L, L) over `lens_parameters`."""
+
+    camera_id: int | None = None
+    covariance: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FramePoints:
+    """What one frame sees. pixels : (K, 2); point_rows : (K,) of the map's points; xyz : (K, 3)."""
+
+    pixels: np.ndarray
+    point_rows: np.ndarray
+    xyz: np.ndarray
+
+
+def frame_covariances(
+    poses: Poses,
+    camera: Camera,
+    frames: Sequence[FramePoints],
+    lens: LensUncertainty,
+    map_covariance: MapCovariance,
+) -> np.ndarray:
+    """(N, 6, 6) as in Labels, for poses (N) estimated from the points of each frame alone."""
+    covariance = np.empty((len(frames), POSE, POSE))
+    for first in range(0, len(frames), _FRAMES_AT_ONCE):
+        some = range(first, min(first + _FRAMES_AT_ONCE, len(frames)))
+        noise, functionals = [], []
+        for k in some:
+            own, functional = _one(poses[k : k + 1], camera, frames[k], lens)
+            noise.append(own)
+            functionals.append(functional)
+        of_map = map_covariance.functional_covariances(functionals)
+        for k, own, through in zip(some, noise, of_map, strict=True):
+            covariance[k] = 0.5 * (own + own.T) + through
+    return covariance
+
+
+def _one(
+    pose: Poses, camera: Camera, frame: FramePoints, lens: LensUncertainty
+) -> tuple[np.ndarray, Functional]:
+    """Covariance by noise and a lens of its own; and what the map's points and lens do to the pose."""
+    m = len(frame.pixels)
+    observations = SequenceObservations(
+        np.zeros(m, np.int64), frame.pixels, frame.xyz, np.full(m, -1)
+    )
+    names = lens_parameters(camera)
+    state = SequenceState(pose, camera, np.zeros((0, 3)))
+    linearized = linearize(state, observations, names)
+    weights = cauchy_weights(linearized.residuals_px, SCALE_PX)
+    weighted = linearized.by_pose * weights[:, None, None]
+    inverse = np.linalg.inv(np.einsum("mia,mib->ab", weighted, linearized.by_pose))
+    squared = float((weights * (linearized.residuals_px**2).sum(axis=1)).sum())
+    variance = squared / max(2 * float(weights.sum()) - POSE, 1.0)
+    noise = variance * inverse
+    by_points = inverse @ np.einsum("mia,mij->maj", weighted, linearized.by_point)
+    rows, where = np.unique(frame.point_rows, return_inverse=True)
+    together = np.zeros((len(rows), POSE, 3))
+    np.add.at(together, where, by_points)
+    by_lens = None
+    if lens.camera_id is not None:
+        in_camera = (frame.xyz - pose.centers[0]) @ pose.rotations[0].T
+        full = projection_jacobians(camera, in_camera)[1]
+        by_lens = inverse @ np.einsum("mia,mil->al", weighted, full)
+        assert by_lens.shape == (POSE, LENS)
+    elif lens.covariance is not None and len(lens.covariance):
+        pull = inverse @ np.einsum("mia,mil->al", weighted, linearized.by_lens)
+        noise = noise + pull @ lens.covariance @ pull.T
+    functional = Functional(rows, together.transpose(1, 0, 2), lens.camera_id, by_lens)
+    return noise, functional
