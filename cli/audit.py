@@ -1,0 +1,53 @@
+"""The command `spn-data audit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cli import console, options
+
+if TYPE_CHECKING:
+    from spn_data.audit import Finding
+
+_SHOWN = 5  # lines of evidence a finding
+
+
+@click.command()
+@options.area
+@click.option("--all", "everything", is_flag=True, help="Show all of the evidence.")
+def audit(area_folder: Path, everything: bool) -> None:
+    """Check that the split keeps what it promises: no leak, no frame on the wrong side, no damaged file.
+
+    Changes nothing. Exit code 1 where a check fails.
+
+    \b
+    Example:
+        spn-data audit --area fields/north
+    """
+    from spn_data.pipeline.audit import audit as check
+
+    area = options.open_area(area_folder)
+    with area.locked():
+        findings = check(area)
+    show_findings(findings, shown=None if everything else _SHOWN)
+
+
+def show_findings(findings: tuple[Finding, ...], *, shown: int | None = _SHOWN) -> None:
+    """One line a check, its evidence below. Ends the program with 1 where a check failed."""
+    from spn_data.audit import Verdict, has_failed
+
+    rows = []
+    for finding in findings:
+        rows.append((finding.check, finding.verdict.value, finding.text))
+        rows += [("", "", f"- {line}") for line in finding.evidence[:shown]]
+        if shown is not None and len(finding.evidence) > shown:
+            more = len(finding.evidence) - shown
+            rows.append(("", "", f"- and {more} more (spn-data audit --all)"))
+    console.table("Audit", rows, ("check", "", "found"))
+    failed = [f.check for f in findings if f.verdict is Verdict.FAIL]
+    if has_failed(findings):
+        raise click.ClickException(f"the audit failed: {', '.join(failed)}")
+    console.out.print("Audit passed.")

@@ -1,0 +1,192 @@
+"""Stage 5-split: frames divided into groups, as dataset.h5 and in the format of Cambridge Landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.area import FRAMES, SPLIT, Area, StageWork
+from spn_data.audit import Finding, Verdict
+from spn_data.camera import Camera
+from spn_data.errors import GeometryError
+from spn_data.hdf5 import DatasetWriter
+from spn_data.hdf5_schema import DatasetInfo, Role
+from spn_data.pipeline.audit import (
+    AUDIT,
+    CAMBRIDGE,
+    DATASET,
+    SPLIT_FILE,
+    audit_folder,
+    write_audit,
+)
+from spn_data.pipeline.images import frame_images
+from spn_data.pipeline.labels import LabelledArea, read_labelled_area
+from spn_data.pipeline.split_cambridge import CambridgeFolder
+from spn_data.pipeline.split_dataset import (
+    GivenFrames,
+    RenderedFrames,
+    given_frames,
+    target_cameras,
+)
+from spn_data.record import StageRecord
+from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
+from spn_data.split_file import write_split
+from spn_data.splitting import make_split
+from spn_data.timing import Progress, Stopwatch
+
+
+class CambridgeFrames(StrEnum):
+    """Which frames cambridge/ holds: its images are of full size."""
+
+    CHOSEN = "chosen"
+    ALL = "all"
+    NONE = "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitStageOptions:
+    """How frames are divided, and what their images are made into."""
+
+    split: SplitOptions = field(default_factory=SplitOptions)
+    # Each lens keeps its own view, undistorted, instead of the one that all of them share.
+    native: bool = False
+    # Width of images in dataset.h5. None: 480, or the lens's own where `native`.
+    width_px: int | None = None
+    cambridge: CambridgeFrames = CambridgeFrames.CHOSEN
+
+
+def split_area(
+    area: Area,
+    options: SplitStageOptions,
+    progress: Progress,
+    *,
+    video_folder: Path | None = None,
+    overwrite: bool = False,
+) -> StageRecord:
+    """Divide the area's frames and write what networks train on; audit it at the end.
+
+    video_folder : where the videos of dense frames lie, besides the places that the area remembers.
+    Raises GeometryError where a group would be empty, StageError for stages missing or stale.
+    """
+    work = area.begin(SPLIT, asdict(options), {}, overwrite=overwrite)
+    if isinstance(work, StageRecord):
+        return work
+    try:
+        return _split(area, work, options, video_folder, progress)
+    except GeometryError:
+        work.discard()  # nothing in it is worth going on from
+        raise
+
+
+def _split(
+    area: Area,
+    work: StageWork,
+    options: SplitStageOptions,
+    video_folder: Path | None,
+    progress: Progress,
+) -> StageRecord:
+    stopwatch = Stopwatch()
+    with stopwatch.step("divide"):
+        labelled = read_labelled_area(area)
+        split = make_split(
+            labelled.mapping,
+            labelled.dense,
+            labelled.evaluation,
+            options.split,
+            metric=labelled.units == "m",
+        )
+        write_split(work.path / SPLIT_FILE, split)
+        frames = given_frames(labelled, split)
+    with stopwatch.step("images"):
+        targets = target_cameras(
+            labelled, frames.labels, native=options.native, width_px=options.width_px
+        )
+        rendered = RenderedFrames(labelled, frames, targets, area.folder(FRAMES) / "masks")
+        images = frame_images(area, frames.labels, video_folder=video_folder)
+        info = _info(
+            area, labelled, split, None if options.native else next(iter(targets.values()))
+        )
+        _write_files(
+            work.path, labelled, frames, rendered, images, info, options.cambridge, progress
+        )
+    with stopwatch.step("audit"):
+        findings = audit_folder(area, labelled, work.path)
+        write_audit(work.path / AUDIT, findings)
+    return work.finish(
+        counts={
+            "groups": split.counts(),
+            "left_out": int((split.group == LEFT_OUT).sum()),
+            "optimistic": split.optimistic,
+            "training_points": len(frames.for_training),
+            "image_px": _sizes(targets),
+            "audit": {v.value: sum(f.verdict is v for f in findings) for v in Verdict},
+        },
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+        notes=(*_notes(split), *_failures(findings)),
+    )
+
+
+def _write_files(
+    folder: Path,
+    labelled: LabelledArea,
+    frames: GivenFrames,
+    rendered: RenderedFrames,
+    images: Iterator[tuple[int, np.ndarray]],
+    info: DatasetInfo,
+    which: CambridgeFrames,
+    progress: Progress,
+) -> None:
+    """dataset.h5 and cambridge/ in one pass over the images; none of them stays in memory."""
+    labels = frames.labels
+    listed = np.full(len(labels), which is not CambridgeFrames.NONE)
+    if which is CambridgeFrames.CHOSEN:
+        listed = ~labels.dense
+    cambridge = CambridgeFolder(folder / CAMBRIDGE, labelled.cameras)
+    roles = {name: _role(name) for name in frames.split.groups()}
+    with DatasetWriter(folder / DATASET, info, roles) as writer:
+        for done, (row, image) in enumerate(images):
+            progress("images", done, len(labels))
+            writer.append(str(frames.group[row]), rendered.frame(row, image))
+            if listed[row]:
+                cambridge.add_image(str(labels.names[row]), str(labels.cameras[row]), image)
+        progress("images", len(labels), len(labels))
+    if listed.any():
+        rows = np.flatnonzero(listed)
+        cambridge.finish(
+            labels.select(rows), frames.group[rows], frames.seen.select(rows), labelled.points
+        )
+
+
+def _info(area: Area, labelled: LabelledArea, split: Split, camera: Camera | None) -> DatasetInfo:
+    return DatasetInfo(
+        units=labelled.units,
+        origin=labelled.origin,
+        up_is_known=labelled.units == "m",
+        camera=camera,
+        optimistic=split.optimistic,
+        split=asdict(split.options),
+        fingerprints=area.upstream_of(SPLIT),
+        notes=_notes(split),
+    )
+
+
+def _notes(split: Split) -> tuple[str, ...]:
+    return (*((OPTIMISTIC,) if split.optimistic else ()), *split.notes)
+
+
+def _role(group: str) -> Role:
+    return {TRAIN: Role.TRAIN, VALIDATION: Role.VALIDATION}.get(group, Role.TEST)
+
+
+def _sizes(targets: dict[str, Camera]) -> list[Any]:
+    return sorted({(camera.width, camera.height) for camera in targets.values()})
+
+
+def _failures(findings: tuple[Finding, ...]) -> list[str]:
+    return [f"audit: {f.check}: {f.text}" for f in findings if f.verdict is Verdict.FAIL]

@@ -1,0 +1,111 @@
+"""The folder cambridge/ of a split: a data set that programs for Cambridge Landmarks read as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spn_data.audit import MIN_TRAINING_VIEWS
+from spn_data.cambridge import write_cambridge
+from spn_data.camera import Camera
+from spn_data.labels import Labels, SeenPoints
+from spn_data.map_points import MapPoints
+from spn_data.nvm import nvm_model, write_nvm
+from spn_data.rendering import Renderer, undistorted_camera
+from spn_data.split import TRAIN, VALIDATION
+
+NVM = "reconstruction.nvm"
+_LISTS = {TRAIN: "dataset_train.txt", VALIDATION: "dataset_validation.txt"}
+TEST_LIST = "dataset_test.txt"
+
+
+def list_of(group: str) -> str:
+    """The file that lists a group; all evaluation sequences, or the held-out test block, are in one."""
+    return _LISTS.get(group, TEST_LIST)
+
+
+def image_name(frame: str) -> str:
+    """The image of a frame, as the lists name it."""
+    return frame.removesuffix(".jpg") + ".png"
+
+
+class CambridgeFolder:
+    """Images are added one by one, the lists and the model at the end.
+
+    Images are undistorted, of full size, their principal point in the middle, as the format has no
+    parameters for either. cameras : by key, of the full-size images.
+    """
+
+    def __init__(self, folder: Path, cameras: dict[str, Camera]):
+        self._folder = folder
+        self._cameras = cameras
+        self._renderers: dict[str, Renderer] = {}
+
+    def add_image(self, frame: str, key: str, image: np.ndarray) -> None:
+        """Write a frame's image (H, W, 3) BGR, unless an interrupted run has written it already."""
+        path = self._folder / image_name(frame)
+        if path.exists():
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.part")
+        ok, data = cv2.imencode(".png", self._renderer(key).render(image))
+        if not ok:
+            raise ValueError(f"{frame} can't be encoded as PNG")
+        temporary.write_bytes(data.tobytes())
+        temporary.replace(path)
+
+    def finish(
+        self, labels: Labels, group: np.ndarray, seen: SeenPoints, points: MapPoints
+    ) -> None:
+        """The lists, each sorted by sequence and time, and the model.
+
+        labels, group, seen : of the frames whose images were added.
+        """
+        names = [image_name(name) for name in labels.names.tolist()]
+        files = np.array([list_of(name) for name in group.tolist()])
+        for file in (*_LISTS.values(), TEST_LIST):
+            rows = np.flatnonzero(files == file)
+            write_cambridge(self._folder / file, [names[k] for k in rows], labels.poses[rows])
+        self._write_model(labels, names, group, seen, points)
+
+    def _write_model(
+        self,
+        labels: Labels,
+        names: list[str],
+        group: np.ndarray,
+        seen: SeenPoints,
+        points: MapPoints,
+    ) -> None:
+        """All images, for their focal lengths; of points only what training frames measured.
+
+        A held-out frame's measurements would tell where it is.
+        """
+        rows, ids, offsets = [], [], []
+        for row in np.flatnonzero(group == TRAIN):
+            own_ids, pixels = seen.of_frame(int(row))
+            target = self._renderer(str(labels.cameras[row])).target
+            moved, is_seen = self._renderer(str(labels.cameras[row])).move(pixels)
+            rows.append(np.full(int(is_seen.sum()), row))
+            ids.append(own_ids[is_seen])
+            offsets.append(moved[is_seen] - [target.width / 2, target.height / 2])
+        image_idx, point_ids = np.concatenate(rows), np.concatenate(ids)
+        known, number, views = np.unique(point_ids, return_inverse=True, return_counts=True)
+        kept = views[number] >= MIN_TRAINING_VIEWS
+        point_rows = points.rows_of(known)[number]
+        focal_px = [self._renderer(str(key)).target.focal_px[0] for key in labels.cameras]
+        model = nvm_model(
+            tuple(names),
+            labels.poses,
+            np.array(focal_px),
+            (points.xyz, points.colors),
+            (point_rows[kept], image_idx[kept], np.concatenate(offsets)[kept]),
+        )
+        write_nvm(self._folder / NVM, model)
+
+    def _renderer(self, key: str) -> Renderer:
+        if key not in self._renderers:
+            camera = self._cameras[key]
+            self._renderers[key] = Renderer(camera, undistorted_camera(camera))
+        return self._renderers[key]

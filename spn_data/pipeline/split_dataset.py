@@ -1,0 +1,135 @@
+"""What dataset.h5 is given of an area: frames in a group, their points, their rendered images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spn_data.audit import training_points
+from spn_data.camera import Camera
+from spn_data.coverage import strata_of
+from spn_data.hdf5_schema import DatasetFrame
+from spn_data.labels import Labels, SeenPoints
+from spn_data.photos import load_mask
+from spn_data.pipeline.labels import LabelledArea, together
+from spn_data.rendering import Renderer, RenderingOptions, canonical_camera, undistorted_camera
+from spn_data.split import LEFT_OUT, TRAIN, Split
+
+
+@dataclass(frozen=True, eq=False)
+class GivenFrames:
+    """N frames that are in a group, sorted by sequence and time, with the map points that they are given.
+
+    group : (N,) str; strata : (N,) str, by the chosen training frames; empty for training frames and where
+    there are no metres. for_training : ids of the points that training frames are given. split : of all.
+    """
+
+    labels: Labels
+    seen: SeenPoints
+    group: np.ndarray
+    strata: np.ndarray
+    for_training: np.ndarray
+    split: Split
+
+
+def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
+    parts = [(labelled.mapping, labelled.mapping_seen), (labelled.dense, labelled.dense_seen)]
+    parts += [(labelled.evaluation[n], labelled.evaluation_seen[n]) for n in labelled.evaluation]
+    kept = [np.flatnonzero(split.of(labels.names) != LEFT_OUT) for labels, _ in parts]
+    labels, seen = together(
+        [(p.select(k), s.select(k)) for (p, s), k in zip(parts, kept, strict=True)]
+    )
+    group = split.of(labels.names)
+    strata = np.full(len(labels), "", dtype="<U6")
+    if labelled.units == "m":
+        others = group != TRAIN
+        training = labels.poses[(group == TRAIN) & ~labels.dense]
+        strata[others] = strata_of(labels.poses[others], training)
+    for_training = training_points(labelled.mapping, labelled.mapping_seen, split)
+    given = (group != TRAIN)[seen.frame_idx] | np.isin(seen.point_ids, for_training)
+    seen = SeenPoints(seen.frame_idx[given], seen.point_ids[given], seen.pixels[given])
+    return GivenFrames(labels, seen, group, strata, for_training, split)
+
+
+def target_cameras(
+    labelled: LabelledArea, labels: Labels, *, native: bool, width_px: int | None
+) -> dict[str, Camera]:
+    """The pinhole that the images of each lens are rendered into, by camera key.
+
+    One for all, fixed by the mapping cameras alone, so that an evaluation sequence changes nothing in what
+    is trained on; or each lens's own.
+    """
+    keys = sorted(set(labels.cameras.tolist()))
+    if native:
+        own = {key: undistorted_camera(labelled.cameras[key]) for key in keys}
+        return {key: _of_width(camera, width_px) for key, camera in own.items()}
+    mapping = labelled.mapping
+    mapped = sorted(set(mapping.cameras[mapping.registered].tolist()))
+    rendering = RenderingOptions(width_px=width_px or RenderingOptions.width_px)
+    one = canonical_camera([labelled.cameras[key] for key in mapped], rendering)
+    return dict.fromkeys(keys, one)
+
+
+def _of_width(camera: Camera, width_px: int | None) -> Camera:
+    if width_px is None:
+        return camera
+    return camera.scaled(width_px, max(1, round(width_px * camera.height / camera.width)))
+
+
+class RenderedFrames:
+    """Frames as dataset.h5 takes them, one by one.
+
+    targets : the pinhole of each lens, by camera key; masks : folder of `<sequence>.png`, which may be empty.
+    """
+
+    def __init__(
+        self, labelled: LabelledArea, frames: GivenFrames, targets: dict[str, Camera], masks: Path
+    ):
+        self._cameras, self._points = labelled.cameras, labelled.points
+        self._frames = frames
+        self._targets = targets
+        self._masks = masks
+        self._renderers: dict[str, Renderer] = {}
+        self._valid: dict[tuple[str, str], np.ndarray | None] = {}
+
+    def frame(self, row: int, image: np.ndarray) -> DatasetFrame:
+        """A frame, from its full-size image (H, W, 3) BGR."""
+        labels, key = self._frames.labels, str(self._frames.labels.cameras[row])
+        renderer = self._renderer(key)
+        ids, pixels = self._frames.seen.of_frame(row)
+        moved, is_seen = renderer.move(pixels)
+        return DatasetFrame(
+            name=str(labels.names[row]),
+            sequence=str(labels.sequences[row]),
+            time_s=float(labels.time_s[row]),
+            center=labels.poses.centers[row],
+            quat_wxyz=labels.poses.quats_wxyz[row],
+            intrinsics=renderer.target.matrix,
+            covariance=labels.covariance[row],
+            dense=bool(labels.dense[row]),
+            stratum=str(self._frames.strata[row]),
+            image=cv2.cvtColor(renderer.render(image), cv2.COLOR_BGR2RGB),
+            valid=self._valid_pixels(str(labels.sequences[row]), key),
+            point_ids=ids[is_seen],
+            point_pixels=moved[is_seen],
+            point_xyz=self._points.xyz[self._points.rows_of(ids[is_seen])],
+        )
+
+    def _renderer(self, key: str) -> Renderer:
+        if key not in self._renderers:
+            self._renderers[key] = Renderer(self._cameras[key], self._targets[key])
+        return self._renderers[key]
+
+    def _valid_pixels(self, sequence: str, key: str) -> np.ndarray | None:
+        """(H, W) bool: inside the lens's image, and not masked out; None where all pixels are."""
+        if (sequence, key) not in self._valid:
+            renderer, path = self._renderer(key), self._masks / f"{sequence}.png"
+            valid = None if renderer.all_valid else renderer.valid
+            if path.exists():
+                size = (renderer.camera.width, renderer.camera.height)
+                valid = renderer.render_mask(load_mask(path, *size))
+            self._valid[sequence, key] = valid
+        return self._valid[sequence, key]
