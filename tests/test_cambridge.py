@@ -44,6 +44,17 @@ def test_the_outlier_in_great_court_is_told_and_kept(shared_data: Path) -> None:
     assert sentence.startswith("seq5/frame00297.png: position (3.11738e+09, -1.37673e+08, -1.24")
 
 
+def test_a_position_is_far_beyond_20_times_what_is_usual() -> None:
+    """Nine of ten lie within 1; 15 may be a distant view, 30 is none; nine are too few."""
+    usual = np.zeros((20, 3))
+    usual[:, 0] = np.linspace(-1, 1, 20)
+    for distance, is_far in ((15.0, False), (30.0, True)):
+        centers = np.vstack([usual, [[0, 0, distance]]])
+        assert far_positions(centers).tolist() == [False] * 20 + [is_far]
+    assert not far_positions(np.vstack([usual[:8], [[0, 0, 1e9]]])).any()
+    assert not far_positions(np.zeros((20, 3))).any()
+
+
 def test_an_ordinary_real_list_has_no_oddities(shared_data: Path) -> None:
     for name in REAL:
         if name != "GreatCourt/dataset_train.txt":

@@ -373,6 +373,7 @@ def test_measurements_in_nvm_fit_its_points(exports: Path) -> None:
     found = read_nvm(exports / "nvm" / "reconstruction.nvm")
     assert not found.distortion.any()
     is_map = np.array([not name.startswith("again/") for name in found.names])
+    assert found.focal_px[~is_map].tolist() == [210.5] * 4  # the mean of 210 and 211
     mine = is_map[found.image_idx]
     rotations, centers = found.poses.rotations, found.poses.centers
     image_idx = found.image_idx[mine]
@@ -381,6 +382,19 @@ def test_measurements_in_nvm_fit_its_points(exports: Path) -> None:
     projected = found.focal_px[image_idx, None] * rays[:, :2] / rays[:, 2:]
     miss = np.linalg.norm(projected - found.offsets_px[mine], axis=1)
     assert 0.05 < np.median(miss) < 1.0
+
+
+def test_each_folder_says_what_it_holds(exports: Path, area: Path) -> None:
+    """Units, origin, sequences with their roles, and the stages that it was made of."""
+    origin = json.loads((area / "3-geo" / "geo.json").read_text())["origin"]
+    stages = {"1-frames", "2-model", "3-geo", "4-eval/again"}
+    for name in {*FORMATS} - {"all"}:
+        record = json.loads((exports / name / "export.json").read_text())
+        assert (record["format"], record["units"], record["version"]) == (name, "m", 1)
+        assert record["origin"] == origin
+        assert record["sequences"]["again"] == {"frames": 4, "role": "evaluation"}
+        assert record["sequences"]["flight1"]["role"] == "mapping"
+        assert record["made_of"].keys() == stages
 
 
 def test_an_export_touches_nothing_of_the_area(area: Path, tmp_path: Path) -> None:
@@ -418,10 +432,12 @@ def test_a_colmap_model_holds_the_map_whole_whatever_is_chosen(area: Path, tmp_p
     for names, count in ((["again"], 4), (["flight1"], 0)):
         target = tmp_path / names[0]
         words = [word for name in names for word in ("--sequence", name)]
-        assert run("colmap", target, area, "--no-images", *words).exit_code == 0
+        assert run("colmap", target, area, *words).exit_code == 0
         found = pycolmap.Reconstruction(str(target / "sparse" / "0"))
         source = pycolmap.Reconstruction(str(area / "3-geo"))
         assert found.num_images() == source.num_images() + count
+        for image in found.images.values():
+            assert (target / "images" / image.name).is_file()
 
 
 def test_without_a_place_everything_says_that_it_is_no_metres(
