@@ -50,6 +50,7 @@ def command_lines(text: str) -> list[tuple[str, bool]]:
 def test_the_commands_are_those_of_this_version():
     """A command that comes or goes is noticed here, and then told in the README."""
     assert COMMANDS == [
+        "audit",
         "coverage",
         "export",
         "georegister",
@@ -57,6 +58,7 @@ def test_the_commands_are_those_of_this_version():
         "reconstruct",
         "report",
         "simulate",
+        "split",
         "status",
     ]
 
@@ -70,6 +72,8 @@ def test_help_lists_the_commands_in_the_order_of_work():
         "reconstruct",
         "georegister",
         "coverage",
+        "split",
+        "audit",
         "import",
         "export",
         "report",

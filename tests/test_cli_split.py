@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
+from dataclasses import fields
 from pathlib import Path
 
+import click
 import cv2
 import h5py
 import numpy as np
@@ -18,10 +21,13 @@ from spn_data.cambridge import read_cambridge
 from spn_data.hdf5_reader import Dataset
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import read_labelled_area
+from spn_data.pipeline.split import SplitStageOptions
 from spn_data.record import read_json, write_json
 from spn_data.rendering import undistorted_camera
-from spn_data.split import LEFT_OUT, TRAIN
+from spn_data.split import LEFT_OUT, TRAIN, SplitOptions
 from spn_data.split_file import read_split
+
+DOC = Path(__file__).resolve().parents[1] / "docs" / "split.md"
 
 
 def run(*arguments: object) -> Result:
@@ -351,3 +357,37 @@ def test_masked_pixels_are_not_valid(finished_area: Path, tmp_path: Path) -> Non
         assert valid is not None
         assert not valid[:, :235].any()
         assert valid[:, 245:].all()
+
+
+def test_every_option_is_documented_with_its_default() -> None:
+    """docs/split.md has a row for each option of split, and names those of audit."""
+    text = DOC.read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
+    options = [p for p in main.commands["split"].params if isinstance(p, click.Option)]
+    assert set(rows) == {option.opts[-1] for option in options}
+    for option in options:
+        if option.show_default is True:
+            shown = rows[option.opts[-1]].strip("` ")
+            is_number = isinstance(option.default, int | float)
+            assert (float(shown) if is_number else shown) == option.default, option.opts
+    for option in main.commands["audit"].params:
+        assert f"`{option.opts[-1]}`" in text
+
+
+def test_defaults_of_the_command_are_those_of_the_option_classes() -> None:
+    """Help, docs and library agree on what happens without options."""
+    given = {p.name: p.default for p in main.commands["split"].params}
+    for field in fields(SplitOptions):
+        if field.name != "dense":
+            assert given[field.name] == field.default, field.name
+    assert given["cambridge"] == SplitStageOptions().cambridge
+    assert given["no_dense"] is not SplitOptions().dense
+
+
+def test_checks_and_fields_are_documented(split_area: Path) -> None:
+    """docs/split.md names every check that an audit makes, and every field of split.json."""
+    text = DOC.read_text(encoding="utf-8")
+    findings = read_json(split_area / SPLIT / "audit.json")["findings"]
+    listed = re.findall(r"^\| `([^`]+)` \|", text.split("## The audit")[1], re.MULTILINE)
+    assert {finding["check"] for finding in findings} <= set(listed)
+    assert set(read_json(split_area / SPLIT / "split.json")) <= set(listed)
