@@ -32,10 +32,16 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
     Example:
         spn-data report --area fields/north
     """
-    from spn_data.pipeline.report import ReportOptions
-    from spn_data.pipeline.report import report as write
+    from spn_data.pipeline.report import ReportOptions, write_report
 
     area = options.open_area(area_folder)
     with area.locked():
-        path = write(area, ReportOptions(max_points=max_points, max_frames=max_frames))
+        path, verdict = write_report(
+            area, ReportOptions(max_points=max_points, max_frames=max_frames)
+        )
     console.out.print(f"{path} is written; any browser shows it, without a network.")
+    console.out.print(f"{verdict.headline}.")
+    if step := verdict.next_step:
+        console.out.print(
+            f"Next: {step.do}{': ' if step.do and step.command else ''}{step.command}"
+        )

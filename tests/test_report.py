@@ -112,11 +112,17 @@ RULES = {
     ),
     "coverage unknown": (lambda d: replace(d, coverage=None), Level.CAUTION, "is not known"),
     "coverage stale": (
-        lambda d: replace(d, stale_coverage="4-eval/medium was made anew since"),
+        lambda d: replace(
+            d, coverage=replace(d.coverage, stale="4-eval/medium was made anew since")
+        ),
         Level.CAUTION,
         "Coverage is out of date: 4-eval/medium",
     ),
-    "coverage low": (lambda d: replace(d, coverage=LOW), Level.CAUTION, "38% of sequence medium are views"),
+    "coverage low": (
+        lambda d: replace(d, coverage=LOW),
+        Level.CAUTION,
+        "38% of sequence medium are views",
+    ),
     "no split": (lambda d: replace(d, split=None, audit=None), Level.STOP, "are not split"),
     "nothing to train on": (nothing_to_train_on, Level.STOP, "No frame is left"),
     "optimistic": (optimistic, Level.CAUTION, "same flight as training: optimistic"),
@@ -131,7 +137,29 @@ RULES = {
         Level.CAUTION,
         "Audit, guard gap: frames lie",
     ),
-    "unread": (lambda d: replace(d, unread=("x is damaged.",)), Level.STOP, "x is damaged."),
+    "plan": (
+        lambda d: replace(d, plan=CoverageFacts({"waypoints": {"high": 1, "low": 3}}, (), "")),
+        Level.CAUTION,
+        "75% of the planned waypoints are views",
+    ),
+    "plan stale": (
+        lambda d: replace(d, plan=CoverageFacts({"waypoints": {"high": 1}}, (), "", "x is gone")),
+        Level.CAUTION,
+        "Coverage of the planned waypoints is out of date: x is gone.",
+    ),
+    "own GNSS": (
+        lambda d: replace(
+            d,
+            evaluation_records={
+                "medium": record(
+                    "4-eval/medium",
+                    gnss={"offset_e_m": 3.0, "offset_n_m": -6.0, "scatter_h_m": 0.4},
+                )
+            },
+        ),
+        Level.CAUTION,
+        "own GNSS of medium, not used for its labels, lies 6.7 m beside them",
+    ),
 }
 
 
@@ -226,7 +254,6 @@ def test_no_text_of_the_area_becomes_markup():
         coverage=CoverageFacts({HOSTILE: {HOSTILE: 3}}, (), HOSTILE),
         split=replace(data.split, group=np.full(190, HOSTILE), notes=(HOSTILE,)),
         audit=(audit.Finding(HOSTILE, audit.Verdict.FAIL, HOSTILE, (HOSTILE,)),),
-        unread=(HOSTILE,),
     )
     html = render(hostile)
     assert "<img" not in html

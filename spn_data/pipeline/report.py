@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, GEO, MODEL, SPLIT, Area, command_of
+from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
 from spn_data.camera import Camera
 from spn_data.errors import FormatError, StageError
 from spn_data.frames import Frames, read_frames
@@ -24,6 +24,7 @@ from spn_data.pose import Poses
 from spn_data.record import read_json, versions, write_atomically
 from spn_data.report.data import CoverageFacts, FlyAgain, FrameTable, ReportData, StageFacts
 from spn_data.report.html import render
+from spn_data.report.verdict import Verdict, verdict
 from spn_data.split_file import read_split
 
 FILE = "report.html"
@@ -40,14 +41,22 @@ class ReportOptions:
 def report(area: Area, options: ReportOptions | None = None) -> Path:
     """Write report.html at the area's root, in place of an earlier one; gives its path.
 
+    Raises as `write_report`.
+    """
+    return write_report(area, options)[0]
+
+
+def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, Verdict]:
+    """The same, with the verdict that the page shows.
+
     Stale stages are named and otherwise left out. Raises StageError where the area holds no frames yet,
     FormatError or InputError for a damaged file.
     """
     options = options or ReportOptions()
-    path = area.root / FILE
-    html = render(report_data(area), max_points=options.max_points, max_frames=options.max_frames)
+    path, data = area.root / FILE, report_data(area)
+    html = render(data, max_points=options.max_points, max_frames=options.max_frames)
     write_atomically(path, html)
-    return path
+    return path, verdict(data)
 
 
 class _FreshStages(Area):
@@ -61,7 +70,7 @@ class _FreshStages(Area):
 
 
 def report_data(area: Area) -> ReportData:
-    """All that the report shows. Raises as `report` does."""
+    """All that the report shows. Raises as `write_report`."""
     if not area.has(FRAMES):
         raise StageError(f"{area.root} holds no frames; run {command_of(FRAMES)} first")
     stages = tuple(
@@ -76,7 +85,6 @@ def report_data(area: Area) -> ReportData:
         value = read_json(path)
         geo = GeoFit.from_json(value)
         residuals = _residuals(path, value, geo)
-    coverage, stale_coverage, strata = _coverage(area)
     split, checks = None, None
     if fresh.has(SPLIT):
         split = read_split(fresh.folder(SPLIT) / SPLIT_FILE)
@@ -84,7 +92,7 @@ def report_data(area: Area) -> ReportData:
         checks = read_audit(path) if path.exists() else None
     groups = dict(zip(split.names.tolist(), split.group.tolist(), strict=True)) if split else {}
     candidates = read_frames(area.folder(FRAMES) / "frames.csv")
-    frames = frame_table(candidates, labelled, residuals, strata, groups)
+    frames = frame_table(candidates, labelled, residuals, _strata(area), groups)
     return ReportData(
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
@@ -98,10 +106,13 @@ def report_data(area: Area) -> ReportData:
         frames=frames,
         points=labelled.points if labelled else None,
         fov_tan={} if labelled is None else {k: _tangents(c) for k, c in labelled.cameras.items()},
-        coverage=coverage,
-        stale_coverage=stale_coverage,
+        coverage=_coverage(area, coverage_stage.EVALUATED),
+        plan=_coverage(area, coverage_stage.PLANNED),
         split=split,
         audit=checks,
+        evaluation_records={
+            name: area.record(f"{EVALUATION}/{name}") for name in fresh.sequences(EVALUATION)
+        },
     )
 
 
@@ -194,20 +205,16 @@ def _tangents(camera: Camera) -> tuple[float, float]:
     return camera.width / 2 / fx, camera.height / 2 / fy
 
 
-def _coverage(area: Area) -> tuple[CoverageFacts | None, str | None, dict[str, str]]:
-    """What was found, why it is stale, and the stratum of each frame by name."""
-    value = coverage_stage.read_coverage(area)
+def _coverage(area: Area, folder: str) -> CoverageFacts | None:
+    """What `spn-data coverage` found, of evaluation sequences or of planned waypoints."""
+    value = coverage_stage.read_coverage(area, folder)
     if value is None:
-        return None, None, {}
-    strata: dict[str, str] = {}
-    counts: dict[str, dict[str, int]] = {}
-    path = area.folder(coverage_stage.EVALUATED)
+        return None
     try:
-        for name, summary in value["sequences"].items():
-            counts[str(name)] = {**summary["strata"], "failed": summary["failed"]}
-        for table in sorted(path.glob("*.csv")):
-            with table.open(newline="", encoding="utf-8") as file:
-                strata |= {row["name"]: row["stratum"] for row in csv.DictReader(file)}
+        counts = {
+            str(name): {**summary["strata"], "failed": summary["failed"]}
+            for name, summary in value["sequences"].items()
+        }
         again = tuple(
             FlyAgain(
                 (float(stop["x_m"]), float(stop["y_m"]), float(stop["z_m"])),
@@ -219,12 +226,26 @@ def _coverage(area: Area) -> tuple[CoverageFacts | None, str | None, dict[str, s
             for stop in value["fly_again"] or ()
         )
         limits = _limits(value["options"])
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise FormatError(
-            f"{path}: cannot be read ({error!r}); run spn-data coverage again"
-        ) from error
-    stale = coverage_stage.stale_because(area, value)
-    return CoverageFacts(counts, again, limits), stale, strata
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(area.folder(folder), error) from error
+    return CoverageFacts(counts, again, limits, coverage_stage.stale_because(area, value))
+
+
+def _strata(area: Area) -> dict[str, str]:
+    """Stratum of each evaluation frame by name, where coverage was measured."""
+    strata: dict[str, str] = {}
+    folder = area.folder(coverage_stage.EVALUATED)
+    try:
+        for table in sorted(folder.glob("*.csv")):
+            with table.open(newline="", encoding="utf-8") as file:
+                strata |= {row["name"]: row["stratum"] for row in csv.DictReader(file)}
+    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
+        raise _damaged(folder, error) from error
+    return strata
+
+
+def _damaged(folder: Path, error: Exception) -> FormatError:
+    return FormatError(f"{folder}: cannot be read ({error!r}); run spn-data coverage again")
 
 
 def _limits(options: Mapping[str, Any] | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -119,9 +120,10 @@ class FrameTable:
         )
 
     def reasons(self, mask: np.ndarray) -> list[tuple[str, int]]:
-        """Why frames of a mask failed, most frequent first."""
+        """Why frames of a mask failed, most frequent first; figures in a reason are shown as N."""
         failed = mask & (self.status == FAILED)
-        return Counter(self.reason[failed].tolist()).most_common()
+        kinds = [re.sub(r"\d+(\.\d+)?", "N", reason) for reason in self.reason[failed].tolist()]
+        return Counter(kinds).most_common()
 
 
 @dataclass(frozen=True)
@@ -152,12 +154,13 @@ class CoverageFacts:
     """How mapping covers other frames.
 
     strata : by sequence, number of frames by stratum, those without a pose as "failed"; fly_again : in the
-    order of a short path; limits : of the strata, in words.
+    order of a short path; limits : of the strata, in words; stale : why it no longer fits the area, or None.
     """
 
     strata: dict[str, dict[str, int]]
     fly_again: tuple[FlyAgain, ...]
     limits: str
+    stale: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -167,8 +170,8 @@ class ReportData:
     title : name of its folder; path : of it; made : UTC, ISO 8601; units : "m", or "model" where nothing is
     known of metres, north and up. stages : those that stand, in the order of work.
     fov_tan : by camera, tangents of half the horizontal and vertical field of view.
-    stale_coverage : why coverage is out of date, None where it is not. unread : what stands but is not shown,
-    with the reason.
+    evaluation_records : of the stages of evaluation sequences, by name. coverage : of these; plan : of
+    planned waypoints.
     """
 
     title: str
@@ -184,10 +187,10 @@ class ReportData:
     points: MapPoints | None
     fov_tan: dict[str, tuple[float, float]] = field(default_factory=dict)
     coverage: CoverageFacts | None = None
-    stale_coverage: str | None = None
+    plan: CoverageFacts | None = None
     split: Split | None = None
     audit: tuple[audit.Finding, ...] | None = None
-    unread: tuple[str, ...] = ()
+    evaluation_records: dict[str, StageRecord] = field(default_factory=dict)
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

@@ -26,9 +26,10 @@ def residual_map(frames: FrameTable) -> str:
         rows = rows[np.linspace(0, len(rows) - 1, _MAX_ARROWS).astype(np.int64)]
     xy, arrows = frames.poses.centers[rows, :2], frames.gnss_m[rows]
     lengths = np.hypot(arrows[:, 0], arrows[:, 1])
-    usual = max(float(np.percentile(lengths, 90)), 1e-3)
+    fitting = lengths[~frames.gnss_outlier[rows]]
+    usual = max(float(np.percentile(fitting if len(fitting) else lengths, 90)), 1e-3)
     extent = max(float(np.ptp(xy, axis=0).max()), 1e-3)
-    factor = max(1.0, round_down(0.08 * extent / usual))
+    factor = max(1.0, round_down(0.1 * extent / usual))
     longest = _MOST_EXTENT * extent / factor
     ends = (
         xy + factor * arrows[:, :2] * np.minimum(1.0, longest / np.maximum(lengths, 1e-9))[:, None]

@@ -119,7 +119,7 @@ def pack_frames(frames: FrameTable) -> dict[str, Any]:
 def pack_scene(data: ReportData, frames: FrameTable, max_points: int) -> dict[str, Any]:
     """Everything that the page's script needs."""
     display = display_of(data.frames, data.points, has_up=data.units == "m")
-    again = data.coverage.fly_again if data.coverage else ()
+    again = [p for facts in (data.coverage, data.plan) if facts for p in facts.fly_again]
     return {
         "units": data.units,
         "display": {

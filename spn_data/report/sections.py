@@ -11,13 +11,15 @@ import numpy as np
 
 from spn_data import audit
 from spn_data.record import StageRecord
-from spn_data.report.data import FAILED, STRATA, FrameTable, ReportData
+from spn_data.report.data import FAILED, STRATA, FlyAgain, FrameTable, ReportData
 from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import Finding, Level, Verdict
 from spn_data.split import LEFT_OUT
 from spn_data.split_file import statements
 
+_REASONS_SHOWN = 6  # of one sequence
+_PLACES_SHOWN = 8  # to fly again, before the list is folded
 _MOST_EVIDENCE = 50  # lines shown of one check
 _MARKS = {
     Level.GOOD: ("&#10003;", "good"),
@@ -108,8 +110,11 @@ def timeline(data: ReportData, left_out: dict[str, int]) -> str:
     rows = []
     for name in np.unique(frames.sequences).tolist():
         mine = frames.sequences == name
-        for reason, n in frames.reasons(mine):
-            rows.append((name, reason, f"{n:,}"))
+        reasons = frames.reasons(mine)
+        rows += [(name, reason, f"{n:,}") for reason, n in reasons[:_REASONS_SHOWN]]
+        if len(reasons) > _REASONS_SHOWN:
+            others = sum(n for _, n in reasons[_REASONS_SHOWN:])
+            rows.append((name, "other reasons", f"{others:,}"))
     failures = (
         _table(("sequence", "why frames have no pose", "frames"), rows, "failures")
         if rows
@@ -129,38 +134,48 @@ def _left_out(left_out: dict[str, int]) -> str:
 
 
 def coverage(data: ReportData) -> str:
-    """Strata of each sequence as bars, and the places to fly again."""
-    if data.coverage is None:
-        return ""
-    bars = "".join(
-        _strata_bar(name, counts) for name, counts in sorted(data.coverage.strata.items())
-    )
-    again = ""
-    if data.coverage.fly_again:
-        rows = []
-        for k, place in enumerate(data.coverage.fly_again, 1):
-            e, n, u = place.east_north_up_m
-            rows.append(
-                (
-                    str(k),
-                    f"{place.lat_lon_deg[0]:.7f}, {place.lat_lon_deg[1]:.7f}",
-                    f"{e:.1f}, {n:.1f}, {u:.1f}",
-                    f"{place.heading_deg:.0f}",
-                    f"{place.pitch_deg:.0f}",
-                    f"{place.frames:,}",
-                )
-            )
-        header = (
-            "",
-            "latitude, longitude",
-            "east, north, up (m)",
-            "heading (deg)",
-            "pitch (deg)",
-            "frames helped",
+    """Strata of each sequence as bars, and the places to fly again; the same of planned waypoints."""
+    parts = []
+    for title, facts in (("Coverage", data.coverage), ("Coverage of planned waypoints", data.plan)):
+        if facts is None:
+            continue
+        bars = "".join(_strata_bar(name, counts) for name, counts in sorted(facts.strata.items()))
+        parts.append(
+            f"<section><h2>{title}</h2>{bars}"
+            f'<p class="note">{escape(facts.limits)}</p>{_fly_again(facts.fly_again)}</section>'
         )
-        again = "<h3>Where to fly again</h3>" + _table(header, rows, "again")
-    limits = f'<p class="note">{escape(data.coverage.limits)}</p>' if data.coverage.limits else ""
-    return f"<section><h2>Coverage</h2>{bars}{limits}{again}</section>"
+    return "".join(parts)
+
+
+def _fly_again(places: Sequence[FlyAgain]) -> str:
+    """Table of places; a long one is folded after its first rows."""
+    header = (
+        *("", "latitude, longitude", "east, north, up (m)", "heading (deg)", "pitch (deg)"),
+        "frames helped",
+    )
+    rows = []
+    for k, place in enumerate(places, 1):
+        e, n, u = place.east_north_up_m
+        latitude, longitude = place.lat_lon_deg
+        rows.append(
+            (
+                str(k),
+                f"{latitude:.7f}, {longitude:.7f}",
+                f"{e:.1f}, {n:.1f}, {u:.1f}",
+                f"{place.heading_deg:.0f}",
+                f"{place.pitch_deg:.0f}",
+                f"{place.frames:,}",
+            )
+        )
+    if not rows:
+        return ""
+    first, rest = rows[:_PLACES_SHOWN], rows[_PLACES_SHOWN:]
+    more = (
+        f"<details><summary>{len(rest):,} more</summary>{_table(header, rest, 'again')}</details>"
+        if rest
+        else ""
+    )
+    return f"<h3>Where to fly again</h3>{_table(header, first, 'again')}{more}"
 
 
 def _strata_bar(name: str, counts: dict[str, int]) -> str:

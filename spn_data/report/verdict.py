@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
 from spn_data import audit
-from spn_data.report.data import STRATA, ReportData
+from spn_data.report.data import STRATA, CoverageFacts, ReportData
 from spn_data.split import OPTIMISTIC, TRAIN, VALIDATION
 
 
@@ -55,6 +56,9 @@ class VerdictLimits:
     max_scale_sigma: float = 0.03
     good_evaluation_share: float = 0.90  # of a sequence's frames that have a pose
     min_evaluation_share: float = 0.50
+    max_gnss_offset_m: float = (
+        5.0  # of a sequence's own GNSS to its labels, beyond the map's 2 sigma
+    )
     max_low_share: float = 0.20  # of a sequence's covered frames in the lowest stratum
     min_training_frames: int = 100
 
@@ -92,8 +96,6 @@ def _stages(data: ReportData) -> Iterator[Finding]:
                 "Make this stage anew",
                 f"{stage.command} --overwrite",
             )
-    for sentence in data.unread:
-        yield Finding(Level.STOP, sentence)
 
 
 def _map(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
@@ -199,41 +201,70 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
             )
         else:
             yield Finding(Level.GOOD, text + ".")
+        yield from _own_gnss(name, data, limits)
+
+
+def _own_gnss(name: str, data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+    """The sequence's own fixes, which its labels were made without."""
+    record = data.evaluation_records.get(name)
+    gnss = record.counts.get("gnss") if record else None
+    if not gnss or data.geo is None:
+        return
+    offset_m = math.hypot(gnss["offset_e_m"], gnss["offset_n_m"])
+    if offset_m > limits.max_gnss_offset_m + 2 * data.geo.uncertainty.horizontal_m:
+        yield Finding(
+            Level.CAUTION,
+            f"The own GNSS of {name}, not used for its labels, lies {offset_m:.1f} m beside them: the "
+            "map's place or these labels may be wrong.",
+            "Compare flights and heights; see the residuals",
+        )
 
 
 def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
-    names = data.evaluation_sequences
-    if data.coverage is None:
-        if names:
-            yield Finding(
-                Level.CAUTION,
-                "How well mapping covers the evaluation sequences is not known.",
-                "Measure it",
-                "spn-data coverage",
-            )
-        return
-    if data.stale_coverage:
+    if data.coverage is None and data.evaluation_sequences:
         yield Finding(
             Level.CAUTION,
-            f"Coverage is out of date: {data.stale_coverage}.",
-            "Measure it again",
+            "How well mapping covers the evaluation sequences is not known.",
+            "Measure it",
             "spn-data coverage",
         )
-    for name, counts in data.coverage.strata.items():
-        total = sum(counts.get(stratum, 0) for stratum in STRATA)
-        share = counts.get("low", 0) / total if total else 0.0
-        if share > limits.max_low_share:
-            again = len(data.coverage.fly_again)
-            yield Finding(
-                Level.CAUTION,
-                f"{share:.0%} of sequence {name} are views that no mapping frame is near to: a network has "
-                "to extrapolate there.",
-                f"Fly the {_count(again, 'place')} listed below and add them" if again else "",
-                "spn-data reconstruct VIDEO --add",
-            )
-        elif total:
-            parts = ", ".join(f"{counts.get(s, 0) / total:.0%} {s}" for s in STRATA)
-            yield Finding(Level.GOOD, f"Coverage of {name} by mapping frames: {parts}.")
+    if data.coverage is not None:
+        for name in sorted(data.coverage.strata):
+            yield from _strata(f"sequence {name}", name, data.coverage, limits)
+        yield from _stale(data.coverage, "Coverage", "spn-data coverage")
+    if data.plan is not None:
+        for name in sorted(data.plan.strata):
+            yield from _strata("the planned waypoints", name, data.plan, limits)
+        command = "spn-data coverage --waypoints FILE.csv"
+        yield from _stale(data.plan, "Coverage of the planned waypoints", command)
+
+
+def _strata(
+    what: str, name: str, coverage: CoverageFacts, limits: VerdictLimits
+) -> Iterator[Finding]:
+    counts = coverage.strata[name]
+    total = sum(counts.get(stratum, 0) for stratum in STRATA)
+    if not total:
+        return
+    share = counts.get("low", 0) / total
+    if share > limits.max_low_share:
+        again = len(coverage.fly_again)
+        yield Finding(
+            Level.CAUTION,
+            f"{share:.0%} of {what} are views that no mapping frame is near to: a network has to "
+            "extrapolate there.",
+            f"Fly the {_count(again, 'place')} listed below and add them" if again else "",
+            "spn-data reconstruct VIDEO --add",
+        )
+    else:
+        parts = ", ".join(f"{counts.get(s, 0) / total:.0%} {s}" for s in STRATA)
+        yield Finding(Level.GOOD, f"Coverage of {what} by mapping frames: {parts}.")
+
+
+def _stale(coverage: CoverageFacts, what: str, command: str) -> Iterator[Finding]:
+    if coverage.stale:
+        text = f"{what} is out of date: {coverage.stale}."
+        yield Finding(Level.CAUTION, text, "Measure it again", command)
 
 
 def _split(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:

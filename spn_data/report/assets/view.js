@@ -137,16 +137,16 @@ function makeView(onPick) {
   if (drawing.kind === "2d")
     document.getElementById("fallback").textContent = " This browser has no WebGL: drawn simply, with fewer points.";
   const FOV = 45 * Math.PI / 180;
-  const home = {yaw: 0.45, pitch: 0.6, target: [0, 0, 0]};
+  const home = () => ({yaw: 0.45, pitch: 0.6, target: [0, 0, floor / 2], distance: fit()});
   const eye = {};
   let size = usualSize(), layers = makeLayers(size), marked = -1, mark = null, waiting = false;
 
   function fit() {
     const aspect = canvas.clientWidth / canvas.clientHeight;
     const narrow = Math.min(FOV, 2 * Math.atan(Math.tan(FOV / 2) * aspect));
-    return 0.85 * half / Math.sin(narrow / 2);
+    return 0.95 * half / Math.sin(narrow / 2);
   }
-  const reset = pitch => Object.assign(eye, home, {target: [0, 0, 0], distance: fit()},
+  const reset = pitch => Object.assign(eye, home(),
     pitch === undefined ? {} : {pitch, yaw: 0});
 
   function basis() {  // right, up, back of the viewer
