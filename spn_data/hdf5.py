@@ -30,7 +30,7 @@ from spn_data.hdf5_schema import (
 _FRAMES_A_BLOCK = 64  # held in memory without their images
 _POINTS_A_CHUNK = 16_384
 _MAX_ATTRIBUTE_BYTES = 60_000  # HDF5's own limit is 64 KiB
-_GROUP_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\- ]{0,99}")
+_GROUP_NAME = re.compile(r"\w[\w.\- ]{0,99}")
 
 
 class DatasetWriter:
