@@ -36,6 +36,7 @@ from spn_data.labels import Labels, SeenPoints, read_labels, write_labels, write
 from spn_data.map_points import MapPoints
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.export import Format
+from spn_data.pipeline.images import image_path
 from spn_data.pipeline.labels import (
     CAMERA,
     POSES,
@@ -100,11 +101,11 @@ def add_evaluation(root: Path) -> None:
     write_json(work.path / CAMERA, {"version": VERSION, **camera_to_json(lens)})
     moved = similarity_to_json(read_world_from_model(area))
     write_json(work.path / REGISTRATION, {"version": VERSION, "world_from_model": moved})
-    (work.path / "frames").mkdir()
-    for k in range(4):
-        source = root / "1-frames" / str(near.names[k])
-        shutil.copyfile(source, work.path / "frames" / f"{k:06d}.jpg")
     work.finish(counts={}, seconds={}, cpu_seconds={})
+    for k in range(4):
+        stored = image_path(area, str(labels.names[k]), "again")
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(root / "1-frames" / str(near.names[k]), stored)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import EVALUATION, FRAMES, Area
+from spn_data.area import Area
 from spn_data.errors import StageError
 from spn_data.exports.colmap_export import FOLDER_OF_IMAGES as COLMAP_IMAGES
 from spn_data.exports.colmap_export import write_colmap
@@ -26,6 +26,7 @@ from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
 from spn_data.labels import Labels, SeenPoints
+from spn_data.pipeline.images import image_path
 from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area
 from spn_data.record import VERSION, write_json
 
@@ -62,8 +63,9 @@ _WITH_DENSE = (Format.TUM, Format.GEOJSON, Format.KML)
 class ExportOptions:
     """What is exported.
 
-    sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames); all_frames : dense frames too, in formats that list no
-    images; images : copy the images that a format lists.
+    sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames).
+    all_frames : dense frames too, in formats that list no images.
+    images : copy the images that a format lists.
     """
 
     sequences: tuple[str, ...] = ()
@@ -219,15 +221,11 @@ def _write(area: Area, one: Format, folder: Path, frames: ExportedFrames, *, ima
 
 
 def _copy_images(area: Area, folder: Path, frames: ExportedFrames) -> None:
-    for name, is_evaluation in zip(frames.labels.names.tolist(), frames.is_evaluation, strict=True):
-        sequence, _, file = name.partition("/")
-        source = (
-            area.folder(f"{EVALUATION}/{sequence}") / "frames" / file
-            if is_evaluation
-            else area.folder(FRAMES) / name
-        )
+    for name, sequence in zip(
+        frames.labels.names.tolist(), frames.labels.sequences.tolist(), strict=True
+    ):
         (folder / sequence).mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, folder / name)
+        shutil.copyfile(image_path(area, name, sequence), folder / name)
 
 
 def _record(area: Area, one: Format, frames: ExportedFrames) -> dict[str, Any]:
