@@ -7,10 +7,11 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from spn_data.report.html import render
@@ -176,6 +177,57 @@ def test_the_table_sorts_and_filters(tmp_path):
     assert seen.found["count"] == "2 of 190 frames"
     assert "medium/000038.jpg" in seen.found["picked"]
     assert "ambiguous" in seen.found["picked"]
+
+
+def test_a_frame_is_told_and_found_from_its_strip(tmp_path):
+    """Pointing at a failed frame's tick tells why; a click shows it in the table, and marks the strip."""
+    seen = visit(
+        tmp_path,
+        render(area()),
+        """
+        const strip = document.querySelectorAll(".lane canvas")[1];
+        const corner = strip.getBoundingClientRect();
+        const at = type => strip.dispatchEvent(new PointerEvent(type,
+          {clientX: corner.left + strip.clientWidth - 4, clientY: corner.top + 10, bubbles: true}));
+        at("pointermove");
+        found.tip = document.getElementById("tip").textContent;
+        const before = strip.toDataURL();
+        at("click");
+        found.marked = strip.toDataURL() !== before;
+        found.row = [...document.querySelectorAll("#table tr.picked")].map(r => r.cells[0].textContent);
+        found.picked = document.getElementById("picked").textContent;
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["tip"] == "medium/000039.jpg at 19.5 s: failed: ambiguous"
+    assert seen.found["marked"]
+    assert seen.found["row"] == ["medium/000039.jpg"]
+    assert seen.found["picked"].startswith("medium/000039.jpg")
+
+
+def test_a_page_without_a_model_is_quiet_too(tmp_path):
+    """Frames alone, without any pose, are listed and drawn over time, and nothing fails."""
+    data = area()
+    frames = data.frames.select(~data.frames.evaluation)
+    unknown = replace(
+        frames.poses,
+        centers=np.full((len(frames), 3), np.nan),
+        quats_wxyz=np.full((len(frames), 4), np.nan),
+    )
+    frames = replace(frames, status=np.full(len(frames), "chosen"), poses=unknown)
+    nothing = {"geo": None, "points": None, "coverage": None, "split": None, "audit": None}
+    data = replace(data, frames=frames, units="model", model_record=None, **nothing)
+    seen = visit(
+        tmp_path,
+        render(data),
+        """
+        found.rows = rows().length;
+        found.strips = [...document.querySelectorAll(".lane canvas")].map(pixels);
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["rows"] > 5
+    assert all(strip["drawn"] > 0.02 for strip in seen.found["strips"])
 
 
 def test_without_webgl_a_plain_canvas_draws(tmp_path):

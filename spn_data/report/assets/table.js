@@ -9,11 +9,11 @@ function makeTable(onPick) {
   const text = (label, title, width, value) => ({label, title, width, value});
   const axes = given.units === "m" ? ["east", "north", "up"] : ["x", "y", "z"];
   const columns = [
-    text("frame", "name of the image", 190, frames.name),
-    text("sequence", "", 110, frames.sequence),
-    text("kind", "of the map, or of an evaluation sequence; dense: not among the chosen frames", 100, kind),
+    text("frame", "name of the image", 175, frames.name),
+    text("sequence", "", 90, frames.sequence),
+    text("kind", "of the map, or of an evaluation sequence; dense: not among the chosen frames", 130, kind),
     number("time, s", "since the sequence's first frame", 85, i => frames.time_s[i], 2),
-    text("status", "", 90, frames.status),
+    text("status", "", 85, frames.status),
     ...axes.map((axis, k) => number(`${axis}, ${unit}`, "of the camera centre", 90, i => frames.center[3 * i + k], 3)),
     number(`sigma, ${unit}`, "of the position, 1 sigma", 95, i => frames.sigma_m[i], 3),
     number("sigma, deg", "of the rotation, 1 sigma", 110, i => frames.sigma_deg[i], 3),

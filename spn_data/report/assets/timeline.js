@@ -4,8 +4,7 @@
 function makeTimeline(onPick) {
   const box = document.getElementById("timeline");
   if (!box) return {draw() {}, pick() {}};
-  const colors = {registered: "--mapping", failed: "--failed", skipped: "--skipped", unreadable: "--unreadable"};
-  const statuses = [...new Set(rows.map(i => frames.status(i)))];
+  const colors = {registered: "--mapping", chosen: "--dense", failed: "--failed", skipped: "--skipped", unreadable: "--unreadable"};
   const key = element("div", {class: "key"});
   for (const status of Object.keys(colors)) {
     const n = rows.filter(i => frames.status(i) === status).length;
@@ -60,7 +59,7 @@ function makeTimeline(onPick) {
         const status = frames.status(i);
         const color = status === "registered" && frames.evaluation[i] ? "--evaluation" : colors[status];
         const failed = status === "failed";
-        const [top, height] = !tried(i) ? [0.72, 0.28] : frames.dense[i] ? [0.36, 0.3] : [0, failed ? 1 : 0.66];
+        const [top, height] = !tried(i) && status !== "chosen" ? [0.72, 0.28] : frames.dense[i] ? [0.36, 0.3] : [0, failed ? 1 : 0.66];
         context.fillStyle = css(color);
         context.fillRect(4 * scale + frames.time_s[i] / last * w - scale / 2, top * h, Math.max(1, (failed ? 2.5 : 1.2) * scale), height * h);
       }
