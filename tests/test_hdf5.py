@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -499,3 +500,24 @@ def test_the_documented_schema_is_the_one_written(written):
         assert set(file["low/points"]) == {*POINTS, "offsets"}
         assert all(file["low"][name].attrs["description"] for name in (*COLUMNS, "images", "masks"))
     assert rows == wanted
+
+
+@pytest.mark.slow
+def test_the_benchmark_measures_what_it_writes(finished_area, tmp_path):
+    """benchmarks/dataset.py writes as many frames as asked for, one process each, and leaves no data set."""
+    program, figures = ROOT / "benchmarks" / "dataset.py", tmp_path / "figures.json"
+    words = [str(finished_area), "--frames", "30", "60", "--folder", str(tmp_path)]
+    subprocess.run(
+        [sys.executable, str(program), *words, "--json", str(figures)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=True,
+        timeout=120,
+        capture_output=True,
+    )
+    few, many = json.loads(figures.read_text())
+    assert (few["frames"], many["frames"]) == (30, 60)
+    assert many["points"] > few["points"] > 0
+    assert many["file_gb"] * 1e9 > 60 * 480 * 270 * 3
+    assert many["late_mb"] < few["late_mb"] + 60
+    assert os.listdir(tmp_path) == ["figures.json"]
