@@ -22,6 +22,9 @@ from spn_data.split import (
 )
 
 REVISIT_M, REVISIT_DEG = 1.0, 10.0
+COPY_M, COPY_DEG = 0.05, 0.5
+_COPY_FRAMES, _COPY_SHARE = 3, 0.05
+_COPIES = "no copy of a mapping flight"
 _NOT_IN_MAP = "no evaluation frame in the map"
 # Views of a point by training frames from which on it may be given for training.
 MIN_TRAINING_VIEWS = 2
@@ -91,6 +94,32 @@ def check_not_in_map(
         bad,
         f"none of {frames} evaluation frames is among the map's {len(in_map)} images or from its sources",
         "the map has seen what it is to be tested on",
+    )
+
+
+def check_copies(mapping: Labels, evaluation: Mapping[str, Labels]) -> Finding:
+    """(a) No evaluation sequence looks like a mapping flight itself, encoded anew: that no fingerprint tells.
+
+    Two flights do not meet within centimetres and fractions of a degree, again and again.
+    """
+    here = mapping.poses[mapping.registered]
+    tree = cKDTree(here.centers)
+    suspects = []
+    for sequence, labels in evaluation.items():
+        poses = labels.poses[labels.registered]
+        apart_m, nearest = tree.query(poses.centers)
+        turned_deg = rotation_errors_deg(poses.quats_wxyz, here.quats_wxyz[nearest])
+        same = int(((apart_m <= COPY_M) & (turned_deg <= COPY_DEG)).sum())
+        if same >= max(_COPY_FRAMES, _COPY_SHARE * len(poses)):
+            suspects.append(f"{sequence}: {same} of {len(poses)} frames")
+    meet = f"within {COPY_M * 100:g} cm and {COPY_DEG:g} deg of a mapping frame"
+    if not suspects:
+        return Finding(_COPIES, Verdict.PASS, f"no sequence lies again and again {meet}")
+    return Finding(
+        _COPIES,
+        Verdict.NOTICE,
+        f"frames lie {meet}: is it a mapping flight under another name, cut or encoded anew?",
+        tuple(suspects),
     )
 
 

@@ -107,6 +107,22 @@ def test_an_evaluation_sequence_of_unknown_source_is_found(mapping, evaluation):
     assert_fails(found, "medium", "not recorded")
 
 
+def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
+    """Every fourth frame of the flight, 2 cm off, as labels of a copy are; another flight passes."""
+    assert audit.check_copies(mapping, evaluation).verdict is Verdict.PASS
+    rows = np.arange(0, 100, 4)
+    copy = frames("copy", 100).select(rows)
+    copy = replace(copy, poses=Poses(copy.poses.centers + 0.01, copy.poses.quats_wxyz))
+    found = audit.check_copies(mapping, {**evaluation, "copy": copy})
+    assert found.verdict is Verdict.NOTICE
+    assert found.evidence == ("copy: 25 of 25 frames",)
+    crossing = frames("crossing", 100, north_m=3.0)
+    centers = crossing.poses.centers.copy()
+    centers[:2] = mapping.poses.centers[:2]
+    crossing = replace(crossing, poses=Poses(centers, crossing.poses.quats_wxyz))
+    assert audit.check_copies(mapping, {"crossing": crossing}).verdict is Verdict.PASS
+
+
 def test_a_map_hash_that_changed_is_found():
     """During a registration, or since."""
     same = audit.check_map_unchanged("m1", {"medium": MapHashes("m1", "m1")})

@@ -13,6 +13,7 @@ from spn_data.audit import (
     MapHashes,
     Verdict,
     check_blocks,
+    check_copies,
     check_fresh,
     check_gap,
     check_map_unchanged,
@@ -62,6 +63,7 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Find
     covered = check_covered(parts, split)
     findings = [
         _check_not_in_map(area, labelled),
+        *_check_copies(labelled),
         _check_map_unchanged(area),
         check_labels(parts),
         covered,
@@ -88,6 +90,14 @@ def _check_not_in_map(area: Area, labelled: LabelledArea) -> Finding:
         labelled.evaluation,
         {name: _sources(area, f"{EVALUATION}/{name}") for name in labelled.evaluation},
     )
+
+
+def _check_copies(labelled: LabelledArea) -> list[Finding]:
+    """Only where lengths are metres and there is something to compare."""
+    if labelled.units != "m" or not labelled.evaluation:
+        return []
+    mapping = Labels.concatenate([labelled.mapping, labelled.dense])
+    return [check_copies(mapping, labelled.evaluation)]
 
 
 def _sources(area: Area, stage: str) -> dict[str, str]:
