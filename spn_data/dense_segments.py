@@ -132,8 +132,9 @@ def _limit(
     if len(state.waiting) <= most:
         return
     if state.anchors and not state.handed_on:
-        yield from _segment(state, state.waiting, state.anchors, sequence)
-        state.waiting, state.handed_on = [], True
+        for part in (state.head, state.waiting):
+            yield from _segment(state, part, state.anchors, sequence)
+        state.head, state.waiting, state.handed_on = [], [], True
     else:
         row, _ = state.waiting.pop(0)
         reasons[row] = "too far from any labelled frame"

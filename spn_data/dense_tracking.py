@@ -256,17 +256,25 @@ def _track_frame(
     guesses: list[Poses],
     options: DenseOptions,
 ) -> TrackedFrame:
-    """A rough pose from few points, then a fine one from all, then the checks."""
-    rough = _rough_pose(_small(gray, options), camera, anchors, guesses, options)
-    if rough is None:
+    """From each labelled frame a rough pose by few points, then all its points; then the checks.
+
+    Each begins for itself, so that one in a wrong place is contradicted by the other, not led astray.
+    """
+    small = _small(gray, options)
+    tracks = []
+    for anchor in anchors:
+        rough = _rough_pose(small, camera, anchor, guesses, options)
+        if rough is not None:
+            tracks.append(_tracks(anchor, gray, rough, camera, options))
+            guesses = [rough, *guesses]
+    if not tracks:
         return failed("the points of the labelled frames beside it were not found in it")
-    tracks = [_tracks(anchor, gray, rough, camera, options) for anchor in anchors]
     together = _once(tracks)
     if len(together.point_ids) < options.min_inliers:
         return failed(
             f"only {len(together.point_ids)} points of the labelled frames beside it were found in it"
         )
-    fit = _fit(together, rough, camera)
+    fit = _fit(together, guesses[0], camera)
     if fit is None:
         return failed("no pose agrees with its points")
     enough = [t for t in tracks if len(t.point_ids) >= options.min_inliers]
@@ -277,27 +285,24 @@ def _track_frame(
 def _rough_pose(
     small: np.ndarray,
     camera: Camera,
-    anchors: list[_Prepared],
+    anchor: _Prepared,
     guesses: list[Poses],
     options: DenseOptions,
 ) -> Poses | None:
-    """From the first anchor and guess whose points agree with each other."""
+    """From the first guess with which the anchor's points agree with each other."""
     height, width = small.shape
     shrunk = np.array([width / camera.width, height / camera.height])
     lens = camera.scaled(width, height)
-    for anchor in anchors:
-        xyz, pixels = anchor.xyz[anchor.start], anchor.pixels[anchor.start] * shrunk
-        for guess in guesses:
-            expected = _project(lens, guess, xyz)
-            there, found = follow(
-                anchor.small, small, pixels, expected, options.start_levels, options
-            )
-            enough = max(12.0, options.min_inlier_ratio * np.count_nonzero(found))
-            if np.count_nonzero(found) < enough:
-                continue
-            fit = fit_pose(lens, guess, xyz[found], there[found], first_px=8.0, last_px=0.5)
-            if fit and np.count_nonzero(fit.inliers(options.max_error_px)) >= enough:
-                return fit.poses
+    xyz, pixels = anchor.xyz[anchor.start], anchor.pixels[anchor.start] * shrunk
+    for guess in guesses:
+        expected = _project(lens, guess, xyz)
+        there, found = follow(anchor.small, small, pixels, expected, options.start_levels, options)
+        enough = max(12.0, options.min_inlier_ratio * np.count_nonzero(found))
+        if np.count_nonzero(found) < enough:
+            continue
+        fit = fit_pose(lens, guess, xyz[found], there[found], first_px=8.0, last_px=0.5)
+        if fit and np.count_nonzero(fit.inliers(options.max_error_px)) >= enough:
+            return fit.poses
     return None
 
 
