@@ -144,7 +144,7 @@ function makeView(onPick) {
   function fit() {
     const aspect = canvas.clientWidth / canvas.clientHeight;
     const narrow = Math.min(FOV, 2 * Math.atan(Math.tan(FOV / 2) * aspect));
-    return 0.95 * half / Math.sin(narrow / 2);
+    return (aspect < 1 ? 1.15 : 0.95) * half / Math.sin(narrow / 2);
   }
   const reset = pitch => Object.assign(eye, home(),
     pitch === undefined ? {} : {pitch, yaw: 0});
