@@ -157,10 +157,7 @@ def _write_files(
                 cambridge.add_image(str(labels.names[row]), str(labels.cameras[row]), image)
         progress("images", len(labels), len(labels))
     if listed.any():
-        rows = np.flatnonzero(listed)
-        cambridge.finish(
-            labels.select(rows), frames.group[rows], frames.seen.select(rows), labelled.points
-        )
+        cambridge.finish(frames, np.flatnonzero(listed), labelled.points)
 
 
 def _info(area: Area, labelled: LabelledArea, split: Split, camera: Camera | None) -> DatasetInfo:

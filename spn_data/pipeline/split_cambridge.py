@@ -10,9 +10,9 @@ import numpy as np
 from spn_data.audit import MIN_TRAINING_VIEWS
 from spn_data.cambridge import write_cambridge
 from spn_data.camera import Camera
-from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints
 from spn_data.nvm import nvm_model, write_nvm
+from spn_data.pipeline.split_dataset import GivenFrames
 from spn_data.rendering import Renderer, undistorted_camera
 from spn_data.split import TRAIN, VALIDATION
 
@@ -56,51 +56,50 @@ class CambridgeFolder:
         temporary.write_bytes(data.tobytes())
         temporary.replace(path)
 
-    def finish(
-        self, labels: Labels, group: np.ndarray, seen: SeenPoints, points: MapPoints
-    ) -> None:
-        """The lists, each sorted by sequence and time, and the model.
-
-        labels, group, seen : of the frames whose images were added.
-        """
-        names = [image_name(name) for name in labels.names.tolist()]
-        files = np.array([list_of(name) for name in group.tolist()])
+    def finish(self, frames: GivenFrames, rows: np.ndarray, points: MapPoints) -> None:
+        """The lists, each sorted by sequence and time, and the model. rows : of frames with an image."""
+        names = [image_name(name) for name in frames.labels.names.tolist()]
+        files = np.array([list_of(name) for name in frames.group.tolist()])
         for file in (*_LISTS.values(), TEST_LIST):
-            rows = np.flatnonzero(files == file)
-            write_cambridge(self._folder / file, [names[k] for k in rows], labels.poses[rows])
-        self._write_model(labels, names, group, seen, points)
+            mine = rows[files[rows] == file]
+            write_cambridge(
+                self._folder / file, [names[k] for k in mine], frames.labels.poses[mine]
+            )
+        self._write_model(frames, rows, [names[k] for k in rows], points)
 
     def _write_model(
-        self,
-        labels: Labels,
-        names: list[str],
-        group: np.ndarray,
-        seen: SeenPoints,
-        points: MapPoints,
+        self, frames: GivenFrames, rows: np.ndarray, names: list[str], points: MapPoints
     ) -> None:
         """All images, for their focal lengths; of points only what training frames measured.
 
         A held-out frame's measurements would tell where it is.
         """
-        rows, ids, offsets = [], [], []
-        for row in np.flatnonzero(group == TRAIN):
-            own_ids, pixels = seen.of_frame(int(row))
-            target = self._renderer(str(labels.cameras[row])).target
-            moved, is_seen = self._renderer(str(labels.cameras[row])).move(pixels)
-            rows.append(np.full(int(is_seen.sum()), row))
+        images, ids, offsets, focal_px = [], [], [], []
+        for image, row in enumerate(rows.tolist()):
+            renderer = self._renderer(str(frames.labels.cameras[row]))
+            target = renderer.target
+            focal_px.append(target.focal_px[0])
+            if frames.group[row] != TRAIN:
+                continue
+            own_ids, pixels = frames.points_of(row)
+            moved, is_seen = renderer.move(pixels)
+            images.append(np.full(int(is_seen.sum()), image))
             ids.append(own_ids[is_seen])
             offsets.append(moved[is_seen] - [target.width / 2, target.height / 2])
-        image_idx, point_ids = np.concatenate(rows), np.concatenate(ids)
-        known, number, views = np.unique(point_ids, return_inverse=True, return_counts=True)
+        known, number, views = np.unique(
+            np.concatenate(ids), return_inverse=True, return_counts=True
+        )
         kept = views[number] >= MIN_TRAINING_VIEWS
-        point_rows = points.rows_of(known)[number]
-        focal_px = [self._renderer(str(key)).target.focal_px[0] for key in labels.cameras]
         model = nvm_model(
             tuple(names),
-            labels.poses,
+            frames.labels.poses[rows],
             np.array(focal_px),
             (points.xyz, points.colors),
-            (point_rows[kept], image_idx[kept], np.concatenate(offsets)[kept]),
+            (
+                points.rows_of(known)[number][kept],
+                np.concatenate(images)[kept],
+                np.concatenate(offsets)[kept],
+            ),
         )
         write_nvm(self._folder / NVM, model)
 

@@ -14,44 +14,62 @@ from spn_data.coverage import strata_of
 from spn_data.hdf5_schema import DatasetFrame
 from spn_data.labels import Labels, SeenPoints
 from spn_data.photos import load_mask
-from spn_data.pipeline.labels import LabelledArea, together
+from spn_data.pipeline.labels import LabelledArea
 from spn_data.rendering import Renderer, RenderingOptions, canonical_camera, undistorted_camera
 from spn_data.split import LEFT_OUT, TRAIN, Split
 
 
 @dataclass(frozen=True, eq=False)
 class GivenFrames:
-    """N frames that are in a group, sorted by sequence and time, with the map points that they are given.
+    """N frames that are in a group, sorted by sequence and time.
 
     group : (N,) str; strata : (N,) str, by the chosen training frames; empty for training frames and where
-    there are no metres. for_training : ids of the points that training frames are given. split : of all.
+    there are no metres. for_training : ids of the points that training frames are given.
+    split : of all frames. seen : of the parts of the area that the frames are from, which may be large and
+    are not copied; part, row : (N,) where each frame is in them.
     """
 
     labels: Labels
-    seen: SeenPoints
     group: np.ndarray
     strata: np.ndarray
     for_training: np.ndarray
     split: Split
+    seen: tuple[SeenPoints, ...]
+    part: np.ndarray
+    row: np.ndarray
+
+    def points_of(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(ids (K,), pixels (K, 2)) that frame k is given; in training those that training frames made."""
+        ids, pixels = self.seen[self.part[k]].of_frame(int(self.row[k]))
+        if self.group[k] == TRAIN:
+            given = np.isin(ids, self.for_training)
+            ids, pixels = ids[given], pixels[given]
+        return ids, pixels
 
 
 def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
     parts = [(labelled.mapping, labelled.mapping_seen), (labelled.dense, labelled.dense_seen)]
     parts += [(labelled.evaluation[n], labelled.evaluation_seen[n]) for n in labelled.evaluation]
     kept = [np.flatnonzero(split.of(labels.names) != LEFT_OUT) for labels, _ in parts]
-    labels, seen = together(
-        [(p.select(k), s.select(k)) for (p, s), k in zip(parts, kept, strict=True)]
-    )
+    labels = Labels.concatenate([p.select(rows) for (p, _), rows in zip(parts, kept, strict=True)])
+    order = np.lexsort((labels.time_s, labels.sequences))
+    labels = labels.select(order)
     group = split.of(labels.names)
     strata = np.full(len(labels), "", dtype="<U6")
     if labelled.units == "m":
         others = group != TRAIN
         training = labels.poses[(group == TRAIN) & ~labels.dense]
         strata[others] = strata_of(labels.poses[others], training)
-    for_training = training_points(labelled.mapping, labelled.mapping_seen, split)
-    given = (group != TRAIN)[seen.frame_idx] | np.isin(seen.point_ids, for_training)
-    seen = SeenPoints(seen.frame_idx[given], seen.point_ids[given], seen.pixels[given])
-    return GivenFrames(labels, seen, group, strata, for_training, split)
+    return GivenFrames(
+        labels,
+        group,
+        strata,
+        training_points(labelled.mapping, labelled.mapping_seen, split),
+        split,
+        tuple(seen for _, seen in parts),
+        np.repeat(np.arange(len(parts)), [len(rows) for rows in kept])[order],
+        np.concatenate(kept)[order],
+    )
 
 
 def target_cameras(
@@ -99,7 +117,7 @@ class RenderedFrames:
         """A frame, from its full-size image (H, W, 3) BGR."""
         labels, key = self._frames.labels, str(self._frames.labels.cameras[row])
         renderer = self._renderer(key)
-        ids, pixels = self._frames.seen.of_frame(row)
+        ids, pixels = self._frames.points_of(row)
         moved, is_seen = renderer.move(pixels)
         return DatasetFrame(
             name=str(labels.names[row]),
