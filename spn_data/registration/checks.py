@@ -19,6 +19,8 @@ from spn_data.pose import Poses, rotation_errors_deg
 from spn_data.registration.options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, reprojection_errors
 
+_MIN_SHARED = 10  # map points that two frames both show, to compare their poses by
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -29,7 +31,7 @@ class Evidence:
     coverage : (N,) share of the image that these cover; rival : (N,) int, inliers of the best pose elsewhere;
     depth : (N,) median distance of the points, in the map's unit; sigma : (N,), sigma_deg : (N,) stated.
     pairs : (P, 2) neighbours, i < j; matches : (P,) of them; agreement : (P,) share of the matches that both
-    poses explain, NaN where one has no pose.
+    poses explain, NaN where one has no pose (see `_agreement`).
     """
 
     direct: np.ndarray
@@ -69,6 +71,7 @@ def gather_evidence(
             away = sequence.map_xyz[point] - solution.poses.centers[row]
             depth[row] = np.median(np.linalg.norm(away, axis=1))
             rival[row] = _rival(sequence, solution, row, depth[row], options)
+    shown = [_points_of_features(sequence, solution, row) for row in range(n)]
     keys = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return Evidence(
         direct=direct,
@@ -82,7 +85,10 @@ def gather_evidence(
         pairs=keys,
         matches=np.array([len(pairs[int(i), int(j)]) for i, j in keys], dtype=np.int64),
         agreement=np.array(
-            [_agreement(sequence, solution, pairs[int(i), int(j)], i, j, options) for i, j in keys]
+            [
+                _agreement(sequence, solution, shown, pairs[int(i), int(j)], i, j, options)
+                for i, j in keys
+            ]
         ),
     )
 
@@ -117,17 +123,55 @@ def same_pose(a: Poses, b: Poses, depth: float, options: CheckOptions) -> bool:
     return apart <= options.same_place * depth and turned_deg <= options.same_rotation_deg
 
 
+def _points_of_features(sequence: Sequence, solution: Solution, row: int) -> np.ndarray:
+    """(K,) row of the map point that the pose agrees with, of each feature of a frame; -1 for none."""
+    shown = np.full(len(sequence.pixels[row]), -1)
+    feature, point = solution.inliers(row)
+    shown[feature] = point
+    return shown
+
+
 def _agreement(
     sequence: Sequence,
     solution: Solution,
+    shown: list[np.ndarray],
     matches: np.ndarray,
     i: int,
     j: int,
     options: RegisterOptions,
 ) -> float:
-    """Share of the matches of two frames that lie on each other's epipolar lines (Sampson's error)."""
+    """Share of the matches of two frames that both poses explain: by what they say least.
+
+    Matches lie on each other's epipolar lines (Sampson's error); and the map point that one frame shows lies
+    where the other has the match. The first says nothing of an error along the line between the frames, as
+    of one window in a facade that they pass; the second needs map points.
+    """
     if not (solution.posed[i] and solution.posed[j]) or not len(matches):
         return float("nan")
+    shares = [_epipolar_share(sequence, solution, matches, i, j, options.max_error_px)]
+    ends = ((i, matches[:, 0], j, matches[:, 1]), (j, matches[:, 1], i, matches[:, 0]))
+    for here, features, there, matched in ends:
+        point = shown[here][features]
+        known = point >= 0
+        if known.sum() >= _MIN_SHARED:
+            error_px = reprojection_errors(
+                solution.poses[there : there + 1],
+                solution.camera,
+                sequence.map_xyz[point[known]],
+                sequence.pixels[there][matched[known]],
+            )
+            shares.append(float((error_px <= 2 * options.max_error_px).mean()))
+    return min(shares)
+
+
+def _epipolar_share(
+    sequence: Sequence,
+    solution: Solution,
+    matches: np.ndarray,
+    i: int,
+    j: int,
+    max_error_px: float,
+) -> float:
     camera = solution.camera
     rotations, centers = solution.poses.rotations, solution.poses.centers
     relative = rotations[j] @ rotations[i].T
@@ -139,7 +183,7 @@ def _agreement(
     line_b, line_a = a @ essential.T, b @ essential
     slope = (line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1)
     error = np.abs((b * line_b).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-30))
-    return float((error * np.mean(camera.focal_px) <= options.max_error_px).mean())
+    return float((error * np.mean(camera.focal_px) <= max_error_px).mean())
 
 
 def _homogeneous(xy: np.ndarray) -> np.ndarray:
