@@ -1,0 +1,157 @@
+"""How the errors of one track hang together: features drift as the view of them changes.
+
+Model of the n errors of a track, in each of x and y: variance s^2 sigma^2 (w + (1 - w) exp(-change / length))
+between two of its frames (w only of one with itself), where the change of view is that of the direction to
+the point in radians and of the logarithm of its distance, and s^2 is of the track: inverse gamma with mean
+near 1, so that errors have the tails of Student's t. Restricted likelihood: of residuals after the point
+itself (Patterson and Thompson 1971; Lange, Little and Taylor 1989 for t).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+from scipy.special import gammaln
+
+from spn_data.bundle_jacobians import Bundle
+
+# Much more than any track sees: what a drift does over a track's views grows with their change. It is not
+# estimated, as only its ratio to the variance matters then.
+_LENGTH = 3.0
+_FITTED_TRACKS = 1000
+_TRACK_LENGTHS = (4, 30)  # of tracks that are fitted: shorter ones tell nothing of drift
+
+
+@dataclass(frozen=True, eq=False)
+class TrackNoise:
+    """sigma_px : deviation of one component in a usual track; apart : w, the share that no neighbour has;
+    length : change of view over which the rest fades; tails : degrees of freedom of Student's t."""
+
+    sigma_px: float
+    apart: float
+    length: float
+    tails: float
+
+    def correlations(self, views: np.ndarray) -> np.ndarray:
+        """(..., n, n) between the errors of a track seen in views (..., n, 4)."""
+        squared = np.zeros((*views.shape[:-1], views.shape[-2]))
+        for axis in range(views.shape[-1]):
+            column = views[..., axis]
+            squared += (column[..., :, None] - column[..., None, :]) ** 2
+        shared = (1 - self.apart) * np.exp(-np.sqrt(squared) / self.length)
+        return shared + self.apart * np.eye(views.shape[-2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """T tracks of n measurements: point (T,), views (T, n, 4), whitened (T, n, 2, 3), residuals (T, n, 2)."""
+
+    point: np.ndarray
+    views: np.ndarray
+    whitened: np.ndarray
+    residuals: np.ndarray
+
+
+def fit_track_noise(bundle: Bundle) -> TrackNoise:
+    """Most likely noise of a bundle's tracks, from a sample of them."""
+    lengths = np.bincount(bundle.point)
+    usable = np.flatnonzero((lengths >= _TRACK_LENGTHS[0]) & (lengths <= _TRACK_LENGTHS[1]))
+    if len(usable) == 0:
+        usable = np.flatnonzero(lengths > 0)
+    chosen = np.random.default_rng(0).permutation(usable)[:_FITTED_TRACKS]
+    tracks = list(_tracks(bundle, chosen))
+    variance = np.median(np.concatenate([(t.residuals**2).mean(axis=(1, 2)) for t in tracks]))
+    start = np.array([np.log(max(2 * float(variance), 1e-12)), -1.0, 1.0])
+    found = optimize.minimize(
+        lambda x: sum(_minus_log_likelihood(t, _noise(x)) for t in tracks),
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": np.vstack([start, start + np.eye(3)]),
+            "maxfev": 200,
+            "xatol": 0.02,
+            "fatol": 0.5,
+        },
+    )
+    return _noise(found.x)
+
+
+def own_errors(bundle: Bundle, noise: TrackNoise | None) -> np.ndarray:
+    """(P, 3, 3) F, with Q^T F Q the covariance of a point by its own errors (Q of Bundle.whitening).
+
+    Without a model of noise: of independent errors of 1 px.
+    """
+    own = np.zeros_like(bundle.whitening)
+    if noise is None:
+        return own + np.eye(3)
+    for tracks in _tracks(bundle, np.arange(len(bundle.points))):
+        correlations = noise.correlations(tracks.views)
+        shape = np.einsum(
+            "tnki,tnkj->tij",
+            tracks.whitened,
+            np.einsum("tmn,tnki->tmki", correlations, tracks.whitened, optimize=True),
+        )
+        misfit, _ = _misfit(tracks, correlations)
+        freedom = 2 * tracks.views.shape[1] - 3
+        # The variance of this track that its residuals and those of all others tell.
+        variance = (noise.tails * noise.sigma_px**2 + misfit) / max(
+            noise.tails + freedom - 2, noise.tails / 2
+        )
+        own[tracks.point] = variance[:, None, None] * shape
+    return own
+
+
+def _noise(x: np.ndarray) -> TrackNoise:
+    log_variance, apart, log_tails = np.clip(x, [-60, -7, -5], [60, 7, 5])
+    return TrackNoise(
+        sigma_px=float(np.exp(0.5 * log_variance)),
+        apart=float(1 / (1 + np.exp(-apart))),
+        length=_LENGTH,
+        tails=float(2 + np.exp(log_tails)),
+    )
+
+
+def _tracks(bundle: Bundle, points: np.ndarray) -> Iterator[_Tracks]:
+    """The tracks of some points, by their length."""
+    order = np.argsort(bundle.point, kind="stable")
+    starts = np.searchsorted(bundle.point[order], points)
+    lengths = np.searchsorted(bundle.point[order], points, side="right") - starts
+    residuals = bundle.residuals.reshape(-1, 2)
+    for length in np.unique(lengths):
+        of_length = lengths == length
+        rows = order[starts[of_length][:, None] + np.arange(length)]
+        yield _Tracks(points[of_length], bundle.views[rows], bundle.whitened[rows], residuals[rows])
+
+
+def _misfit(tracks: _Tracks, correlations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) squares of the residuals in units of their model, points out; (T,) log of its determinant."""
+    count, n = correlations.shape[:2]
+    root = np.linalg.cholesky(correlations)
+    values = np.concatenate([tracks.whitened, tracks.residuals[..., None]], axis=3)
+    scaled = np.linalg.solve(root, values.reshape(count, n, 8)).reshape(count, 2 * n, 4)
+    products = np.swapaxes(scaled, 1, 2) @ scaled
+    by_point, pull = products[:, :3, :3], products[:, :3, 3]
+    misfit = products[:, 3, 3] - np.einsum(
+        "ti,ti->t", pull, np.linalg.solve(by_point, pull[..., None])[..., 0]
+    )
+    log_det = 4 * np.log(np.einsum("tii->ti", root)).sum(axis=1)
+    return np.maximum(misfit, 0.0), log_det + np.linalg.slogdet(by_point)[1]
+
+
+def _minus_log_likelihood(tracks: _Tracks, noise: TrackNoise) -> float:
+    """Of Student's t, whose constants depend on its tails."""
+    misfit, log_det = _misfit(tracks, noise.correlations(tracks.views))
+    m, v = 2 * tracks.views.shape[1] - 3, noise.tails
+    variance = noise.sigma_px**2
+    each = (
+        0.5 * log_det
+        + 0.5 * m * np.log(variance)
+        + 0.5 * (v + m) * np.log1p(misfit / (variance * v))
+        + 0.5 * m * np.log(v)
+        + gammaln(v / 2)
+        - gammaln((v + m) / 2)
+    )
+    return float(each.sum())
