@@ -36,6 +36,7 @@ from cli import options
     type=click.Path(exists=True, dir_okay=False),
     help="Calibrated camera (JSON: model, width, height, params) to start from.",
 )
+@click.option("--fixed-lens", is_flag=True, help="Keep the lens of --camera as it is.")
 @click.option(
     "--map-frames",
     type=click.IntRange(1, 1000),
@@ -77,6 +78,7 @@ def run(
     rate_hz: float,
     fov_deg: float | None,
     camera_file: str | None,
+    fixed_lens: bool,
     map_frames: int,
     any_telemetry: bool,
     video_folder: Path | None,
@@ -95,6 +97,8 @@ def run(
 
     if video is None and not all_frames:
         raise click.UsageError("name a VIDEO to register, or give --all-frames")
+    if fixed_lens and camera_file is None:
+        raise click.UsageError("--fixed-lens keeps the lens of --camera: name one")
     workers = threads or os.cpu_count() or 1
     area = options.open_area(area_folder)
     unit = "m" if area.has(GEO) else "units of the model"
@@ -102,7 +106,9 @@ def run(
         names = [name] if name else None
         if video is not None:
             wanted = RegisterStageOptions(
-                register=RegisterOptions(rate_hz=rate_hz, map_frames=map_frames, seed=seed),
+                register=RegisterOptions(
+                    rate_hz=rate_hz, map_frames=map_frames, hold_lens=fixed_lens, seed=seed
+                ),
                 fov_deg=fov_deg,
                 camera_file=camera_file,
                 any_telemetry=any_telemetry,

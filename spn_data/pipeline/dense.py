@@ -30,7 +30,7 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.pipeline.register import FRAMES_FILE
+from spn_data.pipeline.register_source import FRAMES_FILE
 from spn_data.pipeline.videos import find_videos
 from spn_data.record import VERSION, StageRecord, read_json, write_json
 from spn_data.registration.adjustment import lens_parameters

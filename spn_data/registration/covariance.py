@@ -25,11 +25,10 @@ from spn_data.registration.adjustment import (
     SequenceState,
     cauchy_weights,
     jacobian,
-    lens_parameters,
     linearize,
     normal_equations,
 )
-from spn_data.registration.solution import FRAMES_FOR_LENS, SCALE_PX
+from spn_data.registration.solution import SCALE_PX
 
 _FRAMES_AT_ONCE = 8
 _CELL_PX = 16.0  # measurements of one such cell of a frame are not independent
@@ -54,10 +53,13 @@ def sequence_covariance(
     observations: SequenceObservations,
     point_rows: np.ndarray,
     map_covariance: MapCovariance,
+    lens: tuple[str, ...],
 ) -> SequenceCovariance:
-    """Of a sequence at its solution. point_rows : (M,) rows of the map points, -1 for own points."""
+    """Of a sequence at its solution.
+
+    point_rows : (M,) rows of the map points, -1 for own points; lens : the intrinsics that were estimated.
+    """
     n = len(state.poses)
-    lens = lens_parameters(state.camera) if n >= FRAMES_FOR_LENS else ()
     linearized = linearize(state, observations, lens)
     weights = cauchy_weights(linearized.residuals_px, SCALE_PX)
     normal = normal_equations(linearized, observations, n, len(state.own_points), weights)

@@ -31,6 +31,7 @@ class RegisterOptions:
     rate_hz: float = 2.0  # frames taken of a video, whatever they show
     map_frames: int = 12  # most similar map frames that a frame is matched with
     neighbors: int = 3  # following frames of its sequence that it is matched with
+    hold_lens: bool = False  # keep the lens that is given as it is
     start_error_px: float = 12.0  # of an inlier while the lens is being found
     max_error_px: float = 4.0  # of an inlier afterwards
     features: FeatureOptions = field(default_factory=FeatureOptions)

@@ -20,7 +20,7 @@ from spn_data.registration.options import RegisterOptions
 from spn_data.registration.tracks import Tracks
 
 SCALE_PX = 1.0  # of the Cauchy loss
-FRAMES_FOR_LENS = 3  # fewer do not tell a lens
+_FRAMES_FOR_LENS = 3  # fewer do not tell a lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
     if not len(rows):
         return solution
     state, everything = solution.least_squares(sequence)
-    lens = lens_parameters(solution.camera) if len(rows) >= FRAMES_FOR_LENS else ()
+    lens = free_lens(solution.camera, len(rows), options)
     agree = _agree(state, everything, options.max_error_px)
     for _ in range(3):
         state = adjust(state, everything.select(agree), scale_px=SCALE_PX, lens=lens)
@@ -137,6 +137,12 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
         np.where(own >= 0, np.searchsorted(used, own), -1),
         state.own_points[used],
     )
+
+
+def free_lens(camera: Camera, frames: int, options: RegisterOptions) -> tuple[str, ...]:
+    """The intrinsics that so many frames are to tell."""
+    tells = frames >= _FRAMES_FOR_LENS and not options.hold_lens
+    return lens_parameters(camera) if tells else ()
 
 
 def without(solution: Solution, refused: np.ndarray) -> Solution:

@@ -13,15 +13,14 @@ from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,
     adjust,
-    lens_parameters,
 )
 from spn_data.registration.carry import carry
 from spn_data.registration.options import RegisterOptions
 from spn_data.registration.solution import (
-    FRAMES_FOR_LENS,
     SCALE_PX,
     Sequence,
     Solution,
+    free_lens,
     refine,
 )
 
@@ -34,12 +33,13 @@ def solve(
 ) -> Solution:
     """Poses where there is any agreement with the map; whether they are good enough, `checks` says.
 
-    start : intrinsics to begin with, of which only the principal point is kept.
+    start : intrinsics to begin with, of which only the principal point is kept (all with `hold_lens`).
     """
-    camera = radial(start)
-    if not focal_is_known:
+    camera = start if options.hold_lens else radial(start)
+    if not (focal_is_known or options.hold_lens):
         camera = _guess_focal(sequence, camera, options)
-    camera = _find_lens(sequence, camera, options)
+    if not options.hold_lens:
+        camera = _find_lens(sequence, camera, options)
     found = {
         row: pose
         for row in range(len(sequence.pixels))
@@ -119,7 +119,7 @@ def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> 
             np.full(sum(map(len, frame)), -1),
         )
         state = SequenceState(_join(poses), camera, np.zeros((0, 3)))
-        lens = lens_parameters(camera) if len(poses) >= FRAMES_FOR_LENS else ()
+        lens = free_lens(camera, len(poses), options)
         camera = adjust(state, observations, scale_px=SCALE_PX, lens=lens).camera
     return camera
 

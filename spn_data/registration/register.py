@@ -1,0 +1,156 @@
+"""From images of a sequence to its labels in the frozen map, in the map's own gauge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.colmap.database import DatabaseImage, MapDatabase
+from spn_data.correspondences import FramesToMap, extract_missing, match_missing
+from spn_data.frames import Frames
+from spn_data.labels import Labels, LabelStatus, SeenPoints
+from spn_data.map_covariance import MapCovariance
+from spn_data.pairs import PairOptions, sequence_pairs
+from spn_data.pose import Poses
+from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge
+from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
+from spn_data.registration.frozen_map import FrozenMap
+from spn_data.registration.lookup import look_up_missing
+from spn_data.registration.options import RegisterOptions
+from spn_data.registration.solution import Sequence, Solution, free_lens, settle, without
+from spn_data.registration.solve import solve
+from spn_data.registration.tracks import find_tracks
+from spn_data.timing import Progress, Stopwatch
+
+DATABASE = "database.db"
+_MATCHES = ".matches"
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """solution : of the frames that were accepted; covariances : (N, 6, 6), NaN for the others; covariance :
+    None where none was accepted; seen : map points of each frame; map_sigma_px : residuals of the map itself.
+    """
+
+    solution: Solution
+    evidence: Evidence
+    verdict: Verdict
+    covariance: SequenceCovariance | None
+    covariances: np.ndarray
+    seen: SeenPoints
+    map_sigma_px: float
+
+
+def register_sequence(
+    to_match: FramesToMap,
+    folder: Path,
+    map_folder: Path,
+    options: RegisterOptions,
+    progress: Progress,
+    *,
+    workers: int,
+    stopwatch: Stopwatch,
+) -> Registered:
+    """Poses of N frames of one lens. The map's files are only read.
+
+    folder : holds the features and matches that were found before; map_folder : a model and its database.
+    """
+    names = to_match.names
+    near = sorted(
+        sequence_pairs(to_match.sequences, PairOptions(overlap=options.neighbors, far_steps=0))
+    )
+    with MapDatabase.open(folder / DATABASE) as database:
+        database.add_images(
+            [DatabaseImage(n, str(c)) for n, c in zip(names, to_match.cameras, strict=True)],
+            to_match.start_cameras,
+        )
+        with stopwatch.step("features"):
+            extract_missing(database, to_match, options.features, workers, progress)
+        with stopwatch.step("neighbours"):
+            match_missing(database, to_match, near, options.matching, workers, progress)
+        with FrozenMap.open(map_folder, map_folder / DATABASE) as frozen:
+            with stopwatch.step("map"):
+                putative = look_up_missing(
+                    names, database, frozen, folder / _MATCHES, options, workers, progress
+                )
+            scene, observations, points = frozen.scene, frozen.observations, frozen.points
+        pixels = [
+            database.read_features(name).keypoints[:, :2].astype(np.float64) for name in names
+        ]
+        pairs = {(i, j): database.read_inliers(names[i], names[j]) for i, j in near}
+    progress("poses", 0, len(names))
+    with stopwatch.step("poses"):
+        tracks = find_tracks(pairs, [len(p) for p in pixels])
+        sequence = Sequence(pixels, [putative[name] for name in names], tracks, points.xyz)
+        (start,) = to_match.start_cameras.values()
+        solution = solve(sequence, *start, options)
+        map_covariance = MapCovariance.of(scene, observations)
+        _, covariances = _covariances(sequence, solution, map_covariance, options)
+        evidence = gather_evidence(sequence, solution, covariances, pairs, options)
+        verdict = judge(solution.posed, evidence, options.checks)
+        solution = settle(sequence, without(solution, ~verdict.accepted), options)
+        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
+    progress("poses", len(names), len(names))
+    of_map = np.flatnonzero(solution.point_row >= 0)
+    seen_pixels = sequence.pixels_of(solution.frame[of_map], solution.feature[of_map])
+    seen = SeenPoints(solution.frame[of_map], points.ids[solution.point_row[of_map]], seen_pixels)
+    return Registered(
+        solution, evidence, verdict, covariance, covariances, seen, map_covariance.sigma_px
+    )
+
+
+def _covariances(
+    sequence: Sequence,
+    solution: Solution,
+    map_covariance: MapCovariance,
+    options: RegisterOptions,
+) -> tuple[SequenceCovariance | None, np.ndarray]:
+    """Of the posed frames; and (N, 6, 6) of all, NaN where there is no pose."""
+    everything = np.full((len(solution.posed), 6, 6), np.nan)
+    if not solution.posed.any():
+        return None, everything
+    state, observations = solution.least_squares(sequence)
+    covariance = sequence_covariance(
+        state,
+        observations,
+        solution.point_row,
+        map_covariance,
+        free_lens(solution.camera, len(state.poses), options),
+    )
+    everything[solution.posed] = covariance.poses
+    return covariance, everything
+
+
+def labels_of(chosen: Frames, registered: Registered) -> Labels:
+    """The frames (N), in the order in which they were registered, as labels in the map's gauge."""
+    solution, evidence = registered.solution, registered.evidence
+    accepted, covariance = registered.verdict.accepted, registered.covariance
+    n = len(chosen)
+    error_px = np.full(n, np.nan)
+    if covariance is not None:
+        squared = (covariance.residuals_px**2).sum(axis=1)
+        of_map = solution.point_row >= 0
+        count = np.bincount(solution.frame[of_map], minlength=n)
+        total = np.bincount(solution.frame[of_map], weights=squared[of_map], minlength=n)
+        error_px = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+    return Labels(
+        names=chosen.names,
+        sequences=chosen.sequences,
+        cameras=chosen.cameras,
+        sources=chosen.sources,
+        video_frame=chosen.video_frame,
+        dense=np.zeros(n, bool),
+        time_s=chosen.time_s,
+        status=np.where(accepted, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
+        reason=np.array(registered.verdict.reason, dtype=np.str_),
+        poses=Poses(
+            np.where(accepted[:, None], solution.poses.centers, np.nan),
+            np.where(accepted[:, None], solution.poses.quats_wxyz, np.nan),
+        ),
+        covariance=registered.covariances,
+        inliers=evidence.inliers,
+        coverage=evidence.coverage,
+        error_px=np.where(accepted, error_px, np.nan),
+    )
