@@ -138,6 +138,45 @@ def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
     )
 
 
+def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
+    mapped: Path, tmp_path: Path
+) -> None:
+    """A point 81 degrees off the axis, measured in the image's middle, is dropped before refinement."""
+    model = pycolmap.Reconstruction(mapped)
+    image = model.images[model.reg_image_ids()[0]]
+    # Beside the camera, where those on the other side of the scene see it.
+    beside = image.cam_from_world().inverse() * np.array([6.3, 0.0, 1.0])
+    track = pycolmap.Track()
+    for other_id in model.reg_image_ids():
+        other = model.images[other_id]
+        camera = model.cameras[other.camera_id]
+        pixel = camera.img_from_cam(other.cam_from_world() * beside)
+        if other_id == image.image_id:
+            pixel = np.array([camera.width / 2 + 20, camera.height / 2])
+        elif pixel is None or not ((pixel > 0) & (pixel < [camera.width, camera.height])).all():
+            continue
+        k = next(k for k, p in enumerate(other.points2D) if p.has_point3D())
+        model.delete_observation(other_id, k)  # makes room for another measurement
+        other.points2D[k].xy = pixel
+        track.add_element(other_id, k)
+    assert track.length() >= 3
+    model.add_point3D(beside, track, np.zeros(3, np.uint8))
+    (tmp_path / "wrong").mkdir()
+    model.write(tmp_path / "wrong")
+    done = refine(
+        tmp_path / "wrong",
+        tmp_path / "refined",
+        camera_model="RADIAL",
+        refine_principal_point=False,
+        threads=1,
+        log=tmp_path / "log",
+    )
+    assert done["dropped"] == 1
+    (before,) = read_scene(mapped).cameras.values()
+    (after,) = read_scene(tmp_path / "refined").cameras.values()
+    assert np.abs(after.opencv_distortion - before.opencv_distortion).max() < 1e-4
+
+
 @pytest.mark.parametrize("model", ["RADIAL", "OPENCV"])
 def test_an_upgraded_camera_projects_as_before(model: str) -> None:
     native = pycolmap.Camera(

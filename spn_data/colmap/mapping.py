@@ -13,6 +13,8 @@ from typing import Any
 from spn_data import child
 from spn_data.errors import FormatError
 
+_REFINEMENTS = 3  # bundle adjustments, each after wrong measurements were dropped
+
 
 @dataclass(frozen=True, kw_only=True)
 class MappingJob:
@@ -168,7 +170,7 @@ def _refine(
     source: str, target: str, camera_model: str, refine_principal_point: bool, threads: int
 ) -> None:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.model import upgrade_camera, write_native
+    from spn_data.colmap.model import drop_out_of_view, upgrade_camera, write_native
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
@@ -176,10 +178,17 @@ def _refine(
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=refine_principal_point)
     options.ceres.solver_options.num_threads = threads
     before = model.compute_mean_reprojection_error()
-    pycolmap.bundle_adjustment(model, options)
+    dropped = drop_out_of_view(model)
+    for _ in range(_REFINEMENTS):
+        pycolmap.bundle_adjustment(model, options)
+        more = drop_out_of_view(model)
+        dropped += more
+        if more == 0:
+            break
     model.update_point_3d_errors()
     write_native(model, Path(target))
-    child.send({"error_before_px": before, "error_px": model.compute_mean_reprojection_error()})
+    after = model.compute_mean_reprojection_error()
+    child.send({"error_before_px": before, "error_px": after, "dropped": dropped})
 
 
 if __name__ == "__main__":
