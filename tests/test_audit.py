@@ -116,7 +116,7 @@ def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
     found = audit.check_copies(mapping, {**evaluation, "copy": copy})
     assert found.verdict is Verdict.NOTICE
     assert found.evidence == ("copy: 25 of 25 frames",)
-    crossing = frames("crossing", 100, north_m=3.0)
+    crossing = frames("crossing", 20, north_m=3.0)
     centers = crossing.poses.centers.copy()
     centers[:2] = mapping.poses.centers[:2]
     crossing = replace(crossing, poses=Poses(centers, crossing.poses.quats_wxyz))

@@ -280,9 +280,9 @@ def test_a_sequence_may_not_be_called_like_a_group(area, evaluation, name):
 
 
 def raster() -> Labels:
-    """Eight lines of 40 m, 5 m apart: a flight in which every place has neighbours in time and space."""
+    """Eight lines of 40 m, 2 m apart: a flight in which every place has neighbours in time and space."""
     rows = [
-        line(41, north_m=5.0 * k) if k % 2 == 0 else line(41, north_m=5.0 * k)[::-1]
+        line(41, north_m=2.0 * k) if k % 2 == 0 else line(41, north_m=2.0 * k)[::-1]
         for k in range(8)
     ]
     return flight("raster", np.concatenate(rows))
@@ -308,6 +308,24 @@ def test_blocks_in_space_touch_and_keep_their_distance(evaluation):
         }
     assert reached == cells
     assert {"guard gap", "guard distance"} >= set(split.reason[split.group == LEFT_OUT])
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_a_place_apart_from_the_others_is_no_region(evaluation, seed):
+    """A frame 100 m away has no neighbours: it is never all that validates."""
+    away = flight("away", line(1) + np.array([100.0, 100.0, 0.0]))
+    mapping = Labels.concatenate([raster(), away])
+    options = SplitOptions(validation=Policy.SPACE, seed=seed)
+    counts = make_split(mapping, nothing(), evaluation, options).counts()
+    assert counts[VALIDATION] >= 0.05 * len(mapping)
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_half_of_a_flight_is_left_to_training_where_that_can_be_had(evaluation, seed):
+    """Of 7 s, a block in the middle would leave 6 of 14 frames, one at an end leaves 9."""
+    short = flight("short", line(14))
+    split = make_split(short, nothing(), evaluation, SplitOptions(seed=seed))
+    assert split.counts()[TRAIN] >= 7
 
 
 def test_a_band_of_heights_is_held_out(evaluation):
