@@ -153,12 +153,18 @@ RULES = {
             evaluation_records={
                 "medium": record(
                     "4-eval/medium",
-                    gnss={"offset_e_m": 3.0, "offset_n_m": -6.0, "scatter_h_m": 0.4},
+                    gnss={
+                        "offset_e_m": 3.0,
+                        "offset_n_m": -6.0,
+                        "offset_u_m": 0.5,
+                        "scatter_h_m": 0.4,
+                        "contradicts": True,
+                    },
                 )
             },
         ),
         Level.CAUTION,
-        "own GNSS of medium, not used for its labels, lies 6.7 m beside them",
+        "own GNSS of medium, not used for its labels, lies 6.7 m beside and +0.5 m above them",
     ),
 }
 

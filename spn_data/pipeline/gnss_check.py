@@ -8,10 +8,13 @@ import numpy as np
 
 from spn_data.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.offset import estimate_time_offset
+from spn_data.georegister.options import default_sigma_m
+from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FIXES = 5
+_CONTRADICTION = 3.0  # standard deviations of what GNSS and the map's place account for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +23,9 @@ class GnssCheck:
 
     fixes : frames with a label and a fix; time_offset_s : added to telemetry's times, 0 where the flight
     cannot tell. offset_e_m, offset_n_m, offset_u_m : medians (None: no comparable height).
-    scatter_h_m, scatter_v_m : RMSE about them. max_h_m : the largest horizontal difference from the median.
+    scatter_h_m, scatter_v_m : within which half of the frames lie about them; max_h_m : the largest.
+    sigma_h_m, sigma_v_m : of the offset, by the map's uncertainty and that of such fixes.
+    contradicts : whether the offset is more than three times that.
     """
 
     fixes: int
@@ -31,22 +36,39 @@ class GnssCheck:
     scatter_h_m: float
     scatter_v_m: float | None
     max_h_m: float
+    sigma_h_m: float
+    sigma_v_m: float | None
+    contradicts: bool
+
+    @property
+    def offset_h_m(self) -> float:
+        return float(np.hypot(self.offset_e_m, self.offset_n_m))
 
     def tell(self) -> str:
         vertical = (
             "; no height to compare"
             if self.offset_u_m is None
-            else f", {self.offset_u_m:+.2f} m vertically ({self.scatter_v_m:.2f} m)"
+            else f", {self.offset_u_m:+.2f} m vertically (half within {self.scatter_v_m:.2f} m)"
         )
-        return (
-            f"its own GNSS, not used, lies {np.hypot(self.offset_e_m, self.offset_n_m):.2f} m beside "
-            f"the labels in the middle ({self.scatter_h_m:.2f} m RMSE about that, {self.fixes} frames)"
-            + vertical
+        text = (
+            f"its own GNSS, not used, lies {self.offset_h_m:.2f} m beside the labels in the middle (half of "
+            f"{self.fixes} frames within {self.scatter_h_m:.2f} m of that)" + vertical
         )
+        if self.contradicts:
+            text += (
+                f". That is more than the map's place and GNSS account for ({self.sigma_h_m:.2f} m"
+                + ("" if self.sigma_v_m is None else f", {self.sigma_v_m:.2f} m vertically")
+                + "; 1 sigma): the map, its lens or this one is wrong, or the heights count from elsewhere"
+            )
+        return text
 
 
-def check_gnss(labels: Labels, track: Telemetry, origin: GeoOrigin) -> GnssCheck | None:
-    """Compare registered frames with telemetry; None with fewer than five fixes among them."""
+def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | None:
+    """Compare registered frames with telemetry; None with fewer than five fixes among them.
+
+    geo : how the map was put into the world.
+    """
+    origin = geo.origin
     registered = labels.select(labels.registered)
     if len(registered) < _MIN_FIXES:
         return None
@@ -68,17 +90,27 @@ def check_gnss(labels: Labels, track: Telemetry, origin: GeoOrigin) -> GnssCheck
     vertical = difference[has_height, 2]
     tells_height = len(vertical) >= _MIN_FIXES
     offset_u = float(np.median(vertical)) if tells_height else None
+    of_kind = default_sigma_m(track.kind)
+    # Fixes of one flight share their error: many are hardly better than one.
+    sigma_h = float(np.hypot(geo.uncertainty.horizontal_m, np.hypot(*of_kind[:2])))
+    sigma_v = float(np.hypot(geo.uncertainty.vertical_m, of_kind[2])) if tells_height else None
+    too_far = float(np.hypot(*middle[:2])) > _CONTRADICTION * sigma_h
+    if offset_u is not None and sigma_v is not None:
+        too_far |= abs(offset_u) > _CONTRADICTION * sigma_v
     return GnssCheck(
         fixes=int(known.sum()),
         time_offset_s=round(offset_s, 3),
         offset_e_m=round(float(middle[0]), 4),
         offset_n_m=round(float(middle[1]), 4),
         offset_u_m=None if offset_u is None else round(offset_u, 4),
-        scatter_h_m=round(float(np.sqrt((horizontal**2).mean())), 4),
+        scatter_h_m=round(float(np.median(horizontal)), 4),
         scatter_v_m=None
         if offset_u is None
-        else round(float(np.sqrt(((vertical - offset_u) ** 2).mean())), 4),
+        else round(float(np.median(np.abs(vertical - offset_u))), 4),
         max_h_m=round(float(horizontal.max()), 4),
+        sigma_h_m=round(sigma_h, 4),
+        sigma_v_m=None if sigma_v is None else round(sigma_v, 4),
+        contradicts=bool(too_far),
     )
 
 

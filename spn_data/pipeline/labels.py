@@ -78,6 +78,7 @@ def read_labelled_area(area: Area, *, mapping_covariance: bool = True) -> Labell
         str(key): scene.cameras[int(scene.camera_ids[scene.names.index(name)])]
         for key, name in _camera_samples(chosen, scene).items()
     }
+    geo = read_geo(area)
     world_from_model = read_world_from_model(area)
     evaluation, evaluation_seen = {}, {}
     for name in area.sequences(EVALUATION):
@@ -96,7 +97,7 @@ def read_labelled_area(area: Area, *, mapping_covariance: bool = True) -> Labell
     dense_labels, dense_seen = together(dense) if dense else nothing
     return LabelledArea(
         units="m" if area.has(GEO) else "model",
-        origin=read_origin(area),
+        origin=None if geo is None else geo.origin,
         points=points,
         cameras=cameras,
         mapping=mapping,
@@ -114,18 +115,15 @@ def chosen_frames(area: Area) -> Frames:
     return frames.select(frames.chosen)
 
 
-def read_origin(area: Area) -> GeoOrigin | None:
-    """None where the area is not georegistered."""
-    if not area.has(GEO):
-        return None
-    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
+def read_geo(area: Area) -> GeoFit | None:
+    """How the area was put into the world; None where it is not georegistered."""
+    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")) if area.has(GEO) else None
 
 
 def read_world_from_model(area: Area) -> Similarity:
     """From COLMAP's gauge to the frame that labels are in: the identity where there is no 3-geo."""
-    if not area.has(GEO):
-        return Similarity.identity()
-    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).world_from_model
+    geo = read_geo(area)
+    return Similarity.identity() if geo is None else geo.world_from_model
 
 
 def similarity_to_json(similarity: Similarity) -> dict[str, Any]:

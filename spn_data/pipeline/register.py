@@ -23,7 +23,7 @@ from spn_data.pipeline.labels import (
     POSES,
     REGISTRATION,
     SEEN,
-    read_origin,
+    read_geo,
     read_world_from_model,
     similarity_to_json,
 )
@@ -184,10 +184,10 @@ def _start_json(start: tuple[Camera, bool]) -> dict[str, Any]:
 
 
 def _gnss(area: Area, labels: Labels, track: Telemetry | None) -> GnssCheck | None:
-    origin = read_origin(area)
-    if origin is None or track is None or not track.has_fix.any():
+    geo = read_geo(area)
+    if geo is None or track is None or not track.has_fix.any():
         return None
-    return check_gnss(labels, track, origin)
+    return check_gnss(labels, track, geo)
 
 
 def _counts(labels: Labels, camera: Camera, gnss: GnssCheck | None) -> dict[str, Any]:

@@ -56,9 +56,6 @@ class VerdictLimits:
     max_scale_sigma: float = 0.03
     good_evaluation_share: float = 0.90  # of a sequence's frames that have a pose
     min_evaluation_share: float = 0.50
-    max_gnss_offset_m: float = (
-        5.0  # of a sequence's own GNSS to its labels, beyond the map's 2 sigma
-    )
     max_low_share: float = 0.20  # of a sequence's covered frames in the lowest stratum
     min_training_frames: int = 100
 
@@ -201,23 +198,24 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
             )
         else:
             yield Finding(Level.GOOD, text + ".")
-        yield from _own_gnss(name, data, limits)
+        yield from _own_gnss(name, data)
 
 
-def _own_gnss(name: str, data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
+def _own_gnss(name: str, data: ReportData) -> Iterator[Finding]:
     """The sequence's own fixes, which its labels were made without."""
     record = data.evaluation_records.get(name)
     gnss = record.counts.get("gnss") if record else None
-    if not gnss or data.geo is None:
+    if not gnss or not gnss["contradicts"]:
         return
-    offset_m = math.hypot(gnss["offset_e_m"], gnss["offset_n_m"])
-    if offset_m > limits.max_gnss_offset_m + 2 * data.geo.uncertainty.horizontal_m:
-        yield Finding(
-            Level.CAUTION,
-            f"The own GNSS of {name}, not used for its labels, lies {offset_m:.1f} m beside them: the "
-            "map's place or these labels may be wrong.",
-            "Compare flights and heights; see the residuals",
-        )
+    beside = f"{math.hypot(gnss['offset_e_m'], gnss['offset_n_m']):.1f} m beside"
+    if gnss["offset_u_m"] is not None:
+        beside += f" and {gnss['offset_u_m']:+.1f} m above"
+    yield Finding(
+        Level.CAUTION,
+        f"The own GNSS of {name}, not used for its labels, lies {beside} them, more than it and the "
+        "map's place account for: the map, or a lens, may be wrong.",
+        "Compare flights and heights; see the residuals",
+    )
 
 
 def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
