@@ -151,10 +151,18 @@ def normal_equations(
     frames: int,
     own_points: int,
     weights: np.ndarray,
+    damping: float = 0.0,
 ) -> NormalEquations:
+    """damping : share by which the information of every unknown is raised (Marquardt's).
+
+    Own points are damped like the others: one of little parallax would else overshoot however small the step.
+    """
     by_unknown = jacobian(linearized, observations.frame, frames, weights)
     residuals = (linearized.residuals_px * np.sqrt(weights)[:, None]).ravel()
     matrix = (by_unknown.T @ by_unknown).tocsc()
+    if damping:
+        diagonal = matrix.diagonal()
+        matrix = (matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())).tocsc()
     right = -(by_unknown.T @ residuals)
     mine = np.flatnonzero(observations.own >= 0)
     point_of = observations.own[mine]
@@ -162,6 +170,7 @@ def normal_equations(
     by_point = linearized.by_point[mine] * root[..., None]
     v = np.zeros((own_points, 3, 3))
     np.add.at(v, point_of, by_point.transpose(0, 2, 1) @ by_point)
+    v += damping * v * np.eye(3)
     v += 1e-12 * np.eye(3) * (1 + np.trace(v, axis1=1, axis2=2)[:, None, None])
     inverse = np.linalg.inv(v)
     point_right = np.zeros((own_points, 3))
@@ -188,17 +197,17 @@ def adjust(
     scale_px: float,
     lens: tuple[str, ...],
 ) -> SequenceState:
-    """The state of least robust cost (Cauchy, of this scale), by Levenberg's method from a good start."""
+    """The state of least robust cost (Cauchy, of this scale), from a good start (Levenberg, Marquardt)."""
     damping = 1e-6
     linearized = linearize(state, observations, lens)
     cost = _cost(linearized, scale_px)
     for _ in range(_MAX_STEPS):
         weights = cauchy_weights(linearized.residuals_px, scale_px)
-        normal = normal_equations(
-            linearized, observations, len(state.poses), len(state.own_points), weights
-        )
         while True:
-            candidate = _step(state, normal, damping, lens)
+            normal = normal_equations(
+                linearized, observations, len(state.poses), len(state.own_points), weights, damping
+            )
+            candidate = _step(state, normal, lens)
             ahead = linearize(candidate, observations, lens)
             new_cost = _cost(ahead, scale_px)
             if new_cost <= cost or damping > 1e6:
@@ -224,12 +233,8 @@ def _cost(linearized: Linearized, scale_px: float) -> float:
     return float(np.log1p(squared / scale_px**2).sum())
 
 
-def _step(
-    state: SequenceState, normal: NormalEquations, damping: float, lens: tuple[str, ...]
-) -> SequenceState:
-    diagonal = normal.matrix.diagonal()
-    damped = normal.matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())
-    change = splu(damped.tocsc()).solve(normal.right)
+def _step(state: SequenceState, normal: NormalEquations, lens: tuple[str, ...]) -> SequenceState:
+    change = splu(normal.matrix).solve(normal.right)
     n = len(state.poses)
     moves = change[: POSE * n].reshape(n, POSE)
     poses = Poses.from_rotations(
