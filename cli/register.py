@@ -104,6 +104,7 @@ def run(
     unit = "m" if area.has(GEO) else "units of the model"
     with area.locked(), show.Live(unit) as live:
         names = [name] if name else None
+        before = {s: area.record(s) for s in area.stages()}
         if video is not None:
             wanted = RegisterStageOptions(
                 register=RegisterOptions(
@@ -116,17 +117,16 @@ def run(
             record = stage(
                 area, video, name, wanted, live.progress, workers=workers, overwrite=overwrite
             )
-            live.stage(record)
+            live.made(record, before)
             names = [record.stage.removeprefix(f"{EVALUATION}/")]
         if all_frames:
             for sequence in names or sequences_with_video(area):
-                live.stage(
-                    densify(
-                        area,
-                        sequence,
-                        live.progress,
-                        workers=workers,
-                        video=video_folder or video,
-                        overwrite=overwrite,
-                    )
+                between = densify(
+                    area,
+                    sequence,
+                    live.progress,
+                    workers=workers,
+                    video=video_folder or video,
+                    overwrite=overwrite,
                 )
+                live.made(between, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -89,6 +90,10 @@ class Live:
         else:
             tables = {FRAMES: frames, MODEL: model, GEO: georegistration, DENSE: show_labels.dense}
             tables[group](record)
+
+    def made(self, record: StageRecord, before: Mapping[str, StageRecord]) -> None:
+        """Show a stage, or that it is one of those that stood before."""
+        (self.unchanged if record == before.get(record.stage) else self.stage)(record)
 
     def unchanged(self, record: StageRecord) -> None:
         self._close()

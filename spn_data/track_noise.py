@@ -21,6 +21,7 @@ from spn_data.bundle_jacobians import Bundle
 # Much more than any track sees: what a drift does over a track's views grows with their change. It is not
 # estimated, as only its ratio to the variance matters then.
 _LENGTH = 3.0
+_RIDGE = 1e-9  # of a point whose rays are parallel: its depth explains no residual
 _FITTED_TRACKS = 1000
 _TRACK_LENGTHS = (4, 30)  # of tracks that are fitted: shorter ones tell nothing of drift
 
@@ -94,13 +95,15 @@ def own_errors(bundle: Bundle, noise: TrackNoise | None) -> np.ndarray:
             tracks.whitened,
             np.einsum("tmn,tnki->tmki", correlations, tracks.whitened, optimize=True),
         )
+        # Zero but for a point whose rays are parallel: its depth stays as open as it is.
+        open_ = np.eye(3) - np.einsum("tnki,tnkj->tij", tracks.whitened, tracks.whitened)
         misfit, _ = _misfit(tracks, correlations)
         freedom = 2 * tracks.views.shape[1] - 3
         # The variance of this track that its residuals and those of all others tell.
         variance = (noise.tails * noise.sigma_px**2 + misfit) / max(
             noise.tails + freedom - 2, noise.tails / 2
         )
-        own[tracks.point] = variance[:, None, None] * shape
+        own[tracks.point] = variance[:, None, None] * (shape + open_)
     return own
 
 
@@ -134,6 +137,8 @@ def _misfit(tracks: _Tracks, correlations: np.ndarray) -> tuple[np.ndarray, np.n
     scaled = np.linalg.solve(root, values.reshape(count, n, 8)).reshape(count, 2 * n, 4)
     products = np.swapaxes(scaled, 1, 2) @ scaled
     by_point, pull = products[:, :3, :3], products[:, :3, 3]
+    trace = np.trace(by_point, axis1=1, axis2=2)
+    by_point = by_point + (_RIDGE * trace)[:, None, None] * np.eye(3)
     misfit = products[:, 3, 3] - np.einsum(
         "ti,ti->t", pull, np.linalg.solve(by_point, pull[..., None])[..., 0]
     )

@@ -75,7 +75,7 @@ def densify(
     stopwatch = Stopwatch()
     before = map_hash(area.folder(MODEL))
     videos = find_videos(area, sequence, video)
-    labelled = read_labelled_area(area, mapping_covariance=False)
+    labelled = read_labelled_area(area, mapping_covariance=False, dense=False)
     known, seen_by_known = _known(labelled, sequence)
     with stopwatch.step("tracking"):
         labels, seen = dense_labels(

@@ -58,16 +58,19 @@ def map_folder(area: Area) -> Path:
     return area.folder(GEO if area.has(GEO) else MODEL)
 
 
-def read_labelled_area(area: Area, *, mapping_covariance: bool = True) -> LabelledArea:
+def read_labelled_area(
+    area: Area, *, mapping_covariance: bool = True, dense: bool = True
+) -> LabelledArea:
     """All labels, in metres where the area is georegistered.
 
     mapping_covariance : false leaves the covariances of mapping frames unknown (NaN), which is quicker.
+    dense : false leaves out the frames between, and does not mind whether their stages are stale.
 
     Raises StageError for a stage that is missing or stale, FormatError or InputError for a damaged file.
     """
     area.upstream_of(GEO)  # frames and model stand and fit each other
     for stage in area.stages():
-        if stage.partition("/")[0] in (GEO, EVALUATION, DENSE):
+        if stage.partition("/")[0] in (GEO, EVALUATION, *([DENSE] if dense else [])):
             area.check_fresh(stage)
     scene, observations, points = read_map(map_folder(area))
     chosen = chosen_frames(area)
@@ -80,21 +83,22 @@ def read_labelled_area(area: Area, *, mapping_covariance: bool = True) -> Labell
     }
     geo = read_geo(area)
     world_from_model = read_world_from_model(area)
+    between = area.sequences(DENSE) if dense else ()
     evaluation, evaluation_seen = {}, {}
     for name in area.sequences(EVALUATION):
         stage = f"{EVALUATION}/{name}"
         parts = [_read_stage(area, stage, world_from_model)]
-        if name in area.sequences(DENSE):
+        if name in between:
             parts.append(_read_stage(area, f"{DENSE}/{name}", world_from_model))
         evaluation[name], evaluation_seen[name] = together(parts)
         cameras[name] = _read_camera(area.folder(stage) / CAMERA)
-    dense = [
+    of_mapping = [
         _read_stage(area, f"{DENSE}/{name}", world_from_model)
-        for name in area.sequences(DENSE)
+        for name in between
         if name not in evaluation
     ]
     nothing = (mapping.select(np.zeros(0, np.int64)), mapping_seen.select(np.zeros(0, np.int64)))
-    dense_labels, dense_seen = together(dense) if dense else nothing
+    dense_labels, dense_seen = together(of_mapping) if of_mapping else nothing
     return LabelledArea(
         units="m" if area.has(GEO) else "model",
         origin=None if geo is None else geo.origin,
