@@ -17,13 +17,19 @@ $(VENV)/readers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[readers]'
 	touch $@
 
-# Simulated flights with exact truth, from video to a georeferenced model.
+# Simulated flights with exact truth, from video to a data set to train on.
 demo: $(VENV)/installed
 	rm -rf $(DEMO)
 	$(BIN)/spn-data simulate $(DEMO)/flights --preset demo --seed 1
 	$(BIN)/spn-data reconstruct $(DEMO)/flights/mapping --area $(DEMO)/area --fov 72
+	$(BIN)/spn-data register $(DEMO)/flights/evaluation/medium.mp4 --name medium --all-frames --area $(DEMO)/area
+	$(BIN)/spn-data register $(DEMO)/flights/evaluation/low.mp4 --name low --all-frames --area $(DEMO)/area
+	$(BIN)/spn-data register --all-frames --area $(DEMO)/area
+	$(BIN)/spn-data coverage --area $(DEMO)/area
+	$(BIN)/spn-data split --area $(DEMO)/area
 	$(BIN)/spn-data status --area $(DEMO)/area
 	$(BIN)/python benchmarks/truth.py $(DEMO)/area $(DEMO)/flights
+	$(BIN)/python benchmarks/labels.py $(DEMO)/area $(DEMO)/flights
 
 test: $(VENV)/readers
 	$(BIN)/python -m pytest -m 'not slow'

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options
+from cli import console, options, page
 
 if TYPE_CHECKING:
     from spn_data.coverage_table import Coverage
@@ -108,8 +108,10 @@ def coverage(
     if fly_again is not None:
         check_new(fly_again, overwrite=overwrite)
     area = options.open_area(area_folder)
-    with area.locked(), console.progress() as progress:
-        found = cover_area(area, wanted, progress, waypoints=waypoints)
+    with area.locked():
+        with console.progress() as progress:
+            found = cover_area(area, wanted, progress, waypoints=waypoints)
+        page.refresh(area)
     for name, each in found.by_name.items():
         _show(name, each, found)
     for note in found.notes:

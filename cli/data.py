@@ -101,12 +101,15 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
     Example:
         spn-data georegister --area fields/north --gnss-sigma 0.03 0.05 --overwrite
     """
-    from cli import show
+    from cli import page, show
     from spn_data.pipeline.geo import georegister as stage
 
     area = options.open_area(area_folder)
-    with area.locked(), show.Live() as live:
-        live.stage(stage(area, options.geo_options(**chosen), live.progress, overwrite=overwrite))
+    with area.locked():
+        with show.Live() as live:
+            wanted = options.geo_options(**chosen)
+            live.stage(stage(area, wanted, live.progress, overwrite=overwrite))
+        page.refresh(area)
 
 
 main.add_command(register)

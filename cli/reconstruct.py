@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from cli import options, show
+from cli import options, page, show
 from spn_data.features import FeatureOptions
 from spn_data.pipeline.frames import FramesOptions
 from spn_data.pipeline.geo import GeoStageOptions
@@ -54,9 +54,11 @@ def run(
         geo=None if given == GeoStageOptions() else given,
     )
     area = options.open_area(area_folder)
-    with area.locked(), show.Live() as live:
-        if add:
-            extend(area, list(inputs), wanted, live, overwrite=overwrite)
-        else:
-            reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
-    show.verdict(area)
+    with area.locked():
+        with show.Live() as live:
+            if add:
+                extend(area, list(inputs), wanted, live, overwrite=overwrite)
+            else:
+                reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
+        show.verdict(area)
+        page.refresh(area)

@@ -88,7 +88,7 @@ def run(
 ) -> None:
     import os
 
-    from cli import show
+    from cli import page, show
     from spn_data.area import EVALUATION, GEO
     from spn_data.pipeline.dense import densify, sequences_with_video
     from spn_data.pipeline.register import RegisterStageOptions
@@ -102,31 +102,33 @@ def run(
     workers = threads or os.cpu_count() or 1
     area = options.open_area(area_folder)
     unit = "m" if area.has(GEO) else "units of the model"
-    with area.locked(), show.Live(unit) as live:
-        names = [name] if name else None
-        before = {s: area.record(s) for s in area.stages()}
-        if video is not None:
-            wanted = RegisterStageOptions(
-                register=RegisterOptions(
-                    rate_hz=rate_hz, map_frames=map_frames, hold_lens=fixed_lens, seed=seed
-                ),
-                fov_deg=fov_deg,
-                camera_file=camera_file,
-                any_telemetry=any_telemetry,
-            )
-            record = stage(
-                area, video, name, wanted, live.progress, workers=workers, overwrite=overwrite
-            )
-            live.made(record, before)
-            names = [record.stage.removeprefix(f"{EVALUATION}/")]
-        if all_frames:
-            for sequence in names or sequences_with_video(area):
-                between = densify(
-                    area,
-                    sequence,
-                    live.progress,
-                    workers=workers,
-                    video=video_folder or video,
-                    overwrite=overwrite,
+    with area.locked():
+        with show.Live(unit) as live:
+            names = [name] if name else None
+            before = {s: area.record(s) for s in area.stages()}
+            if video is not None:
+                wanted = RegisterStageOptions(
+                    register=RegisterOptions(
+                        rate_hz=rate_hz, map_frames=map_frames, hold_lens=fixed_lens, seed=seed
+                    ),
+                    fov_deg=fov_deg,
+                    camera_file=camera_file,
+                    any_telemetry=any_telemetry,
                 )
-                live.made(between, before)
+                record = stage(
+                    area, video, name, wanted, live.progress, workers=workers, overwrite=overwrite
+                )
+                live.made(record, before)
+                names = [record.stage.removeprefix(f"{EVALUATION}/")]
+            if all_frames:
+                for sequence in names or sequences_with_video(area):
+                    between = densify(
+                        area,
+                        sequence,
+                        live.progress,
+                        workers=workers,
+                        video=video_folder or video,
+                        overwrite=overwrite,
+                    )
+                    live.made(between, before)
+        page.refresh(area)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cli import console, options
+from cli import options, page
 
 
 @click.command()
@@ -39,9 +39,4 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
         path, verdict = write_report(
             area, ReportOptions(max_points=max_points, max_frames=max_frames)
         )
-    console.out.print(f"{path} is written; any browser shows it, without a network.")
-    console.out.print(f"{verdict.headline}.")
-    if step := verdict.next_step:
-        console.out.print(
-            f"Next: {step.do}{': ' if step.do and step.command else ''}{step.command}"
-        )
+    page.tell(path, verdict)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options
+from cli import console, options, page
 from cli.audit import show_findings
 
 if TYPE_CHECKING:
@@ -135,9 +135,10 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
                 video_folder=video_folder,
                 overwrite=overwrite,
             )
-    if record == before:
-        console.out.print(f"{SPLIT}: unchanged since {record.finished}.")
-    _show(record)
+        if record == before:
+            console.out.print(f"{SPLIT}: unchanged since {record.finished}.")
+        _show(record)
+        page.refresh(area)
     show_findings(read_audit(area.folder(SPLIT) / AUDIT))
 
 

@@ -18,6 +18,7 @@ from spn_data.georegister.offset import TimeOffset, estimate_time_offset
 from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.georegister.register import georegister as fit
 from spn_data.georegister.result import GeoFit
+from spn_data.pipeline.move import move_labels
 from spn_data.record import StageRecord, write_json
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
@@ -68,18 +69,19 @@ def read_tracks(area: Area) -> dict[str, Telemetry]:
 def georegister(
     area: Area, options: GeoStageOptions, progress: Progress, *, overwrite: bool = False
 ) -> StageRecord:
-    """Put the area's model into East-North-Up metres.
+    """Put the area's model, and all labels in it, into East-North-Up metres.
 
     Raises GeometryError where telemetry does not determine the answer.
     """
-    work = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
-    if isinstance(work, StageRecord):
-        return work
-    try:
-        return _georegister(area, work, options, progress)
-    except GeometryError:
-        work.discard()  # nothing in it is worth going on from
-        raise
+    record = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
+    if isinstance(record, StageWork):
+        try:
+            record = _georegister(area, record, options, progress)
+        except GeometryError:
+            record.discard()  # nothing in it is worth going on from
+            raise
+    move_labels(area)  # also those that an interrupted call has left behind
+    return record
 
 
 def _georegister(

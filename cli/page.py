@@ -1,0 +1,34 @@
+"""The area's page, kept up to date by every command that changes what it shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cli import console
+from spn_data.area import Area
+from spn_data.errors import SpnError
+
+if TYPE_CHECKING:
+    from spn_data.report.verdict import Verdict
+
+
+def refresh(area: Area) -> None:
+    """Write report.html. What a command has made stands, whatever becomes of the page."""
+    from spn_data.pipeline.report import write_report
+
+    try:
+        path, verdict = write_report(area)
+    except SpnError as error:
+        console.note(f"report.html could not be written: {error}")
+        return
+    tell(path, verdict)
+
+
+def tell(path: Path, verdict: Verdict) -> None:
+    """The verdict, and what to do next."""
+    console.out.print(f"{verdict.headline}: see {path}.")
+    if step := verdict.next_step:
+        console.out.print(
+            f"Next: {step.do}{': ' if step.do and step.command else ''}{step.command}"
+        )
