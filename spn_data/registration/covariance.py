@@ -88,8 +88,8 @@ def sequence_covariance(
         ]
         of_map = map_covariance.functional_covariances(functionals)
         for k, block in enumerate(some):
-            noise = sigma_px**2 * effect * solved[block, ends[k] : ends[k + 1]]
-            found.append(0.5 * (noise + noise.T) + of_map[k])
+            both = sigma_px**2 * effect * solved[block, ends[k] : ends[k + 1]] + of_map[k]
+            found.append(0.5 * (both + both.T))
     poses[:] = found[:n]
     return SequenceCovariance(poses, found[n], lens, sigma_px, effect, linearized.residuals_px)
 

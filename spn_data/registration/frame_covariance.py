@@ -63,7 +63,8 @@ def frame_covariances(
             functionals.append(functional)
         of_map = map_covariance.functional_covariances(functionals)
         for k, own, through in zip(some, noise, of_map, strict=True):
-            covariance[k] = 0.5 * (own + own.T) + through
+            both = own + through
+            covariance[k] = 0.5 * (both + both.T)
     return covariance
 
 
