@@ -339,6 +339,29 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
     assert np.allclose(some, covariance.pose_covariances()[[7, 2]], rtol=1e-9)
 
 
+def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> None:
+    """Seen from two frames in one place, its depth is unknown, and poses stay as sure as they were."""
+    rng = np.random.default_rng(10)
+    whole = small()
+    made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
+    scene, seen = made.scene, made.seen
+    point, frames = 17, np.flatnonzero(seen.point_idx == 17)
+    drop = np.ones(len(seen.point_idx), dtype=bool)
+    drop[frames[2:]] = False
+    kept = Observations(
+        seen.image_idx[drop], seen.point_idx[drop], seen.pixels[drop], seen.residuals_px[drop]
+    )
+    far = scene.points.copy()
+    first = int(seen.image_idx[frames[0]])
+    far[point] += 1e7 * (far[point] - scene.poses.centers[first])
+    covariance = MapCovariance.of(replace(scene, points=far), kept)
+    toward = Functional(np.array([point]), (far[point] / np.linalg.norm(far[point]))[None, None])
+    assert covariance.functional_covariance(toward)[0, 0] > 1e6
+    before = MapCovariance.of(scene, seen, INDEPENDENT).pose_covariances()
+    after = MapCovariance.of(replace(scene, points=far), kept, INDEPENDENT).pose_covariances()
+    assert np.allclose(after, before, rtol=0, atol=0.1 * before.max())
+
+
 def test_a_map_in_two_pieces_is_refused() -> None:
     """Two halves that share no point have two gauges, and no covariance between them."""
     whole = small(12, 300, 6)
