@@ -35,7 +35,7 @@ class DenseOptions:
     max_error_px: float = 2.0  # of an inlier
     min_inliers: int = 30
     min_inlier_ratio: float = 0.5  # of the points that were followed
-    min_coverage: float = 0.10  # share of the image's cells that hold an inlier
+    min_coverage: float = 0.06  # share of the image's cells that hold an inlier
     max_sigma: float = 0.005  # standard deviation of the position from these points alone
     max_sigma_deg: float = 0.25  # of the rotation
     max_split: float = 0.0125  # between the positions by either labelled frame's points alone

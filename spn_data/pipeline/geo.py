@@ -73,12 +73,14 @@ def georegister(
 
     Raises GeometryError where telemetry does not determine the answer.
     """
-    record = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
-    if isinstance(record, StageWork):
+    begun = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
+    if isinstance(begun, StageRecord):
+        record = begun
+    else:
         try:
-            record = _georegister(area, record, options, progress)
+            record = _georegister(area, begun, options, progress)
         except GeometryError:
-            record.discard()  # nothing in it is worth going on from
+            begun.discard()  # nothing in it is worth going on from
             raise
     move_labels(area)  # also those that an interrupted call has left behind
     return record
