@@ -62,8 +62,12 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
 class _FreshStages(Area):
     """The same area as if it did not hold its stale stages."""
 
+    def __init__(self, area: Area):
+        self._fresh = {stage for stage in area.stages() if area.stale_because(stage) is None}
+        super().__init__(area.root)
+
     def has(self, stage: str) -> bool:
-        return super().has(stage) and self.stale_because(stage) is None
+        return stage in self._fresh
 
     def sequences(self, group: str) -> tuple[str, ...]:
         return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
@@ -77,7 +81,7 @@ def report_data(area: Area) -> ReportData:
         StageFacts(area.record(stage), area.stale_because(stage), command_of(stage))
         for stage in area.stages()
     )
-    fresh = _FreshStages(area.root)
+    fresh = _FreshStages(area)
     labelled = read_labelled_area(fresh) if fresh.has(MODEL) else None
     geo, residuals = None, {}
     if fresh.has(GEO):
