@@ -3,187 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.dense import dense_labels, drop_jumps
-from spn_data.dense_segments import SequenceToLabel, read_segments
-from spn_data.dense_tracking import (
-    Anchor,
-    DenseOptions,
-    Segment,
-    TrackedFrame,
-    follow,
-    spread,
-    track_segment,
-)
-from spn_data.frames import Frames, FrameStatus
-from spn_data.labels import Labels, LabelStatus, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.dense_segments import read_segments
+from spn_data.dense_tracking import DenseOptions, TrackedFrame, follow, spread, track_segment
+from spn_data.frames import FrameStatus
 from spn_data.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.pose_fit import fit_pose
-from spn_data.simulate.video_out import write_video
+from tests.dense_world import CAMERA, LABELLED, TEXTURE, N, World, visible
 
-CAMERA = Camera.from_horizontal_fov(480, 270, 80, (-0.08, 0.02))
 OPTIONS = DenseOptions()
-N = 24
-LABELLED = (3, 9, 15, 20)
-WALL_NORTH_M = 15.0
-TEXELS_PER_M = 24
-
-
-def path() -> Poses:
-    """10 fps past a wall 11 m away, 4 m above the ground, turning and nodding; not at constant velocity."""
-    t = np.arange(N) / 10
-    centers = np.stack([-2 + 1.6 * t + 0.3 * t**2, 4 - 0.5 * t, 4 + 0.4 * np.sin(2 * t)], axis=1)
-    angles = np.stack([-8 + 6 * t + 3 * t**2, -14 + 3 * np.sin(2 * t), np.sin(3 * t)], axis=1)
-    return Poses.from_rotations(centers, rotations_from_angles(angles))
-
-
-def texture() -> np.ndarray:
-    """Blobs of several sizes, which do not repeat."""
-    rng = np.random.default_rng(5)
-    image = np.zeros((1536, 1536), np.float32)
-    for size in (1, 3, 9):
-        noise = cv2.GaussianBlur(rng.standard_normal(image.shape).astype(np.float32), (0, 0), size)
-        image += noise / noise.std()
-    return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
-
-
-TEXTURE = texture()
-
-
-def surfaces(rays: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Where rays (K, 3) from a centre meet the ground (up 0) or the wall (north 15 m)."""
-    with np.errstate(divide="ignore"):
-        to_ground = np.where(rays[:, 2] < 0, -center[2] / rays[:, 2], np.inf)
-        to_wall = np.where(rays[:, 1] > 0, (WALL_NORTH_M - center[1]) / rays[:, 1], np.inf)
-    return center + rays * np.minimum(to_ground, to_wall)[:, None]
-
-
-def rays_of(pixels: np.ndarray, pose: Poses) -> np.ndarray:
-    xy = CAMERA.unproject(pixels)
-    return np.column_stack([xy, np.ones(len(xy))]) @ pose.rotations[0]
-
-
-def render(pose: Poses) -> np.ndarray:
-    """Grey image (270, 480)."""
-    x, y = np.meshgrid(np.arange(480) + 0.5, np.arange(270) + 0.5)
-    hit = surfaces(rays_of(np.column_stack([x.ravel(), y.ravel()]), pose), pose.centers[0])
-    # The ground goes on behind the wall's foot, so that the texture has no seam there.
-    along = np.where(hit[:, 2] > 1e-9, WALL_NORTH_M + hit[:, 2], hit[:, 1])
-    u, v = (hit[:, 0] + 30) * TEXELS_PER_M, along * TEXELS_PER_M
-    maps = [m.reshape(270, 480).astype(np.float32) for m in (u, v)]
-    return cv2.remap(TEXTURE, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-
-
-def map_points(poses: Poses) -> MapPoints:
-    """What a grid of pixels of the labelled frames sees."""
-    x, y = np.meshgrid(np.arange(12, 480, 24.0), np.arange(12, 270, 24.0))
-    pixels = np.column_stack([x.ravel(), y.ravel()])
-    xyz = np.concatenate(
-        [surfaces(rays_of(pixels, poses[k : k + 1]), poses.centers[k]) for k in LABELLED]
-    )
-    xyz = xyz[np.abs(xyz[:, 0]) < 28]
-    n = len(xyz)
-    return MapPoints(np.arange(10, 10 + n), xyz, np.zeros((n, 3), np.uint8), np.full(n, 3))
-
-
-def visible(points: MapPoints, pose: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """(ids, pixels) of the points inside the image."""
-    pixels = CAMERA.project((points.xyz - pose.centers[0]) @ pose.rotations[0].T)
-    inside = np.all((pixels > 12) & (pixels < [468, 258]), axis=1)
-    return points.ids[inside], pixels[inside]
-
-
-def table(names: list[str], sources: list[str], video_frame: list[int]) -> Frames:
-    n = len(names)
-    nan = np.full(n, np.nan)
-    return Frames(
-        names=np.array(names),
-        sequences=np.array(["f"] * n),
-        cameras=np.array(["f"] * n),
-        sources=np.array(sources),
-        video_frame=np.array(video_frame),
-        time_s=np.arange(n) / 10,
-        status=np.array([FrameStatus.SKIPPED.value] * n, dtype="<U10"),
-        reason=np.array([""] * n, dtype="<U40"),
-        sharpness=nan,
-        motion_px=nan,
-        width=np.full(n, 480),
-        height=np.full(n, 270),
-        lat_lon_deg=np.full((n, 2), np.nan),
-        rel_alt_m=nan,
-        abs_alt_m=nan,
-        sigma_m=np.full((n, 3), np.nan),
-        gimbal_deg=np.full((n, 3), np.nan),
-    )
-
-
-def labels_of(frames: Frames, rows: tuple[int, ...], poses: Poses) -> Labels:
-    n = len(rows)
-    chosen = frames.select(np.array(rows))
-    return Labels(
-        names=chosen.names,
-        sequences=chosen.sequences,
-        cameras=chosen.cameras,
-        sources=chosen.sources,
-        video_frame=chosen.video_frame,
-        dense=np.zeros(n, bool),
-        time_s=chosen.time_s,
-        status=np.array([LabelStatus.REGISTERED.value] * n),
-        reason=np.array([""] * n),
-        poses=poses[np.array(rows)],
-        covariance=np.full((n, 6, 6), np.nan),
-        inliers=np.full(n, 100),
-        coverage=np.ones(n),
-        error_px=np.ones(n),
-    )
-
-
-class World:
-    """A flight in two files, four of its frames labelled."""
-
-    def __init__(self, folder: Path) -> None:
-        self.poses = path()
-        self.grays = [render(self.poses[k : k + 1]) for k in range(N)]
-        half = N // 2
-        self.videos = [folder / "a.mp4", folder / "b.mp4"]
-        for video, images in zip(self.videos, (self.grays[:half], self.grays[half:]), strict=True):
-            rgb = (np.repeat(g[:, :, None], 3, axis=2) for g in images)
-            write_video(video, rgb, width=480, height=270, fps=10, crf=16)
-        self.frames = table(
-            [f"f/{k:06d}.jpg" for k in range(N)],
-            [self.videos[k // half].name for k in range(N)],
-            [k % half for k in range(N)],
-        )
-        self.points = map_points(self.poses)
-        self.labelled = labels_of(self.frames, LABELLED, self.poses)
-        views = [visible(self.points, self.poses[k : k + 1]) for k in LABELLED]
-        self.seen = SeenPoints(
-            np.repeat(np.arange(len(LABELLED)), [len(ids) for ids, _ in views]),
-            np.concatenate([ids for ids, _ in views]),
-            np.concatenate([pixels for _, pixels in views]),
-        )
-
-    @property
-    def sequence(self) -> SequenceToLabel:
-        return SequenceToLabel(self.frames, self.labelled, self.seen, {"f": CAMERA}, self.points)
-
-    def anchor(self, k: int) -> Anchor:
-        ids, pixels = self.seen.of_frame(LABELLED.index(k))
-        xyz = self.points.xyz[self.points.rows_of(ids)]
-        return Anchor(k / 10, self.grays[k], self.poses[k : k + 1], ids, xyz, pixels)
-
-    def segment(self, first: int, last: int) -> Segment:
-        """The frames between two labelled ones."""
-        rows = np.arange(first + 1, last)
-        anchors = [self.anchor(first), self.anchor(last)]
-        return Segment(rows, rows / 10, [self.grays[k] for k in rows], CAMERA, anchors)
 
 
 @pytest.fixture(scope="module")
@@ -234,23 +67,46 @@ def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
     assert labels.coverage.min() > 0.7
 
 
-def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
-    """An image moved by a known fraction, begun 12 pixels off; points that leave it are not found."""
-    moved = cv2.warpAffine(
-        TEXTURE[:400, :400],
-        np.array([[1, 0, 3.3], [0, 1, -2.6]]),
-        (400, 400),
-        flags=cv2.INTER_CUBIC,
+def test_frames_off_a_steady_motion_are_dropped_from_the_labels(world: World) -> None:
+    """Nothing may turn faster or slower here, which the flight does; two workers give the same poses."""
+    options = replace(OPTIONS, max_jump_deg=0.02, max_turn_deg_s2=1e-6)
+    labels, seen = dense_labels(
+        world.videos,
+        world.frames,
+        world.labelled,
+        world.seen,
+        {"f": CAMERA},
+        world.points,
+        options,
+        workers=2,
     )
+    dropped = ~labels.registered
+    assert 3 <= dropped.sum() < 20
+    assert set(labels.reason[dropped]) == {"it lies off the motion of the frames before and after"}
+    assert labels.inliers[dropped].max() == 0
+    assert not np.isin(seen.frame_idx, np.flatnonzero(dropped)).any()
+
+
+def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
+    """An image moved by a known fraction, begun 12 pixels off; those that leave it or are hidden are lost."""
+    before = TEXTURE[:400, :400]
+    moved = cv2.warpAffine(
+        before, np.array([[1, 0, 3.3], [0, 1, -2.6]]), (400, 400), flags=cv2.INTER_CUBIC
+    )
+    hidden = np.random.default_rng(3).integers(0, 255, (120, 120)).astype(np.uint8)
+    moved[140:260, 140:260] = cv2.GaussianBlur(hidden, (0, 0), 2)
     x, y = np.meshgrid(np.arange(40.5, 360, 40), np.arange(40.5, 360, 40))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     pixels[0] = (398.0, 200.0)
-    there, found = follow(
-        TEXTURE[:400, :400], moved, pixels, pixels + np.array([9.0, 8.0]), 3, OPTIONS
-    )
+    there, found = follow(before, moved, pixels, pixels + np.array([9.0, 8.0]), 3, OPTIONS)
+    behind = np.all((pixels > 150) & (pixels < 250), axis=1)
+    clear = np.any((pixels < 110) | (pixels > 290), axis=1)
+    assert behind.sum() == 9
+    assert not found[behind].any()
     assert not found[0]
-    assert found[1:].mean() > 0.9
-    error = there[found] - pixels[found] - [3.3, -2.6]
+    assert found[clear].mean() > 0.95
+    right = found & clear
+    error = there[right] - pixels[right] - [3.3, -2.6]
     assert np.abs(error).max() < 0.1
 
 
@@ -337,7 +193,11 @@ def test_a_pose_off_the_motion_of_its_neighbours_fails_and_they_stay(world: Worl
 def test_segments_lie_between_labelled_frames_and_hold_both(world: World) -> None:
     """The frames before the first one wait for the second; those after the last have the last two."""
     reasons: dict[int, str] = {}
-    segments = list(read_segments(world.sequence, world.videos, OPTIONS, reasons))
+    lengths = np.random.default_rng(4).integers(2, 40, len(world.points))
+    sequence = replace(world.sequence, points=replace(world.points, track_lengths=lengths))
+    segments = list(read_segments(sequence, world.videos, OPTIONS, reasons))
+    of_first = lengths[world.points.rows_of(segments[0].anchors[0].point_ids)]
+    assert (np.diff(of_first) <= 0).all()  # the points that most frames see are followed
     assert [s.rows.tolist() for s in segments] == [
         [0, 1, 2],
         [4, 5, 6, 7, 8],
