@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spn_data.map_points import MapPoints
 from spn_data.pose import pose_errors
 from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge
 from spn_data.registration.options import CheckOptions, RegisterOptions
-from spn_data.registration.solution import Sequence, Solution
+from spn_data.registration.register import accept
+from spn_data.registration.solution import Sequence, Solution, settle
 from spn_data.registration.solve import solve
 from tests.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
 
@@ -220,3 +222,62 @@ def test_random_matches_give_no_label() -> None:
     verdict = judge(solution.posed, found, CheckOptions())
     assert not verdict.accepted.any()
     assert all(verdict.reason)
+
+
+class _Perfect:
+    """A map without errors."""
+
+    sigma_px = 0.3
+
+    def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
+        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
+
+
+def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyped-def]
+    sequence = made.sequence(putative)
+    solution = solve(sequence, LENS, True, OPTIONS)
+    points = MapPoints(
+        np.arange(100, 100 + len(made.points)),
+        made.points,
+        np.zeros((len(made.points), 3), np.uint8),
+        np.full(len(made.points), 5),
+    )
+    return accept(sequence, solution, made.pairs, _Perfect(), points, OPTIONS)  # type: ignore[arg-type]
+
+
+def test_what_failed_pulls_at_nothing_that_stands() -> None:
+    """Two frames at the wrong window leave the least squares: the rest is as if they had not been there."""
+    made = flight(10)
+    found = accepted(made, made.matched({3: 1, 7: -1}))
+    stands = [k not in (3, 7) for k in range(10)]
+    assert found.solution.posed.tolist() == stands
+    assert found.reason[3].startswith("ambiguous: ")
+    assert found.inliers[3] > 50, "what is told of a frame is what held when it failed"
+    error_m = pose_errors(found.solution.poses[np.array(stands)], made.poses[np.array(stands)])[0]
+    assert error_m.max() < 0.05
+    assert np.isnan(found.solution.poses.centers[[3, 7]]).all()
+    assert np.isnan(found.covariances[[3, 7]]).all()
+    assert np.linalg.eigvalsh(found.covariances[stands]).min() > 0
+    assert not np.isin(found.seen.frame_idx, [3, 7]).any()
+    assert found.seen.point_ids.min() >= 100
+
+
+def test_where_nothing_stands_there_is_no_covariance() -> None:
+    made = flight(3)
+    found = accepted(made, [np.zeros((0, 2), np.int64)] * 3)
+    assert not found.solution.posed.any()
+    assert found.covariance is None
+    assert found.reason == ("no feature matches a point of the map",) * 3
+
+
+def test_a_frame_of_which_hardly_any_measurement_agrees_loses_its_pose() -> None:
+    """Moved far off before the least squares, nothing of it agrees any more, and the others stay."""
+    made = flight()
+    sequence, solution, _ = solved(made, made.matched())
+    centers = solution.poses.centers.copy()
+    centers[3] += [0, 40, 0]
+    moved = replace(solution, poses=replace(solution.poses, centers=centers))
+    again = settle(sequence, moved, OPTIONS)
+    assert again.posed.tolist() == [k != 3 for k in range(8)]
+    assert np.isnan(again.poses.centers[3]).all()
+    assert not (again.frame == 3).any()

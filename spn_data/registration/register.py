@@ -12,9 +12,9 @@ from spn_data.correspondences import FramesToMap, extract_missing, match_missing
 from spn_data.frames import Frames
 from spn_data.labels import Labels, LabelStatus, SeenPoints
 from spn_data.map_covariance import MapCovariance
+from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, sequence_pairs
-from spn_data.pose import Poses
-from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge
+from spn_data.registration.checks import gather_evidence, judge
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
 from spn_data.registration.lookup import look_up_missing
@@ -30,13 +30,15 @@ _MATCHES = ".matches"
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """solution : of the frames that were accepted; covariances : (N, 6, 6), NaN for the others; covariance :
-    None where none was accepted; seen : map points of each frame; map_sigma_px : residuals of the map itself.
+    """solution : of the frames that were accepted; reason : N sentences, why the others failed; inliers,
+    coverage : (N,) of map points that agree; covariances : (N, 6, 6), NaN without a pose; covariance : None
+    where none was accepted; seen : map points of each frame; map_sigma_px : residuals of the map itself.
     """
 
     solution: Solution
-    evidence: Evidence
-    verdict: Verdict
+    reason: tuple[str, ...]
+    inliers: np.ndarray
+    coverage: np.ndarray
     covariance: SequenceCovariance | None
     covariances: np.ndarray
     seen: SeenPoints
@@ -86,18 +88,52 @@ def register_sequence(
         sequence = Sequence(pixels, [putative[name] for name in names], tracks, points.xyz)
         (start,) = to_match.start_cameras.values()
         solution = solve(sequence, *start, options)
-        map_covariance = MapCovariance.of(scene, observations)
-        _, covariances = _covariances(sequence, solution, map_covariance, options)
+        found = accept(
+            sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
+        )
+    progress("poses", len(names), len(names))
+    return found
+
+
+def accept(
+    sequence: Sequence,
+    solution: Solution,
+    pairs: dict[tuple[int, int], np.ndarray],
+    map_covariance: MapCovariance,
+    points: MapPoints,
+    options: RegisterOptions,
+) -> Registered:
+    """The frames that stand. What fails leaves the least squares, and the others are judged anew."""
+    n = len(solution.posed)
+    reason, inliers, coverage = [""] * n, np.zeros(n, np.int64), np.zeros(n)
+    settled = np.zeros(n, bool)  # what is told of a frame is what held when it failed
+    while True:
+        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
         evidence = gather_evidence(sequence, solution, covariances, pairs, options)
         verdict = judge(solution.posed, evidence, options.checks)
-        solution = settle(sequence, without(solution, ~verdict.accepted), options)
-        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
-    progress("poses", len(names), len(names))
+        for row in np.flatnonzero(~settled):
+            reason[row] = verdict.reason[row]
+            inliers[row], coverage[row] = evidence.inliers[row], evidence.coverage[row]
+        settled |= ~verdict.accepted
+        failing = solution.posed & ~verdict.accepted
+        if not failing.any():
+            break
+        solution = settle(sequence, without(solution, failing), options)
     of_map = np.flatnonzero(solution.point_row >= 0)
-    seen_pixels = sequence.pixels_of(solution.frame[of_map], solution.feature[of_map])
-    seen = SeenPoints(solution.frame[of_map], points.ids[solution.point_row[of_map]], seen_pixels)
+    seen = SeenPoints(
+        solution.frame[of_map],
+        points.ids[solution.point_row[of_map]],
+        sequence.pixels_of(solution.frame[of_map], solution.feature[of_map]),
+    )
     return Registered(
-        solution, evidence, verdict, covariance, covariances, seen, map_covariance.sigma_px
+        solution=solution,
+        reason=tuple(reason),
+        inliers=inliers,
+        coverage=coverage,
+        covariance=covariance,
+        covariances=covariances,
+        seen=seen,
+        map_sigma_px=map_covariance.sigma_px,
     )
 
 
@@ -125,8 +161,8 @@ def _covariances(
 
 def labels_of(chosen: Frames, registered: Registered) -> Labels:
     """The frames (N), in the order in which they were registered, as labels in the map's gauge."""
-    solution, evidence = registered.solution, registered.evidence
-    accepted, covariance = registered.verdict.accepted, registered.covariance
+    solution, covariance = registered.solution, registered.covariance
+    accepted = solution.posed
     n = len(chosen)
     error_px = np.full(n, np.nan)
     if covariance is not None:
@@ -144,13 +180,10 @@ def labels_of(chosen: Frames, registered: Registered) -> Labels:
         dense=np.zeros(n, bool),
         time_s=chosen.time_s,
         status=np.where(accepted, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
-        reason=np.array(registered.verdict.reason, dtype=np.str_),
-        poses=Poses(
-            np.where(accepted[:, None], solution.poses.centers, np.nan),
-            np.where(accepted[:, None], solution.poses.quats_wxyz, np.nan),
-        ),
+        reason=np.array(registered.reason, dtype=np.str_),
+        poses=solution.poses,
         covariance=registered.covariances,
-        inliers=evidence.inliers,
-        coverage=evidence.coverage,
-        error_px=np.where(accepted, error_px, np.nan),
+        inliers=registered.inliers,
+        coverage=registered.coverage,
+        error_px=error_px,
     )

@@ -21,6 +21,7 @@ from spn_data.registration.tracks import Tracks
 
 SCALE_PX = 1.0  # of the Cauchy loss
 _FRAMES_FOR_LENS = 3  # fewer do not tell a lens
+_FOR_A_POSE = 4  # measurements; with fewer it is not determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,10 @@ def refine(
 
 
 def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> Solution:
-    """The least squares of a solution's frames, and which of its measurements agree with it."""
+    """The least squares of a solution's frames, and which of its measurements agree with it.
+
+    A frame of which hardly any agree has no pose any more.
+    """
     rows = np.flatnonzero(solution.posed)
     if not len(rows):
         return solution
@@ -127,7 +131,7 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
     poses.centers[rows], poses.quats_wxyz[rows] = state.poses.centers, state.poses.quats_wxyz
     own = solution.own[agree]
     used = np.unique(own[own >= 0])
-    return Solution(
+    settled = Solution(
         solution.posed,
         poses,
         state.camera,
@@ -137,6 +141,9 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
         np.where(own >= 0, np.searchsorted(used, own), -1),
         state.own_points[used],
     )
+    left = np.bincount(settled.frame, minlength=len(solution.posed))
+    open_ = solution.posed & (left < _FOR_A_POSE)
+    return without(settled, open_) if open_.any() else settled
 
 
 def free_lens(camera: Camera, frames: int, options: RegisterOptions) -> tuple[str, ...]:
