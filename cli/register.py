@@ -11,7 +11,7 @@ from cli import options
 
 
 @click.command()
-@click.argument("video", required=False, type=click.Path(path_type=Path, exists=True))
+@click.argument("video", required=False, type=click.Path(path_type=Path))
 @options.area
 @click.option("--name", help="Of the sequence.  [default: the video's own]")
 @click.option(

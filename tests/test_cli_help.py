@@ -56,6 +56,7 @@ def test_the_commands_are_those_of_this_version():
         "georegister",
         "import",
         "reconstruct",
+        "register",
         "report",
         "simulate",
         "split",
@@ -71,6 +72,7 @@ def test_help_lists_the_commands_in_the_order_of_work():
     assert listed == [
         "reconstruct",
         "georegister",
+        "register",
         "coverage",
         "split",
         "audit",
