@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import time
 from pathlib import Path
 
 import av
+import click
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from click.testing import CliRunner, Result
 from cli.data import main
 from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.camera_file import camera_from_json, camera_to_json
-from spn_data.labels import Labels, read_labels, read_seen_points
+from spn_data.labels import _COLUMNS, Labels, read_labels, read_seen_points
 from spn_data.map_hash import map_hash
 from spn_data.pipeline.labels import (
     LabelledArea,
@@ -28,8 +30,10 @@ from spn_data.pipeline.labels import (
 )
 from spn_data.pose import Poses, Similarity, pose_errors
 from spn_data.record import read_json
+from spn_data.registration.options import CheckOptions
 from spn_data.simulate.truth import read_truth
 
+DOC = Path(__file__).resolve().parents[1] / "docs" / "registration.md"
 FAST = ("--rate", "1", "--threads", "1")
 
 
@@ -418,3 +422,48 @@ def test_a_killed_run_goes_on_to_the_same_labels(
     assert {p.name for p in (bare / EVALUATION / "medium").iterdir()} == {
         p.name for p in (registered / EVALUATION / "medium").iterdir()
     }
+
+
+def test_the_page_has_every_option_with_its_default() -> None:
+    """docs/registration.md has a row for each option of the command and no other."""
+    rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", DOC.read_text(), re.MULTILINE))
+    parameters = {
+        p.opts[-1]: p for p in main.commands["register"].params if isinstance(p, click.Option)
+    }
+    assert rows.keys() == parameters.keys()
+    for flag, parameter in parameters.items():
+        if parameter.show_default is True:
+            assert float(rows[flag].strip("` ")) == parameter.default
+
+
+def test_the_page_has_every_check_with_its_default() -> None:
+    """And no figure of them is another one than the program's."""
+    text = DOC.read_text().split("## Checks")[1].split("### Reasons")[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([0-9.]+) \|", text, re.MULTILINE))
+    options = CheckOptions()
+    for name, value in rows.items():
+        assert float(value) == getattr(options, name), name
+    inside = {
+        "same_place": f"within {options.same_place:g} *d* (`same_place`)",
+        "same_rotation_deg": f"{options.same_rotation_deg:g}\u00b0 (`same_rotation_deg`)",
+        "min_pair_matches": f"`min_pair_matches` ({options.min_pair_matches})",
+    }
+    assert rows.keys() | inside.keys() == vars(options).keys()
+    assert [phrase for phrase in inside.values() if phrase not in text] == []
+
+
+def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
+    """Columns of poses.csv in their order, and all that registration.json and camera.json hold."""
+    text = DOC.read_text()
+    part = text.split("### poses.csv")[1].split("### observations.npz")[0]
+    cells = re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE)
+    listed = re.findall(r"`([^`]+)`", " ".join(cells))
+    plain = [name for name in _COLUMNS if not name.startswith("cov_")]
+    assert listed == [*plain, "cov_00", "cov_55"]
+    folder = registered / EVALUATION / "medium"
+    told = read_json(folder / "registration.json")
+    for name in (*told, *told["gnss"], *read_json(folder / "camera.json")):
+        assert f"`{name}`" in text.split("## Files")[1], name
+    files = text.split("## Files")[1].split("### poses.csv")[0]
+    for path in folder.iterdir():
+        assert f"`{path.name}" in files, path.name
