@@ -4,8 +4,9 @@ Three things make them so, and all are in one least squares: the noise of the se
 the lens and the points that its frames share, and the errors of the map's points, which are alike for points
 seen by the same mapping frames. With S the information of poses and lens (own points eliminated) and N the
 pull of the map points on them, the errors are S^-1 (noise - N dX): the covariance is the sum of
-s^2 k S^-1 and S^-1 N Cov(X) N^T S^-1. s^2 is the variance of the residuals themselves, k (at least 1) by how
-much the measurements of one spot of an image pull together (the design effect of clusters).
+s^2 k S^-1 and b S^-1 N Cov(X) N^T S^-1. s^2 is the variance of the residuals themselves, k (at least 1) by
+how much the measurements of one spot of an image pull together (the design effect of clusters), b (at
+least 1) by how much worse the sequence fits the map than sequences usually do.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from spn_data.registration.adjustment import (
 from spn_data.registration.solution import SCALE_PX
 
 _FRAMES_AT_ONCE = 8
+# Residuals of a sequence are usually a fifth larger than the map's own. Where they are more than half as
+# large again, the map is bent, and its points are off by more than their covariance says.
+_USUAL_MISFIT = 1.5
 _CELL_PX = 16.0  # measurements of one such cell of a frame are not independent
 
 
@@ -67,6 +71,7 @@ def sequence_covariance(
     factor = splu((normal.matrix + sparse.diags(1e-12 * diagonal)).tocsc())
     by_unknown = jacobian(linearized, observations.frame, n, weights)
     sigma_px = _sigma_px(linearized.residuals_px, weights, n, len(lens), len(state.own_points))
+    bent = bend_factor(sigma_px, map_covariance)
     effect = _design_effect(by_unknown, linearized.residuals_px, weights, observations, sigma_px)
     used, columns = np.unique(point_rows[point_rows >= 0], return_inverse=True)
     pull = _pull(linearized, observations, weights, by_unknown, columns, len(used))
@@ -88,10 +93,16 @@ def sequence_covariance(
         ]
         of_map = map_covariance.functional_covariances(functionals)
         for k, block in enumerate(some):
-            both = sigma_px**2 * effect * solved[block, ends[k] : ends[k + 1]] + of_map[k]
+            noise = sigma_px**2 * effect * solved[block, ends[k] : ends[k + 1]]
+            both = noise + bent * of_map[k]
             found.append(0.5 * (both + both.T))
     poses[:] = found[:n]
     return SequenceCovariance(poses, found[n], lens, sigma_px, effect, linearized.residuals_px)
+
+
+def bend_factor(sigma_px: float, map_covariance: MapCovariance) -> float:
+    """By what the covariance of the map's points is too small, at least 1, by a frame's residuals."""
+    return max(1.0, (sigma_px / (_USUAL_MISFIT * map_covariance.sigma_px)) ** 2)
 
 
 def _sigma_px(

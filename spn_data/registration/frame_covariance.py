@@ -22,6 +22,7 @@ from spn_data.registration.adjustment import (
     lens_parameters,
     linearize,
 )
+from spn_data.registration.covariance import bend_factor
 from spn_data.registration.solution import SCALE_PX
 from spn_data.residual_fit import LENS, projection_jacobians
 
@@ -56,22 +57,23 @@ def frame_covariances(
     covariance = np.empty((len(frames), POSE, POSE))
     for first in range(0, len(frames), _FRAMES_AT_ONCE):
         some = range(first, min(first + _FRAMES_AT_ONCE, len(frames)))
-        noise, functionals = [], []
+        noise, functionals, bent = [], [], []
         for k in some:
-            own, functional = _one(poses[k : k + 1], camera, frames[k], lens)
+            own, functional, sigma_px = _one(poses[k : k + 1], camera, frames[k], lens)
             noise.append(own)
             functionals.append(functional)
+            bent.append(bend_factor(sigma_px, map_covariance))
         of_map = map_covariance.functional_covariances(functionals)
-        for k, own, through in zip(some, noise, of_map, strict=True):
-            both = own + through
+        for k, own, b, through in zip(some, noise, bent, of_map, strict=True):
+            both = own + b * through
             covariance[k] = 0.5 * (both + both.T)
     return covariance
 
 
 def _one(
     pose: Poses, camera: Camera, frame: FramePoints, lens: LensUncertainty
-) -> tuple[np.ndarray, Functional]:
-    """Covariance by noise and a lens of its own; and what the map's points and lens do to the pose."""
+) -> tuple[np.ndarray, Functional, float]:
+    """Covariance by noise and a lens of its own; what the map does to the pose; deviation of a residual."""
     m = len(frame.pixels)
     observations = SequenceObservations(
         np.zeros(m, np.int64), frame.pixels, frame.xyz, np.full(m, -1)
@@ -99,4 +101,4 @@ def _one(
         pull = inverse @ np.einsum("mia,mil->al", weighted, linearized.by_lens)
         noise = noise + pull @ lens.covariance @ pull.T
     functional = Functional(rows, together.transpose(1, 0, 2), lens.camera_id, by_lens)
-    return noise, functional
+    return noise, functional, float(np.sqrt(variance))

@@ -13,7 +13,9 @@ class CheckOptions:
     """When a pose becomes a label. Lengths are shares of the median distance of the points that are seen."""
 
     min_inliers: int = 30  # map points that agree with the pose
-    min_inlier_ratio: float = 0.05  # of the putative matches; wrong poses reach 0.02 by chance
+    # Of the features that match the map, so that a pose stands without a neighbour. True poses have 0.2 and
+    # more where the image is sharp; in another place with the same window grid, wrong ones reach 0.10.
+    min_inlier_ratio: float = 0.15
     min_coverage: float = 0.08  # share of the image's cells that hold an inlier
     max_rival: float = 0.5  # inliers of the second-best pose, as a share of the best one's
     same_place: float = 0.025  # poses nearer than this, and
