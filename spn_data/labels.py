@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import zlib
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from spn_data.pose import Poses, Similarity, canonical_quats
 from spn_data.record import write_atomically
 
 _MAX_CSV_BYTES = 2_000_000_000
+# What NumPy lets through of a damaged archive.
+_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
 _UPPER = np.triu_indices(6)
 
 
@@ -284,9 +288,9 @@ def write_seen_points(path: Path, seen: SeenPoints) -> None:
 def read_seen_points(path: Path) -> SeenPoints:
     """Raises InputError where it is not what `write_seen_points` writes. No pickle is opened."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             seen = SeenPoints(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except _DAMAGED as error:
         raise InputError(f"is no file of observations ({error})", path=path) from error
     if seen.pixels.shape != (len(seen.frame_idx), 2):
         raise InputError("is no file of observations (shapes differ)", path=path)
