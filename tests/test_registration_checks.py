@@ -82,7 +82,7 @@ def test_what_no_neighbour_can_make_good(values: dict[str, float], reason: str) 
 NEED_SUPPORT = [
     ({"rival": 101}, "ambiguous: 200 map points agree with the pose and 101 with another"),
     ({"direct": 29}, "only 29 map points found in it agree (30 are needed)"),
-    ({"putative": 4001}, "only 200 of its 4001 matches with the map agree"),
+    ({"putative": 1334}, "only 200 of its 1334 matches with the map agree"),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -135,6 +136,8 @@ def draw() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class _Perfect:
     """A map without errors."""
 
+    sigma_px = NOISE_PX
+
     def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
         return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
 
@@ -177,6 +180,19 @@ def test_measurements_that_err_alike_weigh_less() -> None:
     once = stated(state, observations, rows, map_covariance)
     assert once.design_effect < 1.2
     assert found.design_effect > 1.8  # robust weights keep it below 3
+
+
+def test_a_sequence_that_fits_the_map_badly_takes_the_map_for_bent() -> None:
+    """Three times the map's own residuals: the map's part grows by the square of three over 1.5."""
+    truth = small()
+    mapped, map_covariance = maps()[0]
+    state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
+    straight = stated(state, observations, rows, map_covariance)
+    exact = stated(state, observations, rows, _Perfect())  # type: ignore[arg-type]
+    finer = replace(map_covariance, sigma_px=straight.sigma_px / 3)
+    bent = stated(state, observations, rows, finer)
+    grown = (bent.poses - exact.poses) / (straight.poses - exact.poses)
+    assert np.allclose(grown, 4.0)
 
 
 def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
