@@ -10,10 +10,10 @@ import pytest
 
 from spn_data.map_points import MapPoints
 from spn_data.pose import pose_errors
-from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge
+from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge, same_pose
 from spn_data.registration.options import CheckOptions, RegisterOptions
 from spn_data.registration.register import accept
-from spn_data.registration.solution import Sequence, Solution, settle
+from spn_data.registration.solution import Sequence, Solution, settle, without
 from spn_data.registration.solve import solve
 from tests.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
 
@@ -222,6 +222,81 @@ def test_random_matches_give_no_label() -> None:
     verdict = judge(solution.posed, found, CheckOptions())
     assert not verdict.accepted.any()
     assert all(verdict.reason)
+
+
+def test_a_second_pose_that_is_the_same_is_no_rival() -> None:
+    """Half of the features 9 px off, as leaves in the wind: their own pose is turned by less than 2 degrees."""
+    made = flight(1)
+    pixels = made.pixels[0].copy()
+    pixels[::2, 0] += 9
+    moved = replace(made, pixels=[pixels])
+    _, _, found = solved(moved, made.matched())
+    assert found.direct[0] < 0.7 * len(pixels)
+    assert found.rival[0] == 0
+    near, far = (
+        replace(made.poses, centers=made.poses.centers + np.array([x, 0, 0])) for x in (0.2, 0.3)
+    )
+    assert same_pose(made.poses, near, 10.0, CheckOptions())
+    assert not same_pose(made.poses, far, 10.0, CheckOptions())
+
+
+def test_a_lens_that_is_not_known_is_found() -> None:
+    """From a focal length a third too long and no distortion; one that is held stays to the bit."""
+    made = flight()
+    start = replace(LENS, params=np.array([380.0, 160, 120, 0, 0]))
+    sequence = made.sequence(made.matched())
+    found = solve(sequence, start, False, OPTIONS)
+    assert found.camera.focal_px[0] == pytest.approx(LENS.focal_px[0], rel=0.005)
+    assert pose_errors(found.poses, made.poses)[0].max() < 0.06
+    held = solve(sequence, LENS, False, replace(OPTIONS, hold_lens=True))
+    assert np.array_equal(held.camera.params, LENS.params)
+    assert pose_errors(held.poses, made.poses)[0].max() < 0.03
+
+
+def test_what_no_map_point_explains_becomes_a_point_of_the_sequence_where_it_is() -> None:
+    """Two thirds of the facade are not in the map: tracks of them are triangulated, and help the frames."""
+    made = flight()
+    putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
+    _, solution, _ = solved(made, putative)
+    assert len(solution.own_points) > 60
+    for row, point in enumerate(solution.own_points):
+        mine = np.flatnonzero(solution.own == row)
+        shown = {int(made.shows[solution.frame[k]][solution.feature[k]]) for k in mine}
+        assert len(shown) == 1
+        assert len(mine) >= 2
+        assert np.linalg.norm(point - made.points[shown.pop()]) < 0.5
+    assert pose_errors(solution.poses, made.poses)[0].max() < 0.15
+
+
+def test_points_that_only_one_frame_sees_leave_with_the_others() -> None:
+    """Without frames 3 to 7, each own point that is left has two frames of the rest."""
+    made = flight()
+    putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
+    _, solution, _ = solved(made, putative)
+    left = without(solution, np.arange(8) > 2)
+    assert left.posed.tolist() == [k <= 2 for k in range(8)]
+    assert left.frame.max() == 2
+    counts = np.bincount(left.own[left.own >= 0], minlength=len(left.own_points))
+    assert len(left.own_points) < len(solution.own_points)
+    assert counts.min() >= 2
+
+
+def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One fails at first, another once that one is gone: each keeps its own reason."""
+    rounds = iter([({3}, "first"), ({3, 5}, "second"), ({3, 5}, "third")])
+
+    def scripted(posed: np.ndarray, *_: object) -> Verdict:
+        failing, reason = next(rounds)
+        return Verdict(
+            np.array([k not in failing for k in range(8)]),
+            tuple(reason if k in failing else "" for k in range(8)),
+        )
+
+    monkeypatch.setattr("spn_data.registration.register.judge", scripted)
+    made = flight()
+    found = accepted(made, made.matched())
+    assert [found.reason[k] for k in (3, 5, 6)] == ["first", "second", ""]
+    assert found.solution.posed.tolist() == [k not in (3, 5) for k in range(8)]
 
 
 class _Perfect:

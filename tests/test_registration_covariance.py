@@ -180,6 +180,12 @@ def test_measurements_that_err_alike_weigh_less() -> None:
     once = stated(state, observations, rows, map_covariance)
     assert once.design_effect < 1.2
     assert found.design_effect > 1.8  # robust weights keep it below 3
+    exact = [
+        stated(state, seen, of, _Perfect()).poses  # type: ignore[arg-type]
+        for seen, of in ((crowded, rows[pairs]), (observations, rows))
+    ]
+    ratio = np.trace(exact[0].sum(axis=0)) / np.trace(exact[1].sum(axis=0))
+    assert ratio > 0.6, "a third where the three were taken for independent"
 
 
 def test_a_sequence_that_fits_the_map_badly_takes_the_map_for_bent() -> None:
@@ -260,3 +266,60 @@ def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
         error = errors(truth, mapped, state)
         scores.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
     assert 0.7 < np.median(np.concatenate(scores)) / CHI2_MEDIAN < 1.4
+
+
+def test_few_measurements_tell_the_noise_without_bias() -> None:
+    """Ten points and six unknowns: the residuals are smaller than the noise, what is stated is not."""
+    truth = small()
+    rng = np.random.default_rng(8)
+    poses = evaluation_poses()[:1]
+    seen = LENS.project((truth.scene.points - poses.centers[0]) @ poses.rotations[0].T)
+    rows = np.flatnonzero(((seen > 0) & (seen < [LENS.width, LENS.height])).all(axis=1))[::30][:10]
+    variances = []
+    for _ in range(60):
+        observations = SequenceObservations(
+            np.zeros(10, np.int64),
+            seen[rows] + rng.normal(0, 0.1, (10, 2)),
+            truth.scene.points[rows],
+            np.full(10, -1),
+        )
+        start = SequenceState(poses, LENS, np.zeros((0, 3)))
+        state = adjust(start, observations, scale_px=50.0, lens=())
+        perfect = _Perfect()
+        found = sequence_covariance(state, observations, rows, perfect, ())  # type: ignore[arg-type]
+        variances.append(found.sigma_px**2)
+        assert found.lens.shape == (0, 0)
+    assert np.mean(variances) == pytest.approx(0.1**2, rel=0.15)
+
+
+class _LensOnly:
+    """A map whose points are exact, and whose lens has this covariance (8, 8)."""
+
+    sigma_px = NOISE_PX
+
+    def __init__(self, lens: np.ndarray):
+        self.lens = lens
+
+    def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
+        assert all(f.camera_id == 7 for f in functionals)
+        return [f.by_lens @ self.lens @ f.by_lens.T for f in functionals]
+
+
+def test_a_lens_of_the_map_counts_as_one_of_the_sequence_with_the_same_covariance() -> None:
+    """Focal length and two terms of distortion, as the map states them: fx, fy, cx, cy, k1, k2, p1, p2."""
+    truth = small()
+    mapped, _ = maps()[0]
+    state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
+    mine = (observations.frame == 0) & (rows >= 0)
+    frames = [FramePoints(observations.pixels[mine], rows[mine], observations.map_xyz[mine])]
+    lens = np.diag([4.0, 1e-4, 4e-4])
+    place = np.zeros((8, 3))
+    place[[0, 1], 0] = place[4, 1] = place[5, 2] = 1.0
+    own, of_map = (
+        frame_covariances(state.poses[:1], state.camera, frames, uncertain, map_covariance)  # type: ignore[arg-type]
+        for uncertain, map_covariance in (
+            (LensUncertainty(covariance=lens), _Perfect()),
+            (LensUncertainty(camera_id=7), _LensOnly(place @ lens @ place.T)),
+        )
+    )
+    assert np.allclose(own, of_map, rtol=1e-9)

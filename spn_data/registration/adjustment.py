@@ -110,7 +110,6 @@ def linearize(
         else:
             columns.append(by_all[:, :, _LENS_COLUMN[name]])
     by_lens = np.stack(columns, axis=2) if columns else np.zeros((len(x), 2, 0))
-    by_lens[behind] = 0.0
     return Linearized(residuals, by_pose, by_lens, by_point, lens)
 
 
