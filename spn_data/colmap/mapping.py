@@ -13,7 +13,10 @@ from typing import Any
 from spn_data import child
 from spn_data.errors import FormatError
 
-_REFINEMENTS = 3  # bundle adjustments, each after wrong measurements were dropped
+_CONVERGED = 1e-5  # relative decrease of the cost
+# Deviations at which Cauchy's loss begins to bend: 95 % efficient for normal errors (Holland & Welsch
+# 1977, "Robust regression using iteratively reweighted least-squares").
+_CAUCHY = 2.385
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,21 +173,29 @@ def _refine(
     source: str, target: str, camera_model: str, refine_principal_point: bool, threads: int
 ) -> None:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.model import drop_out_of_view, upgrade_camera, write_native
+    from spn_data.colmap.clean import (
+        drop_out_of_view,
+        drop_outliers,
+        drop_without_depth,
+        residual_sigma_px,
+    )
+    from spn_data.colmap.model import upgrade_camera, write_native
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
         upgrade_camera(camera, camera_model)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=refine_principal_point)
     options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.function_tolerance = _CONVERGED
     before = model.compute_mean_reprojection_error()
-    dropped = drop_out_of_view(model)
-    for _ in range(_REFINEMENTS):
-        pycolmap.bundle_adjustment(model, options)
-        more = drop_out_of_view(model)
-        dropped += more
-        if more == 0:
-            break
+    drop_out_of_view(model)
+    pycolmap.bundle_adjustment(model, options)
+    dropped = drop_out_of_view(model) + drop_outliers(model)
+    # What is left of wrong matches shall not bend the model either.
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _CAUCHY * residual_sigma_px(model)
+    pycolmap.bundle_adjustment(model, options)
+    dropped += drop_without_depth(model)
     model.update_point_3d_errors()
     write_native(model, Path(target))
     after = model.compute_mean_reprojection_error()

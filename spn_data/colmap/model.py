@@ -95,7 +95,7 @@ def read_scene(folder: Path) -> Scene:
 
 
 def scene_of(native: pycolmap.Reconstruction) -> Scene:
-    images = sorted(_registered(native), key=lambda image: image.name)
+    images = sorted(registered_images(native), key=lambda image: image.name)
     rigid = [image.cam_from_world() for image in images]
     points = [native.points3D[i] for i in sorted(native.points3D)]
     return Scene(
@@ -135,14 +135,14 @@ def read_feature_points(folder: Path) -> dict[str, np.ndarray]:
         image.name: np.array(
             [p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64
         )
-        for image in _registered(load_native(folder))
+        for image in registered_images(load_native(folder))
     }
 
 
 def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observations:
     point_position = {point_id: k for k, point_id in enumerate(sorted(native.points3D))}
     image_idx, point_idx, pixels, residuals = [], [], [], []
-    by_name = {image.name: image for image in _registered(native)}
+    by_name = {image.name: image for image in registered_images(native)}
     for k, name in enumerate(scene.names):
         image = by_name[name]
         seen = image.get_observation_points2D()
@@ -213,35 +213,5 @@ def upgrade_camera(camera: Any, model: str) -> None:
     camera.params = [*focals, cx, cy, *old.opencv_distortion[: _DISTORTION[model]]]
 
 
-_BEYOND_RIM = 1.2  # of the image's farthest corner, from where a point can't be in view
-
-
-def drop_out_of_view(native: pycolmap.Reconstruction) -> int:
-    """Delete measurements of points far beyond the image's rim or behind the camera; how many there were.
-
-    A polynomial distortion folds far outside the image: rays at 80 degrees may land in its middle. One wrong
-    match that does so has such leverage that it alone decides the distortion of the lens.
-    """
-    dropped = 0
-    for image in _registered(native):
-        camera = from_native_camera(native.cameras[image.camera_id])
-        w, h = camera.width, camera.height
-        corners = camera.unproject(np.array([[0, 0], [w, 0], [0, h], [w, h]]))
-        rim = _BEYOND_RIM * float(np.linalg.norm(corners, axis=1).max())
-        seen = [k for k, p in enumerate(image.points2D) if p.has_point3D()]
-        if not seen:
-            continue
-        points = np.array([native.points3D[image.points2D[k].point3D_id].xyz for k in seen])
-        rigid = image.cam_from_world()
-        in_camera = points @ rigid.rotation.matrix().T + rigid.translation
-        reach = np.linalg.norm(in_camera[:, :2], axis=1)
-        for k in np.flatnonzero(reach > rim * in_camera[:, 2]).tolist():
-            # A point goes with the second last of its measurements.
-            if image.points2D[seen[k]].has_point3D():
-                native.delete_observation(image.image_id, seen[k])
-                dropped += 1
-    return dropped
-
-
-def _registered(native: pycolmap.Reconstruction) -> list[Any]:
+def registered_images(native: pycolmap.Reconstruction) -> list[Any]:
     return [native.images[i] for i in native.reg_image_ids()]
