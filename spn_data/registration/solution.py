@@ -19,7 +19,7 @@ from spn_data.registration.adjustment import (
 from spn_data.registration.options import RegisterOptions
 from spn_data.registration.tracks import Tracks
 
-SCALE_PX = 1.0  # of the Cauchy loss
+SCALE_PX = 0.5  # of the Cauchy loss
 _FRAMES_FOR_LENS = 3  # fewer do not tell a lens
 _FOR_A_POSE = 4  # measurements; with fewer it is not determined
 
