@@ -188,9 +188,9 @@ def _refine(
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.function_tolerance = _CONVERGED
     before = model.compute_mean_reprojection_error()
-    drop_out_of_view(model)
+    dropped = drop_out_of_view(model)
     pycolmap.bundle_adjustment(model, options)
-    dropped = drop_out_of_view(model) + drop_outliers(model)
+    dropped += drop_out_of_view(model) + drop_outliers(model)
     # What is left of wrong matches shall not bend the model either.
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _CAUCHY * residual_sigma_px(model)

@@ -72,7 +72,7 @@ def sequence_covariance(
     by_unknown = jacobian(linearized, observations.frame, n, weights)
     sigma_px = _sigma_px(linearized.residuals_px, weights, n, len(lens), len(state.own_points))
     bent = bend_factor(sigma_px, map_covariance)
-    effect = _design_effect(by_unknown, linearized.residuals_px, weights, observations, sigma_px)
+    effect = _design_effect(by_unknown, linearized.residuals_px, weights, observations)
     used, columns = np.unique(point_rows[point_rows >= 0], return_inverse=True)
     pull = _pull(linearized, observations, weights, by_unknown, columns, len(used))
     poses = np.empty((n, POSE, POSE))
@@ -119,22 +119,24 @@ def _design_effect(
     residuals_px: np.ndarray,
     weights: np.ndarray,
     observations: SequenceObservations,
-    sigma_px: float,
 ) -> float:
-    """Mean ratio of the pull of clusters of measurements to that of as many independent ones, at least 1."""
+    """Median ratio of the squared pull of clusters of measurements to that of each by itself, at least 1."""
     cells = np.floor(observations.pixels / _CELL_PX).astype(np.int64)
     where = np.column_stack([observations.frame, cells])
     cluster = np.unique(where, axis=0, return_inverse=True)[1].ravel()
     residuals = (residuals_px * np.sqrt(weights)[:, None]).ravel()
-    gather = sparse.csr_matrix(
-        (residuals, (np.repeat(cluster, 2), np.arange(len(residuals)))),
-        (int(cluster.max()) + 1, len(residuals)),
-    )
-    together = gather @ by_unknown
-    pulled = np.asarray(together.multiply(together).sum(axis=0)).ravel()
-    expected = sigma_px**2 * np.asarray(by_unknown.multiply(by_unknown).sum(axis=0)).ravel()
-    known = expected > 0
-    return max(1.0, float(np.median(pulled[known] / expected[known])))
+
+    def squared_pull(group: np.ndarray) -> np.ndarray:
+        shape = (int(group.max()) + 1, len(residuals))
+        gather = sparse.csr_matrix(
+            (residuals, (np.repeat(group, 2), np.arange(len(residuals)))), shape
+        )
+        pull = gather @ by_unknown
+        return np.asarray(pull.multiply(pull).sum(axis=0)).ravel()
+
+    single = squared_pull(np.arange(len(residuals_px)))
+    known = single > 0
+    return max(1.0, float(np.median(squared_pull(cluster)[known] / single[known])))
 
 
 def _pull(
