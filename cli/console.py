@@ -43,7 +43,8 @@ class Group(click.Group):
         except SpnError as error:
             if ctx.params.get("verbose"):
                 raise
-            raise click.ClickException(str(error)) from error
+            refused = isinstance(error.__cause__, OSError) and error.__cause__.errno in _DISK
+            raise click.ClickException(f"{error}{_KEPT if refused else ''}") from error
         except KeyboardInterrupt:
             click.echo(
                 "\nStopped. What is done is kept: the same command goes on from here.", err=True

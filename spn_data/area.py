@@ -16,6 +16,7 @@ from typing import Any
 import tomli_w
 
 from spn_data.errors import FormatError, StageError
+from spn_data.files import write_whole
 from spn_data.record import (
     VERSION,
     StageRecord,
@@ -23,7 +24,6 @@ from spn_data.record import (
     difference,
     read_record,
     versions,
-    write_atomically,
     write_json,
 )
 
@@ -290,7 +290,7 @@ class Area:
         if facts.evaluation:
             table["evaluation"] = dict(sorted(facts.evaluation.items()))
         text = tomli_w.dumps(table)
-        write_atomically(self.root / _FACTS, text)
+        write_whole(self.root / _FACTS, text)
         self.facts = facts
 
     def _read_facts(self) -> Facts:
@@ -298,7 +298,7 @@ class Area:
         if not path.exists():
             return Facts()
         try:
-            table = tomllib.loads(path.read_text())
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
             check_version(path, table["version"])
             evaluation = {str(k): str(v) for k, v in dict(table.get("evaluation", {})).items()}
             return Facts(sources=tuple(str(s) for s in table["sources"]), evaluation=evaluation)

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.files import write_whole
 from spn_data.pose import Poses, canonical_quats
-from spn_data.record import write_atomically
 
 HEADER = ("Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", "")
 MAX_FRAMES = 1_000_000
@@ -85,7 +85,7 @@ def write_cambridge(path: Path, names: Sequence[str], poses: Poses) -> None:
     for name, row in zip(names, numbers.tolist(), strict=True):
         _check_name(name)
         lines.append(" ".join([name, *(f"{value:.6f}" for value in row)]))
-    write_atomically(path, "\n".join(lines) + "\n")
+    write_whole(path, "\n".join(lines) + "\n")
 
 
 def far_positions(centers: np.ndarray) -> np.ndarray:

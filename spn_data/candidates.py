@@ -11,6 +11,7 @@ import numpy as np
 
 from spn_data import video
 from spn_data.errors import InputError
+from spn_data.files import writing_whole
 from spn_data.frames import Frames
 from spn_data.measurement import MEASURE_WIDTH, GrayImage, Measurements, measure
 from spn_data.photos import PhotoHeaders, decode_photo_gray, read_headers
@@ -196,8 +197,7 @@ def _identity(source: Source) -> str:
 def _write_cache(path: Path, candidates: Candidates) -> None:
     measured = candidates.measured
     columns = {f.name: getattr(measured, f.name) for f in fields(measured)}
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
+    with writing_whole(path) as file:
         np.savez_compressed(
             file,
             identity=np.array(_identity(candidates.source)),
@@ -205,7 +205,6 @@ def _write_cache(path: Path, candidates: Candidates) -> None:
             notes=np.array(candidates.notes, dtype=np.str_),
             **columns,
         )
-    temporary.replace(path)
 
 
 def _read_cache(path: Path, source: Source) -> Candidates | None:

@@ -11,10 +11,10 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames
+from spn_data.files import write_csv
 from spn_data.pose import Poses
 from spn_data.timing import Progress
 from spn_data.view_share import SeenMap, view_shares
-from spn_data.waypoints import write_csv
 
 _TELLING_M = 0.05  # less beyond the range of heights is not worth a sentence
 _FAR_M = 1000.0  # from the map: nobody plans that

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from spn_data import video
 from spn_data.errors import InputError
+from spn_data.files import write_whole
 from spn_data.frames import Frames
 from spn_data.photos import decode_photo, read_headers
 from spn_data.sources import Source, SourceKind
@@ -148,7 +148,7 @@ def _extract_video(
             break
         ok, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert ok
-        _write_whole(targets[row], data.tobytes())
+        write_whole(targets[row], data.tobytes())
         yield targets[row]
     if wanted:
         raise InputError(
@@ -166,26 +166,12 @@ def _extract_photo(
     with part.open("rb") as file:
         is_jpeg = file.read(3) == b"\xff\xd8\xff"
     if is_jpeg and metadata is not None and metadata.orientation == 1:
-        _write_whole(target, part.read_bytes())
+        write_whole(target, part.read_bytes())
     else:
         image = decode_photo(part)
         if image.shape[:2] != (frames.height[row], frames.width[row]):
             raise InputError("changed since it was measured", path=part)
         ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert ok
-        _write_whole(target, data.tobytes())
+        write_whole(target, data.tobytes())
     yield target
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Under another name first, so that a file of this name is complete; no rest is left of a failure."""
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"can't be written: {error.strerror}", path=path) from error

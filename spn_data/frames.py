@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.files import write_csv
 from spn_data.telemetry.track import Telemetry
 
 _MAX_CSV_BYTES = 500_000_000
@@ -146,23 +146,16 @@ _MAY_BE_UNKNOWN = set(_COLUMNS) - _STRINGS - _INTEGERS - {"time_s"}
 
 
 def write_frames(path: Path, frames: Frames) -> None:
-    """As frames.csv (docs/input.md), under another name first and then renamed: it is never half there."""
-    columns = []
+    """As frames.csv (docs/input.md); the file appears whole."""
+    columns = {}
     for name, (field, index) in _COLUMNS.items():
         values = getattr(frames, field)
         values = values if index is None else values[:, index]
         if name in _STRINGS or name in _INTEGERS:
-            columns.append([str(v) for v in values.tolist()])
+            columns[name] = [str(v) for v in values.tolist()]
         else:
-            columns.append(["" if np.isnan(v) else repr(float(v)) for v in values])
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(zip(*columns, strict=True))
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+            columns[name] = ["" if np.isnan(v) else repr(float(v)) for v in values]
+    write_csv(path, columns)
 
 
 def read_frames(path: Path) -> Frames:

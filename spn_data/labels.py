@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import zlib
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
@@ -14,9 +13,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.files import write_csv, writing_whole
 from spn_data.frames import check_name
 from spn_data.pose import Poses, Similarity, canonical_quats
-from spn_data.record import write_atomically
 
 _MAX_CSV_BYTES = 2_000_000_000
 # What NumPy lets through of a damaged archive.
@@ -146,38 +145,35 @@ class SeenPoints:
         return SeenPoints(frame_idx, self.point_ids[index], self.pixels[index])
 
 
+_POSE_COLUMNS = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 _COVARIANCE_COLUMNS = [f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True)]
 _COLUMNS = [
-    *("name", "time_s", "status", "reason", "x", "y", "z", "qw", "qx", "qy", "qz", "inliers"),
-    *("coverage", "error_px", "camera", "source", "video_frame", "dense"),
+    *("name", "time_s", "status", "reason", *_POSE_COLUMNS, "inliers", "coverage", "error_px"),
+    *("camera", "source", "video_frame", "dense"),
     *_COVARIANCE_COLUMNS,
 ]
 
 
 def write_labels(path: Path, labels: Labels) -> None:
     """As poses.csv (docs/formats.md); the file appears whole."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for k in range(len(labels)):
-        numbers = [*labels.poses.centers[k], *labels.poses.quats_wxyz[k]]
-        writer.writerow(
-            [
-                *(
-                    labels.names[k],
-                    repr(float(labels.time_s[k])),
-                    labels.status[k],
-                    labels.reason[k],
-                ),
-                *map(_cell, numbers),
-                int(labels.inliers[k]),
-                *map(_cell, (labels.coverage[k], labels.error_px[k])),
-                *(labels.cameras[k], labels.sources[k], int(labels.video_frame[k])),
-                int(labels.dense[k]),
-                *map(_cell, labels.covariance[k][_UPPER]),
-            ]
-        )
-    write_atomically(path, text.getvalue())
+    poses = np.concatenate([labels.poses.centers, labels.poses.quats_wxyz], axis=1)
+    covariance = labels.covariance[:, _UPPER[0], _UPPER[1]]
+    columns: dict[str, list[object]] = {
+        "name": labels.names.tolist(),
+        "time_s": [repr(t) for t in labels.time_s.tolist()],
+        "status": labels.status.tolist(),
+        "reason": labels.reason.tolist(),
+        **{name: _cells(poses[:, k]) for k, name in enumerate(_POSE_COLUMNS)},
+        "inliers": labels.inliers.tolist(),
+        "coverage": _cells(labels.coverage),
+        "error_px": _cells(labels.error_px),
+        "camera": labels.cameras.tolist(),
+        "source": labels.sources.tolist(),
+        "video_frame": labels.video_frame.tolist(),
+        "dense": labels.dense.astype(np.int64).tolist(),
+        **{name: _cells(covariance[:, k]) for k, name in enumerate(_COVARIANCE_COLUMNS)},
+    }
+    write_csv(path, {name: columns[name] for name in _COLUMNS})
 
 
 def read_labels(path: Path) -> Labels:
@@ -212,7 +208,7 @@ def _parse(path: Path, line: int, cells: list[str]) -> dict[str, Any]:
             raise ValueError(f"status {row['status']!r} is none of {', '.join(LabelStatus)}")
         if "/" in row["source"] or "\\" in row["source"] or row["source"] in ("", ".", ".."):
             raise ValueError(f"source {row['source']!r} is not the name of a file")
-        row["pose"] = [_number(row[c]) for c in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+        row["pose"] = [_number(row[c]) for c in _POSE_COLUMNS]
         row["covariance"] = [_number(row[c]) for c in _COVARIANCE_COLUMNS]
         if row["status"] == LabelStatus.REGISTERED:
             if not np.isfinite(row["pose"]).all():
@@ -259,8 +255,8 @@ def _labels_of(rows: list[dict[str, Any]]) -> Labels:
     )
 
 
-def _cell(value: float) -> str:
-    return "" if np.isnan(value) else repr(float(value))
+def _cells(values: np.ndarray) -> list[object]:
+    return ["" if np.isnan(v) else repr(v) for v in values.tolist()]
 
 
 def _number(cell: str) -> float:
@@ -273,16 +269,14 @@ def _number(cell: str) -> float:
 
 
 def write_seen_points(path: Path, seen: SeenPoints) -> None:
-    """As observations.npz: plain arrays, written whole."""
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
+    """As observations.npz, plain arrays; the file appears whole."""
+    with writing_whole(path) as file:
         np.savez_compressed(
             file,
             frame_idx=seen.frame_idx.astype(np.int64),
             point_ids=seen.point_ids.astype(np.int64),
             pixels=seen.pixels.astype(np.float64),
         )
-    temporary.replace(path)
 
 
 def read_seen_points(path: Path) -> SeenPoints:

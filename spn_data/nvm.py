@@ -9,7 +9,6 @@ http://ccwu.me/vsfm/doc.html#nvm
 from __future__ import annotations
 
 import math
-import os
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.camera import Camera
-from spn_data.errors import InputError, StageError
+from spn_data.errors import InputError
+from spn_data.files import writing_whole
 from spn_data.pose import Poses, canonical_quats
 
 MAX_IMAGES = 1_000_000
@@ -93,13 +93,8 @@ def _numbers_within(image_idx: np.ndarray, images: int) -> np.ndarray:
 def write_nvm(path: Path, model: NvmModel) -> None:
     """The file appears whole. Numbers are written so that they are read back the same, bit by bit."""
     _check(model)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(_text(model))
-        os.replace(temporary, path)
-    except OSError as error:
-        raise StageError(f"{path} cannot be written: {error.strerror}") from error
+    with writing_whole(path, "w") as file:
+        file.writelines(_text(model))
 
 
 def _check(model: NvmModel) -> None:

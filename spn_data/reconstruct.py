@@ -13,6 +13,7 @@ from spn_data.correspondences import FramesToMap, extract_missing, match_missing
 from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
 from spn_data.features import FeatureOptions
+from spn_data.files import write_whole
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions
 from spn_data.timing import Progress, Stopwatch
@@ -201,9 +202,7 @@ def _map(
         log=work / "mapping.log",
         progress=lambda registered: progress("mapping", min(registered, n), n),
     )
-    listed = done.with_suffix(".part")
-    listed.write_text(json.dumps([model.name for model in models]))
-    listed.replace(done)
+    write_whole(done, json.dumps([model.name for model in models]))
     return models
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from spn_data.errors import FormatError, StageError
+from spn_data.errors import FormatError
+from spn_data.files import write_whole
 
 VERSION = 1  # of the area's layout and of stage.json
 
@@ -61,7 +61,7 @@ def content_fingerprint(path: Path) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    write_atomically(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
+    write_whole(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -134,15 +134,3 @@ def _changed_options(
             yield from _changed_options(before, now, f"{prefix}{name}.")
         elif before != now:
             yield prefix + name, before, now
-
-
-def write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("w") as handle:
-            handle.write(text)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise StageError(f"{path} cannot be written: {error.strerror}") from error

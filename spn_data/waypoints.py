@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from dataclasses import dataclass
@@ -14,7 +12,6 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geodesy import GeoOrigin, HeightReference
 from spn_data.pose import Poses, rotations_from_angles
-from spn_data.record import write_atomically
 from spn_data.telemetry.textfile import csv_rows, read_text
 
 MAX_WAYPOINTS = 100_000
@@ -146,15 +143,6 @@ def waypoint_columns(
     columns["pitch_deg"] = [f"{v:.3f}" for v in angles[:, 1]]
     columns["roll_deg"] = [f"{v:.3f}" for v in angles[:, 2]]
     return columns
-
-
-def write_csv(path: Path, columns: dict[str, list[str]]) -> None:
-    """Columns of cells, all of one length, under their names; the file appears whole."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    write_atomically(path, text.getvalue())
 
 
 def _columns(header: list[str], line: int, path: Path | str) -> dict[str, int]:

@@ -118,7 +118,7 @@ def test_an_interrupted_extraction_goes_on(flight: Source, tmp_path: Path) -> No
     kept = (tmp_path / names[0]).stat().st_mtime_ns
     (tmp_path / names[1]).unlink()
     (tmp_path / names[-1]).unlink()
-    (tmp_path / (names[1] + ".part")).write_bytes(b"half")
+    (tmp_path / f".{names[1]}.part").write_bytes(b"half")
     heard: list[int] = []
     assert extract_chosen(flight, frames, tmp_path, progress=heard.append) == 2
     assert heard == [total - 2, total - 1, total]

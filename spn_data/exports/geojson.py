@@ -8,8 +8,8 @@ from typing import Any
 
 from spn_data.exports.frames import ExportedFrames
 from spn_data.exports.geographic import places_of
+from spn_data.files import write_whole
 from spn_data.geodesy import HeightReference
-from spn_data.record import write_atomically
 
 
 def write_geojson(folder: Path, frames: ExportedFrames) -> None:
@@ -49,4 +49,4 @@ def write_geojson(folder: Path, frames: ExportedFrames) -> None:
         )
     collection = {"type": "FeatureCollection", "features": features}
     text = json.dumps(collection, indent=1, allow_nan=False)
-    write_atomically(folder / "frames.geojson", text + "\n")
+    write_whole(folder / "frames.geojson", text + "\n")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.frames import ExportedFrames, timestamps_us
-from spn_data.record import write_atomically
+from spn_data.files import write_whole
 
 FOLDER_OF_IMAGES = "sensors/records_data"
 _VERSION = "# kapture format: 1.1"
@@ -55,4 +55,4 @@ def write_kapture(folder: Path, frames: ExportedFrames) -> None:
     (folder / FOLDER_OF_IMAGES).mkdir(parents=True)
     for name, (head, rows_of_table) in tables.items():
         text = "\n".join([_VERSION, told, head, *rows_of_table]) + "\n"
-        write_atomically(folder / "sensors" / f"{name}.txt", text)
+        write_whole(folder / "sensors" / f"{name}.txt", text)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from spn_data.exports.frames import ExportedFrames
 from spn_data.exports.geographic import Places, places_of
+from spn_data.files import write_whole
 from spn_data.geodesy import HeightReference
-from spn_data.record import write_atomically
 
 # KML's absolute altitudes count from mean sea level, and it knows no ellipsoid.
 _MODES = {
@@ -29,7 +29,7 @@ _MODES = {
 def write_kml(folder: Path, frames: ExportedFrames) -> None:
     """frames.kml. Raises StageError where the area has no place in the world."""
     text = "\n".join(_text(frames, places_of(frames, "KML")))
-    write_atomically(folder / "frames.kml", text + "\n")
+    write_whole(folder / "frames.kml", text + "\n")
 
 
 def _text(frames: ExportedFrames, places: Places) -> Iterator[str]:

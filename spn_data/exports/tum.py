@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.frames import ExportedFrames, timestamps_us
-from spn_data.record import write_atomically
+from spn_data.files import write_whole
 
 
 def write_tum(folder: Path, frames: ExportedFrames) -> None:
@@ -30,4 +30,4 @@ def write_tum(folder: Path, frames: ExportedFrames) -> None:
         for stamp, center, quat in zip(stamps, poses.centers, quats_xyzw, strict=True):
             numbers = " ".join(f"{value:.9f}" for value in (*center, *quat))
             lines.append(f"{stamp / 1e6:.6f} {numbers}")
-        write_atomically(folder / f"{name}.txt", "\n".join(lines) + "\n")
+        write_whole(folder / f"{name}.txt", "\n".join(lines) + "\n")

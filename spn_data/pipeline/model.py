@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import shutil
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ from spn_data.colmap.model import Scene, read_observations
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
+from spn_data.files import write_csv
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
@@ -162,14 +162,10 @@ def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[Shutte
 
 
 def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([f.name for f in fields(FrameRegistration)])
-        for row in rows:
-            error = "" if math.isnan(row.error_px) else f"{row.error_px:.4f}"
-            status = "registered" if row.registered else "missing"
-            cells = [row.name, status, row.reason, row.keypoints, row.verified_pairs]
-            writer.writerow([*cells, row.observations, error])
+    columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(FrameRegistration)}
+    columns["registered"] = ["registered" if row.registered else "missing" for row in rows]
+    columns["error_px"] = ["" if math.isnan(r.error_px) else f"{r.error_px:.4f}" for r in rows]
+    write_csv(path, columns)
 
 
 def _name_results(work: Path, result: ReconstructResult) -> None:

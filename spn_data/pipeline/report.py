@@ -14,6 +14,7 @@ import numpy as np
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
 from spn_data.camera import Camera
 from spn_data.errors import FormatError, StageError
+from spn_data.files import write_whole
 from spn_data.frames import Frames, read_frames
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels
@@ -21,7 +22,7 @@ from spn_data.pipeline import coverage as coverage_stage
 from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.pose import Poses
-from spn_data.record import read_json, versions, write_atomically
+from spn_data.record import read_json, versions
 from spn_data.report.data import CoverageFacts, FlyAgain, FrameTable, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import Verdict, verdict
@@ -55,7 +56,7 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
     options = options or ReportOptions()
     path, data = area.root / FILE, report_data(area)
     html = render(data, max_points=options.max_points, max_frames=options.max_frames)
-    write_atomically(path, html)
+    write_whole(path, html)
     return path, verdict(data)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from spn_data.audit import MIN_TRAINING_VIEWS
 from spn_data.cambridge import write_cambridge
 from spn_data.camera import Camera
+from spn_data.files import write_whole
 from spn_data.map_points import MapPoints
 from spn_data.nvm import nvm_model, write_nvm
 from spn_data.pipeline.split_dataset import GivenFrames
@@ -49,12 +50,10 @@ class CambridgeFolder:
         if path.exists():
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.part")
         ok, data = cv2.imencode(".png", self._renderer(key).render(image))
         if not ok:
             raise ValueError(f"{frame} can't be encoded as PNG")
-        temporary.write_bytes(data.tobytes())
-        temporary.replace(path)
+        write_whole(path, data.tobytes())
 
     def finish(self, frames: GivenFrames, rows: np.ndarray, points: MapPoints) -> None:
         """The lists, each sorted by sequence and time, and the model. rows : of frames with an image."""

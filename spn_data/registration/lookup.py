@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.database import MapDatabase
+from spn_data.files import writing_whole
 from spn_data.matching import MatchOptions, match_descriptors
 from spn_data.parallel import run_batches
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
@@ -73,10 +74,8 @@ def look_up_missing(
     def store(result: list[tuple[str, np.ndarray]]) -> None:
         nonlocal done
         for name, matches in result:
-            temporary = files[name].with_suffix(".part")
-            with temporary.open("wb") as file:
+            with writing_whole(files[name]) as file:
                 np.save(file, matches)
-            temporary.replace(files[name])
         done += len(result)
         progress("map matches", done, len(names))
 

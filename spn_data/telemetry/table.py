@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import FormatError
+from spn_data.files import write_whole
 from spn_data.geodesy import HeightReference
 from spn_data.telemetry.track import Telemetry
 
@@ -43,9 +44,7 @@ def write_track(path: Path, telemetry: Telemetry) -> None:
     )
     lines = [f"# {json.dumps(about)}", _COLUMNS]
     lines += [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows]
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, "\n".join(lines) + "\n")
 
 
 def read_track(path: Path) -> Telemetry:
