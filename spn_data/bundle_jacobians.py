@@ -1,8 +1,6 @@
 """A bundle adjustment at its solution: derivatives of its residuals, points eliminated.
 
-The unknowns that stay are those of the frames (6 each) and of the lenses that mapping estimated. A change of
-a frame is that of its centre in world axes, then a rotation vector v in the camera frame with
-R_changed = exp(v) R.
+The unknowns that stay are those of the frames (6 each) and of the lenses that mapping estimated.
 """
 
 from __future__ import annotations
@@ -14,14 +12,17 @@ from scipy import sparse
 
 from spn_data.camera import MODELS, Camera
 from spn_data.colmap.model import Observations, Scene
-from spn_data.residual_fit import LENS, POSE, projection_jacobians, rows_to_sparse
+from spn_data.least_squares import (
+    POSE,
+    lens_mixing,
+    point_whitening,
+    pose_jacobians,
+    projection_jacobians,
+    rows_to_sparse,
+)
 
 GAUGE = 7  # a similarity of everything changes no residual
 
-# Columns of residual_fit.projection_jacobians that each parameter of a lens moves.
-_FOCAL = {"f": (0, 1), "fx": (0,), "fy": (1,)}
-_PRINCIPAL_POINT = {"cx": (2,), "cy": (3,)}
-_DISTORTION = {"k1": (4,), "k2": (5,), "p1": (6,), "p2": (7,)}
 # Of a point's own information: a point whose rays are parallel has a depth that nothing fixes.
 _RIDGE = 1e-12
 
@@ -44,19 +45,16 @@ class Unknowns:
         count = POSE * len(scene.names)
         for camera_id in np.unique(scene.camera_ids).tolist():
             camera = scene.cameras[camera_id]
-            mixing[camera_id] = _lens_mixing(camera, refine_principal_point)
+            mixing[camera_id] = lens_mixing(_lens_parameters(camera, refine_principal_point))
             columns[camera_id] = count + np.arange(mixing[camera_id].shape[1])
             count += mixing[camera_id].shape[1]
         return cls(count, columns, mixing)
 
 
-def _lens_mixing(camera: Camera, refine_principal_point: bool) -> np.ndarray:
-    refined = _FOCAL | _DISTORTION | (_PRINCIPAL_POINT if refine_principal_point else {})
-    columns = [refined[name] for name in MODELS[camera.model] if name in refined]
-    mixing = np.zeros((LENS, len(columns)))
-    for k, rows in enumerate(columns):
-        mixing[list(rows), k] = 1.0
-    return mixing
+def _lens_parameters(camera: Camera, refine_principal_point: bool) -> list[str]:
+    """Those that mapping estimates."""
+    held = () if refine_principal_point else ("cx", "cy")
+    return [name for name in MODELS[camera.model] if name not in held]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +107,10 @@ def linearize_bundle(
         lens[own, :, : len(columns)] = by_lens @ unknowns.lens_mixing[camera_id]
         lens_columns[own, : len(columns)] = columns
     by_point = by_cam @ rotations
-    values = np.concatenate([-by_point, np.cross(points_cam[:, None], by_cam), lens], axis=2)
+    values = np.concatenate([pose_jacobians(points_cam, by_cam, by_point), lens], axis=2)
     columns = np.concatenate([POSE * frame[:, None] + np.arange(POSE), lens_columns], axis=1)
     design = rows_to_sparse(values, columns, unknowns.count)
-    whitening = _whitening(by_point, point, len(points))
+    whitening = point_whitening(by_point, point, len(points), ridge=_RIDGE)
     whitened = by_point @ np.swapaxes(whitening, 1, 2)[point]
     by_points = rows_to_sparse(whitened, 3 * point[:, None] + np.arange(3), 3 * len(points))
     residuals = seen.residuals_px[rows].ravel()
@@ -142,11 +140,3 @@ def gauge_directions(scene: Scene, unknowns: Unknowns) -> np.ndarray:
         frames[:, 3:, 3 + axis] = -rotations @ unit / size
     frames[:, :3, 6] = offsets / size
     return directions
-
-
-def _whitening(by_point: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
-    information = np.zeros((count, 3, 3))
-    np.add.at(information, point, np.einsum("mki,mkj->mij", by_point, by_point))
-    trace = np.trace(information, axis1=1, axis2=2)
-    information += (_RIDGE * trace)[:, None, None] * np.eye(3)
-    return np.linalg.inv(np.linalg.cholesky(information))

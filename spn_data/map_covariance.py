@@ -23,7 +23,7 @@ from spn_data.bundle_jacobians import GAUGE, Bundle, Unknowns, linearize_bundle
 from spn_data.colmap.model import Observations, Scene
 from spn_data.errors import GeometryError
 from spn_data.gauged_inverse import GaugedInverse
-from spn_data.residual_fit import POSE
+from spn_data.least_squares import POSE, cluster_pulls
 from spn_data.track_noise import TrackNoise, fit_track_noise, own_errors
 
 _FRAMES_AT_ONCE = 32
@@ -226,11 +226,6 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
 
 def _clustered_pull(bundle: Bundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
     """(n, n) sum over clusters of the outer product of their pull on frames and lenses."""
-    clusters, cluster = np.unique(cluster_of_point, return_inverse=True)
-    m = len(bundle.residuals)
-    gather = sparse.csr_matrix(
-        (bundle.residuals, (np.repeat(cluster[bundle.point], 2), np.arange(m))),
-        (len(clusters), m),
-    )
-    pulls = (gather @ bundle.design).tocsr()
+    cluster = np.unique(cluster_of_point, return_inverse=True)[1]
+    pulls = cluster_pulls(bundle.residuals, cluster[bundle.point], bundle.design)
     return (pulls.T @ pulls).tocsr()

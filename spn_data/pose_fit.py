@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.camera import Camera
+from spn_data.least_squares import cauchy_weights, pose_jacobians, projection_jacobians
 from spn_data.pose import Poses, rotations_from_vectors
-from spn_data.residual_fit import projection_jacobians
 
 _MAX_STEPS = 20
 _CONVERGED_PX = 1e-3  # mean change of the projections
@@ -54,12 +54,9 @@ def fit_pose(
         if np.count_nonzero(ahead) < 4:
             return None
         x, residuals = in_camera[ahead], camera.project(in_camera[ahead]) - pixels[ahead]
-        weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
+        weights = cauchy_weights(residuals, scale)
         by_point = projection_jacobians(camera, x)[0]
-        # A turn exp(v) moves a point x by v x x; a move of the centre, by -R of it.
-        by_pose = np.concatenate(
-            [-by_point @ rotation, np.cross(x[:, None, :], by_point)], axis=2
-        ).reshape(-1, 6)
+        by_pose = pose_jacobians(x, by_point, by_point @ rotation).reshape(-1, 6)
         weighted = by_pose * np.repeat(weights, 2)[:, None]
         try:
             inverse = np.linalg.inv(weighted.T @ by_pose)

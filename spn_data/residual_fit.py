@@ -10,15 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg
 
 from spn_data.camera import Camera
 from spn_data.colmap.model import Observations, Scene
+from spn_data.least_squares import (
+    LENS,
+    POSE,
+    point_whitening,
+    projection_jacobians,
+    rows_to_sparse,
+)
 
-POSE = 6  # moves in the camera frame (3), then rotation vector in the camera frame
-LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2
 FRAME_EFFECTS = 3  # zoom, shear, stretch of the rows, each of one frame
 _PER_FRAME = POSE + FRAME_EFFECTS
+_POINT_RIDGE = 1e-7  # points seen under a tiny angle have a depth that nothing fixes
 _RIDGE = 1e-9  # of each unknown's own information: the gauge is free, and solving must not stumble
 
 
@@ -67,42 +73,6 @@ class Partialled:
     effects: np.ndarray
     residuals_px: np.ndarray
     pose_per_effect: np.ndarray
-
-
-def projection_jacobians(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of pixels by points in the camera frame (M, 2, 3) and by the lens (M, 2, 8)."""
-    fx, fy = camera.focal_px
-    k1, k2, p1, p2 = camera.opencv_distortion
-    z = points_cam[:, 2]
-    x, y = points_cam[:, 0] / z, points_cam[:, 1] / z
-    r2 = x * x + y * y
-    radial, slope = 1 + k1 * r2 + k2 * r2 * r2, 2 * (k1 + 2 * k2 * r2)
-    by_xy = np.empty((len(z), 2, 2))
-    by_xy[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    by_xy[:, 0, 1] = by_xy[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    by_xy[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    focal = np.array([fx, fy])
-    by_xy *= focal[:, None]
-    zero = np.zeros_like(x)
-    xy_by_point = np.stack(
-        [np.stack([1 / z, zero, -x / z], axis=-1), np.stack([zero, 1 / z, -y / z], axis=-1)], axis=1
-    )
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ],
-        axis=1,
-    )
-    one = np.ones_like(x)
-    by_lens = np.zeros((len(z), 2, LENS))
-    by_lens[:, 0, 0], by_lens[:, 1, 1] = distorted[:, 0], distorted[:, 1]
-    by_lens[:, 0, 2], by_lens[:, 1, 3] = one, one
-    by_lens[:, :, 4] = focal * np.stack([x * r2, y * r2], axis=1)
-    by_lens[:, :, 5] = focal * np.stack([x * r2 * r2, y * r2 * r2], axis=1)
-    by_lens[:, :, 6] = focal * np.stack([2 * x * y, r2 + 2 * y * y], axis=1)
-    by_lens[:, :, 7] = focal * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
-    return by_xy @ xy_by_point, by_lens
 
 
 def frame_effects(camera: Camera, pixels: np.ndarray) -> np.ndarray:
@@ -154,6 +124,7 @@ def linearize(
     offsets = scene.points[seen.point_idx[rows]] - poses.centers[frame]
     points_cam = np.einsum("mij,mj->mi", poses.rotations[frame], offsets)
     by_point, lens = projection_jacobians(camera, points_cam)
+    # Unlike elsewhere, a move is along the camera's axes.
     pose = np.concatenate([by_point, np.cross(points_cam[:, None], by_point)], axis=2)
     pixels = seen.pixels[rows]
     share = pixels[:, 1] / camera.height - 0.5
@@ -163,7 +134,11 @@ def linearize(
     residuals = seen.residuals_px[rows]
     weights = huber_weights(residuals)
     per_frame = np.concatenate([pose, own], axis=2)
-    whitened = _whiten(by_point @ poses.rotations[frame], weights, point, len(order))
+    by_place = by_point @ poses.rotations[frame]
+    inverse_root = point_whitening(
+        np.sqrt(weights)[:, None, None] * by_place, point, len(order), ridge=_POINT_RIDGE
+    )
+    whitened = by_place @ np.swapaxes(inverse_root, 1, 2)[point]
     shared = np.concatenate([lens, effects, residuals[:, :, None]], axis=2)
     normal = _normal(per_frame, shared, frame, len(frames), whitened, point, weights)
     return Block(
@@ -176,16 +151,6 @@ def huber_weights(residuals_px: np.ndarray, *, beyond_sigmas: float = 2.5) -> np
     length = np.linalg.norm(residuals_px, axis=1)
     sigma = max(float(np.median(length)) / 1.1774, 1e-6)  # median of a Rayleigh distribution
     return np.minimum(1.0, beyond_sigmas * sigma / np.maximum(length, 1e-12))
-
-
-def _whiten(by_point: np.ndarray, weights: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
-    information = np.zeros((count, 3, 3))
-    np.add.at(information, point, np.einsum("m,mki,mkj->mij", weights, by_point, by_point))
-    trace = np.trace(information, axis1=1, axis2=2)
-    # Points seen under a tiny angle have a depth that nothing fixes.
-    information += (1e-7 * trace + 1e-300)[:, None, None] * np.eye(3)
-    inverse_root = np.linalg.inv(np.linalg.cholesky(information))
-    return by_point @ np.swapaxes(inverse_root, 1, 2)[point]
 
 
 def _normal(
@@ -218,15 +183,6 @@ def _normal(
     # What is left of an unknown after its points can be less than rounding.
     normal[np.diag_indices(len(normal))] += 1e-8 * direct.diagonal()
     return normal
-
-
-def rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
-    """(2 M, width) from blocks (M, 2, n) whose both rows have the columns (M, n)."""
-    m, two, n = values.shape
-    pointers = n * np.arange(two * m + 1)
-    return sparse.csr_matrix(
-        (values.ravel(), np.repeat(columns, two, axis=0).ravel(), pointers), (two * m, width)
-    )
 
 
 def partial_out(block: Block) -> Partialled:

@@ -21,6 +21,7 @@ from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import Observations, Scene, read_observations
 from spn_data.errors import GeometryError
+from spn_data.least_squares import POSE
 from spn_data.map_covariance import Functional, MapCovariance, MapCovarianceOptions
 from spn_data.pose import (
     Poses,
@@ -29,7 +30,6 @@ from spn_data.pose import (
     rotations_from_angles,
     rotations_from_vectors,
 )
-from spn_data.residual_fit import POSE
 
 INDEPENDENT = MapCovarianceOptions(clustered=False)
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import minimize
 
 from spn_data.camera import MODELS, Camera
+from spn_data.least_squares import POSE
 from spn_data.pose import Poses, pose_errors, rotations_from_vectors
 from spn_data.registration.adjustment import (
-    POSE,
     SequenceObservations,
     SequenceState,
     adjust,

@@ -177,9 +177,10 @@ def _own_lens(area: Area, sequence: str, camera: Camera) -> LensUncertainty:
     value = read_json(path)
     try:
         names = lens_parameters(camera)
-        matrix = np.array(value["covariance"], np.float64)
-        if tuple(value["estimated"]) not in (names, ()) or matrix.shape != (len(matrix),) * 2:
+        estimated = tuple(value["estimated"])  # none, where the lens was held
+        if estimated not in (names, ()):
             raise ValueError("its covariance is of other parameters")
+        matrix = np.array(value["covariance"], np.float64).reshape((len(estimated),) * 2)
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: cannot be read ({error})") from error
     return LensUncertainty(covariance=matrix)

@@ -1,7 +1,6 @@
 """Least squares over a sequence in a frozen map: its poses, its lens, and the points that only it sees.
 
-Map points stay where they are. Poses are changed by a move of the centre along the map's axes and a
-rotation vector in the camera frame, R_new = exp(v) @ R: the order of every covariance here.
+Map points stay where they are.
 """
 
 from __future__ import annotations
@@ -13,11 +12,16 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from spn_data.camera import MODELS, Camera
+from spn_data.least_squares import (
+    POSE,
+    cauchy_weights,
+    lens_mixing,
+    pose_jacobians,
+    projection_jacobians,
+    rows_to_sparse,
+)
 from spn_data.pose import Poses, rotations_from_vectors
-from spn_data.residual_fit import projection_jacobians
 
-POSE = 6
-_LENS_COLUMN = {"k1": 4, "k2": 5}  # of projection_jacobians
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost
 _FAR_PX = 1e3  # residual of a point at or behind the camera: it counts as an outlier
@@ -88,28 +92,9 @@ def linearize(
     residuals[behind] = _FAR_PX
     by_camera_point, by_all = projection_jacobians(state.camera, safe)
     by_camera_point[behind] = 0.0
-    x, y, z = safe.T
-    zero = np.zeros_like(x)
-    # d(exp(v) X)/dv = -[X]x
-    minus_cross = np.stack(
-        [
-            np.stack([zero, z, -y], axis=1),
-            np.stack([-z, zero, x], axis=1),
-            np.stack([y, -x, zero], axis=1),
-        ],
-        axis=1,
-    )
     by_point = by_camera_point @ rotations
-    by_pose = np.concatenate([-by_point, by_camera_point @ minus_cross], axis=2)
-    columns = []
-    for name in lens:
-        if name == "f":
-            columns.append(by_all[:, :, 0] + by_all[:, :, 1])
-        elif name in ("fx", "fy"):
-            columns.append(by_all[:, :, 0 if name == "fx" else 1])
-        else:
-            columns.append(by_all[:, :, _LENS_COLUMN[name]])
-    by_lens = np.stack(columns, axis=2) if columns else np.zeros((len(x), 2, 0))
+    by_pose = pose_jacobians(safe, by_camera_point, by_point)
+    by_lens = by_all @ lens_mixing(lens)
     return Linearized(residuals, by_pose, by_lens, by_point, lens)
 
 
@@ -133,15 +118,10 @@ def jacobian(
 ) -> sparse.csr_matrix:
     """Sparse (2M, 6N+L) by poses and lens, each row times the root of its weight."""
     m, lens = len(frame), linearized.by_lens.shape[2]
-    root = np.sqrt(weights)[:, None, None]
-    values = np.concatenate([linearized.by_pose, linearized.by_lens], axis=2) * root
-    columns = np.empty((m, 2, POSE + lens), np.int64)
-    columns[:, :, :POSE] = (POSE * frame[:, None] + np.arange(POSE))[:, None]
-    columns[:, :, POSE:] = POSE * frames + np.arange(lens)
-    pointers = np.arange(0, values.size + 1, POSE + lens)
-    return sparse.csr_matrix(
-        (values.ravel(), columns.ravel(), pointers), shape=(2 * m, POSE * frames + lens)
-    )
+    values = np.concatenate([linearized.by_pose, linearized.by_lens], axis=2)
+    of_lens = np.broadcast_to(POSE * frames + np.arange(lens), (m, lens))
+    columns = np.concatenate([POSE * frame[:, None] + np.arange(POSE), of_lens], axis=1)
+    return rows_to_sparse(values * np.sqrt(weights)[:, None, None], columns, POSE * frames + lens)
 
 
 def normal_equations(
@@ -175,11 +155,7 @@ def normal_equations(
     point_right = np.zeros((own_points, 3))
     weighted = linearized.residuals_px[mine] * root
     np.add.at(point_right, point_of, -np.einsum("mij,mi->mj", by_point, weighted))
-    columns = np.repeat(3 * point_of[:, None] + np.arange(3), 2, axis=0)
-    of_points = sparse.csr_matrix(
-        (by_point.ravel(), columns.ravel(), np.arange(0, by_point.size + 1, 3)),
-        shape=(2 * len(mine), 3 * own_points),
-    )
+    of_points = rows_to_sparse(by_point, 3 * point_of[:, None] + np.arange(3), 3 * own_points)
     rows = (2 * mine[:, None] + np.arange(2)).ravel()
     coupling = (by_unknown[rows].T @ of_points).tocsr()
     if own_points:
@@ -220,11 +196,6 @@ def adjust(
         if done:
             break
     return state
-
-
-def cauchy_weights(residuals_px: np.ndarray, scale_px: float) -> np.ndarray:
-    """(M,) of residuals (M, 2)."""
-    return 1 / (1 + (residuals_px**2).sum(axis=1) / scale_px**2)
 
 
 def _cost(linearized: Linearized, scale_px: float) -> float:

@@ -18,13 +18,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from spn_data.least_squares import POSE, cauchy_weights, cluster_pulls, rows_to_sparse
 from spn_data.map_covariance import Functional, MapCovariance
 from spn_data.registration.adjustment import (
-    POSE,
     Linearized,
     SequenceObservations,
     SequenceState,
-    cauchy_weights,
     jacobian,
     linearize,
     normal_equations,
@@ -127,11 +126,7 @@ def _design_effect(
     residuals = (residuals_px * np.sqrt(weights)[:, None]).ravel()
 
     def squared_pull(group: np.ndarray) -> np.ndarray:
-        shape = (int(group.max()) + 1, len(residuals))
-        gather = sparse.csr_matrix(
-            (residuals, (np.repeat(group, 2), np.arange(len(residuals)))), shape
-        )
-        pull = gather @ by_unknown
+        pull = cluster_pulls(residuals, group, by_unknown)
         return np.asarray(pull.multiply(pull).sum(axis=0)).ravel()
 
     single = squared_pull(np.arange(len(residuals_px)))
@@ -151,10 +146,6 @@ def _pull(
     of_map = np.flatnonzero(observations.own < 0)
     root = np.sqrt(weights[of_map])[:, None, None]
     by_point = linearized.by_point[of_map] * root
-    index = np.repeat(3 * columns[:, None] + np.arange(3), 2, axis=0)
-    by_places = sparse.csr_matrix(
-        (by_point.ravel(), index.ravel(), np.arange(0, by_point.size + 1, 3)),
-        shape=(2 * len(of_map), 3 * points),
-    )
+    by_places = rows_to_sparse(by_point, 3 * columns[:, None] + np.arange(3), 3 * points)
     rows = (2 * of_map[:, None] + np.arange(2)).ravel()
     return (by_unknown[rows].T @ by_places).tocsr()

@@ -12,19 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.camera import Camera
+from spn_data.least_squares import LENS, POSE, cauchy_weights, projection_jacobians
 from spn_data.map_covariance import Functional, MapCovariance
 from spn_data.pose import Poses
 from spn_data.registration.adjustment import (
-    POSE,
     SequenceObservations,
     SequenceState,
-    cauchy_weights,
     lens_parameters,
     linearize,
 )
 from spn_data.registration.covariance import bend_factor
 from spn_data.registration.solution import SCALE_PX
-from spn_data.residual_fit import LENS, projection_jacobians
 
 _FRAMES_AT_ONCE = 32
 
