@@ -116,9 +116,7 @@ def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptio
         paths[s].poses[i : i + 1]
         for s, i in zip(sequence, frames.video_frame.tolist(), strict=True)
     ]
-    true = Poses(
-        np.concatenate([p.centers for p in picked]), np.concatenate([p.quats_wxyz for p in picked])
-    )
+    true = Poses.concatenate(picked)
     world_from_model = Similarity.fit(scene.poses.centers, true.centers)
     return Model(paths, sequence, frames.time_s, scene.poses, true, world_from_model), options
 

@@ -33,9 +33,7 @@ def true_poses(frames: Frames, truth_folder: Path) -> Poses:
     for sequence, index in zip(frames.sequences.tolist(), frames.video_frame.tolist(), strict=True):
         truth = read_truth(truth_folder, sequence)
         poses.append(truth.poses[index : index + 1])
-    return Poses(
-        np.concatenate([p.centers for p in poses]), np.concatenate([p.quats_wxyz for p in poses])
-    )
+    return Poses.concatenate(poses)
 
 
 def at_origin(true: Poses, true_origin: GeoOrigin, origin: GeoOrigin) -> Poses:

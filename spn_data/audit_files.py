@@ -95,9 +95,7 @@ class PoseList:
 
     def with_more(self, other: PoseList) -> PoseList:
         """These, then the others."""
-        centers = np.concatenate([self.poses.centers, other.poses.centers])
-        quats = np.concatenate([self.poses.quats_wxyz, other.poses.quats_wxyz])
-        return PoseList(self.names + other.names, Poses(centers, quats))
+        return PoseList(self.names + other.names, Poses.concatenate([self.poses, other.poses]))
 
 
 def check_dataset(

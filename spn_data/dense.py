@@ -12,7 +12,7 @@ from spn_data.camera import Camera
 from spn_data.dense_segments import SequenceToLabel, read_segments
 from spn_data.dense_tracking import DenseOptions, TrackedFrame, between, failed, track_segment
 from spn_data.frames import Frames
-from spn_data.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints
 from spn_data.parallel import run_batches
 from spn_data.pose import Poses, pose_errors
@@ -108,23 +108,11 @@ def _labels(sequence: SequenceToLabel, found: dict[int, TrackedFrame]) -> tuple[
     frames = sequence.frames.select(sequence.wanted)
     results = [found[row] for row in sequence.wanted.tolist()]
     n = len(results)
-    reasons = np.array([result.reason for result in results], dtype=np.str_)
-    labels = Labels(
-        names=frames.names,
-        sequences=frames.sequences,
-        cameras=frames.cameras,
-        sources=frames.sources,
-        video_frame=frames.video_frame,
-        dense=np.ones(n, bool),
-        time_s=frames.time_s,
-        status=np.where(
-            reasons == "", LabelStatus.REGISTERED.value, LabelStatus.FAILED.value
-        ).astype(np.str_),
-        reason=reasons,
-        poses=Poses(
-            np.array([r.poses.centers[0] for r in results]).reshape(n, 3),
-            np.array([r.poses.quats_wxyz[0] for r in results]).reshape(n, 4),
-        ),
+    labels = Labels.of_frames(
+        frames,
+        Poses.concatenate(r.poses for r in results),
+        dense=True,
+        reason=[r.reason for r in results],
         covariance=np.full((n, 6, 6), np.nan),
         inliers=np.array([len(r.point_ids) for r in results], dtype=np.int64),
         coverage=np.array([r.coverage for r in results], dtype=np.float64),

@@ -108,8 +108,7 @@ class TrackedFrame:
 
 def failed(reason: str, row: int = -1) -> TrackedFrame:
     """A frame without a label."""
-    nowhere = Poses(np.full((1, 3), np.nan), np.full((1, 4), np.nan))
-    return TrackedFrame(row, reason, nowhere, np.zeros(0, np.int64), np.zeros((0, 2)))
+    return TrackedFrame(row, reason, Poses.unknown(1), np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 def track_segment(segment: Segment, options: DenseOptions) -> list[TrackedFrame]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.files import write_csv, writing_whole
-from spn_data.frames import check_name
+from spn_data.frames import Frames, check_name
 from spn_data.pose import Poses, Similarity, canonical_quats
 
 _MAX_CSV_BYTES = 2_000_000_000
@@ -85,6 +86,38 @@ class Labels:
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @classmethod
+    def of_frames(
+        cls,
+        frames: Frames,
+        poses: Poses,
+        *,
+        dense: bool,
+        reason: Sequence[str],
+        covariance: np.ndarray,
+        inliers: np.ndarray,
+        coverage: np.ndarray,
+        error_px: np.ndarray,
+    ) -> Labels:
+        """Of all those frames (N) and what became of them; registered are those whose pose is finite."""
+        registered = np.isfinite(poses.centers).all(axis=1)
+        return cls(
+            names=frames.names,
+            sequences=frames.sequences,
+            cameras=frames.cameras,
+            sources=frames.sources,
+            video_frame=frames.video_frame,
+            dense=np.full(len(frames), dense),
+            time_s=frames.time_s,
+            status=np.where(registered, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
+            reason=np.array(reason, dtype=np.str_),
+            poses=poses,
+            covariance=covariance,
+            inliers=inliers,
+            coverage=coverage,
+            error_px=error_px,
+        )
+
+    @classmethod
     def concatenate(cls, parts: list[Labels]) -> Labels:
         """The rows of several, one after the other."""
         if not parts:
@@ -94,21 +127,23 @@ class Labels:
             for f in fields(cls)
             if f.name != "poses"
         }
-        centers = np.concatenate([p.poses.centers for p in parts])
-        quats = np.concatenate([p.poses.quats_wxyz for p in parts])
-        return cls(**values, poses=Poses(centers, quats))
+        return cls(**values, poses=Poses.concatenate(p.poses for p in parts))
 
     def moved(self, b_from_a: Similarity) -> Labels:
         """The same labels in another frame of the same map; covariances turn and scale with it."""
-        has = self.registered
-        centers = np.full((len(self), 3), np.nan)
-        quats = np.full((len(self), 4), np.nan)
-        there = b_from_a.apply_to_poses(self.poses[has])
-        centers[has], quats[has] = there.centers, there.quats_wxyz
+        has = np.flatnonzero(self.registered)
+        poses = b_from_a.apply_to_poses(self.poses[has]).at_rows(has, len(self))
         jacobian = np.eye(6)  # rotation vectors in the camera frame stay as they are
         jacobian[:3, :3] = b_from_a.scale * b_from_a.rotation
         covariance = jacobian @ self.covariance @ jacobian.T
-        return replace(self, poses=Poses(centers, quats), covariance=covariance)
+        return replace(self, poses=poses, covariance=covariance)
+
+
+def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) standard deviations of position and rotation (degrees): roots of traces of (N, 6, 6)."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    sigma, sigma_rad = (np.sqrt(part.sum(axis=1)) for part in np.split(variances, 2, axis=1))
+    return sigma, np.rad2deg(sigma_rad)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ World axes are East, North, Up once a model is georeferenced; camera axes are x 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,6 +141,26 @@ class Poses:
         quats = canonical_quats(np.roll(np.asarray(quats_xyzw, dtype=np.float64), 1, axis=-1))
         centers = -np.einsum("nji,nj->ni", rotations_from_quats(quats), translations)
         return cls(centers, quats)
+
+    @classmethod
+    def unknown(cls, n: int) -> Poses:
+        """N poses that are NaN."""
+        return cls(np.full((n, 3), np.nan), np.full((n, 4), np.nan))
+
+    @classmethod
+    def concatenate(cls, parts: Iterable[Poses]) -> Poses:
+        """Those of several, one after the other."""
+        parts = [Poses(np.zeros((0, 3)), np.zeros((0, 4))), *parts]
+        return cls(
+            np.concatenate([p.centers for p in parts]),
+            np.concatenate([p.quats_wxyz for p in parts]),
+        )
+
+    def at_rows(self, rows: np.ndarray | list[int], n: int) -> Poses:
+        """N poses, these at `rows`, the others unknown."""
+        poses = Poses.unknown(n)
+        poses.centers[rows], poses.quats_wxyz[rows] = self.centers, self.quats_wxyz
+        return poses
 
     def to_cam_from_world(self) -> tuple[np.ndarray, np.ndarray]:
         """COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""

@@ -212,3 +212,15 @@ def test_a_moved_camera_still_sees_its_points_at_the_same_pixels():
     seen = np.einsum("nij,nj->ni", poses.rotations, point - poses.centers)
     seen_after = np.einsum("nij,nj->ni", moved.rotations, b_from_a.apply(point) - moved.centers)
     assert seen_after == pytest.approx(3.0 * seen, abs=1e-12)
+
+
+def test_poses_are_put_together_and_at_rows_and_the_rest_is_unknown():
+    """What nothing is known of is NaN, never an identity; of no parts come no poses."""
+    some = Poses(np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([[1.0, 0, 0, 0], [0, 1, 0, 0]]))
+    both = Poses.concatenate([some[1:], some])
+    assert both.centers[:, 0].tolist() == [4, 1, 4]
+    spread = some.at_rows([2, 0], 4)
+    assert spread.centers[:, 0].tolist()[::2] == [4, 1]
+    assert np.isnan(spread.centers[1::2]).all()
+    assert np.isnan(spread.quats_wxyz[1::2]).all()
+    assert len(Poses.concatenate([])) == 0

@@ -233,14 +233,10 @@ def _place(area: Area, labelled: LabelledArea) -> Place | None:
 
 def _together(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:
     """Poses and strata of all queries that have a pose."""
-    known = [each.queries.known for each in by_name.values()]
-    poses = [each.queries.poses for each in by_name.values()]
+    every = [(each, each.queries.known) for each in by_name.values()]
     return (
-        Poses(
-            np.concatenate([p.centers[k] for p, k in zip(poses, known, strict=True)]),
-            np.concatenate([p.quats_wxyz[k] for p, k in zip(poses, known, strict=True)]),
-        ),
-        np.concatenate([c.stratum[k] for c, k in zip(by_name.values(), known, strict=True)]),
+        Poses.concatenate(each.queries.poses[known] for each, known in every),
+        np.concatenate([each.stratum[known] for each, known in every]),
     )
 
 

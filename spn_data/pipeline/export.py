@@ -25,9 +25,8 @@ from spn_data.exports.nerfstudio import FOLDER_OF_IMAGES as NERFSTUDIO_IMAGES
 from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
-from spn_data.labels import Labels, SeenPoints
 from spn_data.pipeline.images import image_path
-from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area
+from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area, together
 from spn_data.record import VERSION, write_json
 
 RECORD = "export.json"
@@ -163,39 +162,27 @@ def chosen_frames(
 
     dense : dense frames too; whole_map : all mapping frames, also those of other sequences.
     """
-    parts: list[tuple[Labels, SeenPoints, bool]] = [
-        (labelled.mapping, labelled.mapping_seen, False),
-        (labelled.dense, labelled.dense_seen, False),
-    ]
-    for name, labels in labelled.evaluation.items():
-        parts.append((labels, labelled.evaluation_seen[name], True))
-    known = sorted({name for labels, _, _ in parts for name in labels.sequences.tolist()})
+    known = sorted({s for labels, _ in labelled.parts() for s in labels.sequences.tolist()})
     for name in sequences:
         if name not in known:
             raise StageError(f"there is no sequence {name!r}; there are {', '.join(known)}")
     kept = []
-    for labels, seen, is_evaluation in parts:
+    for labels, seen in labelled.parts():
         mask = labels.registered & (dense | ~labels.dense)
-        if sequences and (is_evaluation or not whole_map):
-            mask &= np.isin(labels.sequences, list(sequences))
+        if sequences:
+            of_map = whole_map & ~np.isin(labels.sequences, list(labelled.evaluation))
+            mask &= of_map | np.isin(labels.sequences, list(sequences))
         rows = np.flatnonzero(mask)
-        kept.append((labels.select(rows), seen.select(rows), np.full(len(rows), is_evaluation)))
-    labels = Labels.concatenate([part for part, _, _ in kept])
+        kept.append((labels.select(rows), seen.select(rows)))
+    labels, seen = together(kept)
     if len(labels) == 0:
         raise StageError("no frame of " + (", ".join(sequences) or "the area") + " has a pose")
-    first = np.cumsum([0, *(len(part) for part, _, _ in kept)])
-    seen = SeenPoints(
-        np.concatenate([s.frame_idx + first[k] for k, (_, s, _) in enumerate(kept)]),
-        np.concatenate([s.point_ids for _, s, _ in kept]),
-        np.concatenate([s.pixels for _, s, _ in kept]),
-    )
-    order = np.lexsort((labels.names, labels.time_s, labels.sequences))
     return ExportedFrames(
         units=labelled.units,
         origin=labelled.origin,
-        labels=labels.select(order),
-        is_evaluation=np.concatenate([flag for _, _, flag in kept])[order],
-        seen=seen.select(order),
+        labels=labels,
+        is_evaluation=np.isin(labels.sequences, list(labelled.evaluation)),
+        seen=seen,
         points=labelled.points,
         cameras=labelled.cameras,
     )

@@ -156,10 +156,7 @@ def _read_lists(folder: Path, options: ImportOptions) -> tuple[_Frames, list[str
     frames = _Frames(
         tuple(name for part in kept for name in part.names),
         np.concatenate([part.roles for part in kept]),
-        Poses(
-            np.concatenate([part.poses.centers for part in kept]),
-            np.concatenate([part.poses.quats_wxyz for part in kept]),
-        ),
+        Poses.concatenate(part.poses for part in kept),
         tuple(file for part in kept for file in part.files),
     )
     return _without_missing_images(frames, notes), notes

@@ -17,10 +17,10 @@ from spn_data.errors import FormatError
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.georegister.result import GeoFit
-from spn_data.labels import Labels, LabelStatus, SeenPoints, read_labels, read_seen_points
+from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
-from spn_data.pose import Poses, Similarity
+from spn_data.pose import Similarity
 from spn_data.record import read_json
 
 POSES, SEEN, CAMERA, REGISTRATION = (
@@ -51,6 +51,14 @@ class LabelledArea:
     dense_seen: SeenPoints
     evaluation: dict[str, Labels]
     evaluation_seen: dict[str, SeenPoints]
+
+    def parts(self) -> list[tuple[Labels, SeenPoints]]:
+        """Mapping, its dense frames, and each evaluation sequence."""
+        return [
+            (self.mapping, self.mapping_seen),
+            (self.dense, self.dense_seen),
+            *((self.evaluation[n], self.evaluation_seen[n]) for n in self.evaluation),
+        ]
 
 
 def map_folder(area: Area) -> Path:
@@ -160,10 +168,6 @@ def _mapping_labels(
     n = len(chosen)
     row_of = {name: k for k, name in enumerate(chosen.names.tolist())}
     rows = np.array([row_of[name] for name in scene.names], dtype=np.int64)
-    centers, quats = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
-    centers[rows], quats[rows] = scene.poses.centers, scene.poses.quats_wxyz
-    status = np.full(n, LabelStatus.FAILED.value, dtype="<U10")
-    status[rows] = LabelStatus.REGISTERED.value
     inliers, coverage, error_px = np.zeros(n, np.int64), np.zeros(n), np.full(n, np.nan)
     ends = np.searchsorted(observations.image_idx, np.arange(len(scene.names) + 1))
     squared = (observations.residuals_px**2).sum(axis=1)
@@ -174,17 +178,11 @@ def _mapping_labels(
         coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
         error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
     reasons = _missing_reasons(area)
-    labels = Labels(
-        names=chosen.names,
-        sequences=chosen.sequences,
-        cameras=chosen.cameras,
-        sources=chosen.sources,
-        video_frame=chosen.video_frame,
-        dense=np.zeros(n, bool),
-        time_s=chosen.time_s,
-        status=status,
-        reason=np.array([reasons.get(name, "") for name in chosen.names.tolist()], dtype=np.str_),
-        poses=Poses(centers, quats),
+    labels = Labels.of_frames(
+        chosen,
+        scene.poses.at_rows(rows, n),
+        dense=False,
+        reason=[reasons.get(name, "") for name in chosen.names.tolist()],
         covariance=np.full((n, 6, 6), np.nan),
         inliers=inliers,
         coverage=coverage,

@@ -13,7 +13,7 @@ from spn_data.camera import Camera
 from spn_data.camera_file import camera_to_json, read_camera
 from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
-from spn_data.labels import Labels, write_labels, write_seen_points
+from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
 from spn_data.map_hash import map_hash
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
@@ -192,6 +192,7 @@ def _gnss(area: Area, labels: Labels, track: Telemetry | None) -> GnssCheck | No
 
 def _counts(labels: Labels, camera: Camera, gnss: GnssCheck | None) -> dict[str, Any]:
     registered = labels.registered
+    sigma, sigma_deg = sigmas(labels.covariance[registered])
     reasons: dict[str, int] = {}
     for reason in labels.reason[~registered].tolist():
         kind = "ambiguous" if reason.startswith("ambiguous") else "too little agreement"
@@ -204,15 +205,8 @@ def _counts(labels: Labels, camera: Camera, gnss: GnssCheck | None) -> dict[str,
         "fov_deg": round(camera.horizontal_fov_deg, 3),
         "error_px": _median(labels.error_px[registered], 4),
         "inliers": _median(labels.inliers[registered], 0),
-        "sigma": _median(
-            np.sqrt(np.trace(labels.covariance[registered][:, :3, :3], axis1=1, axis2=2)), 6
-        ),
-        "sigma_deg": _median(
-            np.rad2deg(
-                np.sqrt(np.trace(labels.covariance[registered][:, 3:, 3:], axis1=1, axis2=2))
-            ),
-            6,
-        ),
+        "sigma": _median(sigma, 6),
+        "sigma_deg": _median(sigma_deg, 6),
         "gnss": None if gnss is None else asdict(gnss),
     }
 

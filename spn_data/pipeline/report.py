@@ -17,7 +17,7 @@ from spn_data.errors import FormatError, StageError
 from spn_data.files import write_whole
 from spn_data.frames import Frames, read_frames
 from spn_data.georegister.result import GeoFit
-from spn_data.labels import Labels
+from spn_data.labels import Labels, sigmas
 from spn_data.pipeline import coverage as coverage_stage
 from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
@@ -150,7 +150,7 @@ def frame_table(
 
 def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
     n = len(labels)
-    trace = np.diagonal(labels.covariance, axis1=1, axis2=2)
+    sigma_m, sigma_deg = sigmas(labels.covariance)
     return FrameTable(
         names=labels.names,
         sequences=labels.sequences,
@@ -161,8 +161,8 @@ def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
         status=labels.status,
         reason=labels.reason,
         poses=labels.poses,
-        sigma_m=np.sqrt(trace[:, :3].sum(axis=1)),
-        sigma_deg=np.rad2deg(np.sqrt(trace[:, 3:].sum(axis=1))),
+        sigma_m=sigma_m,
+        sigma_deg=sigma_deg,
         inliers=labels.inliers,
         error_px=labels.error_px,
         **FrameTable.no_facts(n),
@@ -183,7 +183,7 @@ def _of_candidates(frames: Frames, mask: np.ndarray) -> FrameTable:
         time_s=found.time_s,
         status=found.status,
         reason=found.reason,
-        poses=Poses(np.full((n, 3), np.nan), np.full((n, 4), np.nan)),
+        poses=Poses.unknown(n),
         sigma_m=unknown,
         sigma_deg=unknown,
         inliers=np.zeros(n, np.int64),

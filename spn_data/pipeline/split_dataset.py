@@ -48,8 +48,7 @@ class GivenFrames:
 
 
 def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
-    parts = [(labelled.mapping, labelled.mapping_seen), (labelled.dense, labelled.dense_seen)]
-    parts += [(labelled.evaluation[n], labelled.evaluation_seen[n]) for n in labelled.evaluation]
+    parts = labelled.parts()
     kept = [np.flatnonzero(split.of(labels.names) != LEFT_OUT) for labels, _ in parts]
     labels = Labels.concatenate([p.select(rows) for (p, _), rows in zip(parts, kept, strict=True)])
     order = np.lexsort((labels.time_s, labels.sequences))

@@ -131,12 +131,10 @@ def _own_points(
     usable = np.flatnonzero(wanted & strong[tracks.frame])
     if not len(usable):
         return none
-    poses = Poses(np.full((len(putative), 3), np.nan), np.full((len(putative), 4), np.nan))
-    for row, pose in found.items():
-        poses.centers[row], poses.quats_wxyz[row] = pose.pose.centers[0], pose.pose.quats_wxyz[0]
+    known = Poses.concatenate(one.pose for one in found.values())
     pixels = sequence.pixels_of(tracks.frame[usable], tracks.feature[usable])
     points = triangulate(
-        poses,
+        known.at_rows(list(found), len(putative)),
         camera,
         pixels,
         tracks.frame[usable],

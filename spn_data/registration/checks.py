@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.colmap.resection import resect
+from spn_data.labels import sigmas
 from spn_data.map_points import covered_share
 from spn_data.pose import Poses, rotation_errors_deg
 from spn_data.registration.options import CheckOptions, RegisterOptions
@@ -72,6 +73,7 @@ def gather_evidence(
             depth[row] = np.median(np.linalg.norm(away, axis=1))
             rival[row] = _rival(sequence, solution, row, depth[row], options)
     shown = [_points_of_features(sequence, solution, row) for row in range(n)]
+    sigma, sigma_deg = sigmas(covariances)
     keys = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return Evidence(
         direct=direct,
@@ -80,8 +82,8 @@ def gather_evidence(
         coverage=coverage,
         rival=rival,
         depth=depth,
-        sigma=np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)),
-        sigma_deg=np.rad2deg(np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))),
+        sigma=sigma,
+        sigma_deg=sigma_deg,
         pairs=keys,
         matches=np.array([len(pairs[int(i), int(j)]) for i, j in keys], dtype=np.int64),
         agreement=np.array(

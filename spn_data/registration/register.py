@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.correspondences import FramesToMap, extract_missing, match_missing
 from spn_data.frames import Frames
-from spn_data.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels import Labels, SeenPoints
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, sequence_pairs
@@ -162,7 +162,6 @@ def _covariances(
 def labels_of(chosen: Frames, registered: Registered) -> Labels:
     """The frames (N), in the order in which they were registered, as labels in the map's gauge."""
     solution, covariance = registered.solution, registered.covariance
-    accepted = solution.posed
     n = len(chosen)
     error_px = np.full(n, np.nan)
     if covariance is not None:
@@ -171,17 +170,11 @@ def labels_of(chosen: Frames, registered: Registered) -> Labels:
         count = np.bincount(solution.frame[of_map], minlength=n)
         total = np.bincount(solution.frame[of_map], weights=squared[of_map], minlength=n)
         error_px = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
-    return Labels(
-        names=chosen.names,
-        sequences=chosen.sequences,
-        cameras=chosen.cameras,
-        sources=chosen.sources,
-        video_frame=chosen.video_frame,
-        dense=np.zeros(n, bool),
-        time_s=chosen.time_s,
-        status=np.where(accepted, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
-        reason=np.array(registered.reason, dtype=np.str_),
-        poses=solution.poses,
+    return Labels.of_frames(
+        chosen,
+        solution.poses,
+        dense=False,
+        reason=registered.reason,
         covariance=registered.covariances,
         inliers=registered.inliers,
         coverage=registered.coverage,

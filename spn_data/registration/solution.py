@@ -93,9 +93,7 @@ def refine(
     n = len(sequence.pixels)
     posed = np.zeros(n, bool)
     posed[list(found)] = True
-    poses = Poses(np.full((n, 3), np.nan), np.full((n, 4), np.nan))
-    for row, pose in found.items():
-        poses.centers[row], poses.quats_wxyz[row] = pose.pose.centers[0], pose.pose.quats_wxyz[0]
+    poses = Poses.concatenate(one.pose for one in found.values()).at_rows(list(found), n)
     matches = np.concatenate(putative)
     frame = np.repeat(np.arange(n), [len(m) for m in putative])
     table = np.concatenate(
@@ -127,13 +125,11 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
         before, agree = agree, _agree(state, everything, options.max_error_px)
         if np.array_equal(before, agree):
             break
-    poses = Poses(np.full_like(solution.poses.centers, np.nan), solution.poses.quats_wxyz * np.nan)
-    poses.centers[rows], poses.quats_wxyz[rows] = state.poses.centers, state.poses.quats_wxyz
     own = solution.own[agree]
     used = np.unique(own[own >= 0])
     settled = Solution(
         solution.posed,
-        poses,
+        state.poses.at_rows(rows, len(solution.posed)),
         state.camera,
         solution.frame[agree],
         solution.feature[agree],
@@ -157,10 +153,8 @@ def without(solution: Solution, refused: np.ndarray) -> Solution:
     stay = ~refused[solution.frame]
     seen = np.bincount(solution.own[stay & (solution.own >= 0)], minlength=len(solution.own_points))
     stay &= (solution.own < 0) | (np.append(seen, 0)[solution.own] >= 2)
-    poses = Poses(
-        np.where(refused[:, None], np.nan, solution.poses.centers),
-        np.where(refused[:, None], np.nan, solution.poses.quats_wxyz),
-    )
+    kept = np.flatnonzero(~refused)
+    poses = solution.poses[kept].at_rows(kept, len(refused))
     used = np.unique(solution.own[stay & (solution.own >= 0)])
     own = solution.own[stay]
     return Solution(

@@ -118,7 +118,7 @@ def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> 
             np.concatenate(places),
             np.full(sum(map(len, frame)), -1),
         )
-        state = SequenceState(_join(poses), camera, np.zeros((0, 3)))
+        state = SequenceState(Poses.concatenate(poses), camera, np.zeros((0, 3)))
         lens = free_lens(camera, len(poses), options)
         camera = adjust(state, observations, scale_px=SCALE_PX, lens=lens).camera
     return camera
@@ -133,10 +133,4 @@ def _resect(
         camera,
         max_error_px=options.max_error_px,
         seed=options.seed,
-    )
-
-
-def _join(poses: list[Poses]) -> Poses:
-    return Poses(
-        np.concatenate([p.centers for p in poses]), np.concatenate([p.quats_wxyz for p in poses])
     )

@@ -82,14 +82,7 @@ class FrameTable:
             for f in fields(cls)
             if f.name != "poses"
         }
-        poses = [part.poses for part in parts]
-        return cls(
-            **columns,
-            poses=Poses(
-                np.concatenate([p.centers for p in poses]),
-                np.concatenate([p.quats_wxyz for p in poses]),
-            ),
-        )
+        return cls(**columns, poses=Poses.concatenate(part.poses for part in parts))
 
     @staticmethod
     def no_facts(n: int) -> dict[str, np.ndarray]:
