@@ -17,6 +17,10 @@ from spn_data.errors import InputError
 from spn_data.files import write_whole
 from spn_data.pose import Poses, canonical_quats
 
+TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (
+    f"dataset_{part}.txt" for part in ("train", "validation", "test")
+)
+NVM = "reconstruction.nvm"  # the model beside the lists
 HEADER = ("Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", "")
 MAX_FRAMES = 1_000_000
 _MAX_LINE_BYTES = 4096

@@ -90,9 +90,7 @@ def nearest_frames(
     level = np.zeros(n, np.int64)
     for first in range(0, n, step):
         part = slice(first, first + step)
-        distance = cdist(queries.centers[part], mapping.centers)
-        cosine = np.abs(queries.quats_wxyz[part] @ mapping.quats_wxyz.T)
-        angle = np.rad2deg(2 * np.arccos(np.minimum(cosine, 1.0)))
+        distance, angle = distances_and_angles(queries[part], mapping)
         cost = distance + angle / options.deg_per_m
         answer[part] = cost.argmin(axis=1)
         levels = _levels(distance, angle, options)
@@ -109,6 +107,12 @@ def nearest_frames(
         answer_distance=answer_distance,
         answer_angle_deg=answer_angle_deg,
     )
+
+
+def distances_and_angles(a: Poses, b: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """(N, M) between every two of N and M poses; angles in degrees, exact to 1e-5."""
+    cosine = np.minimum(np.abs(a.quats_wxyz @ b.quats_wxyz.T), 1.0)
+    return cdist(a.centers, b.centers), np.rad2deg(2 * np.arccos(cosine))
 
 
 def strata_of(queries: Poses, mapping: Poses, options: CoverageOptions | None = None) -> np.ndarray:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from spn_data.camera import Camera
+from spn_data.grouping import number_within
 from spn_data.map_points import covered_share
 from spn_data.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.pose_fit import PoseFit, fit_pose
@@ -203,10 +204,7 @@ def spread(pixels: np.ndarray, width: int, height: int, count: int) -> np.ndarra
     columns = int(np.ceil(width / side))
     x, y = (pixels // side).astype(np.int64).T
     cells = y * columns + x
-    order = np.argsort(cells, kind="stable")
-    sizes = np.unique(cells, return_counts=True)[1]
-    rank_in_cell = np.empty(len(pixels), np.int64)
-    rank_in_cell[order] = np.arange(len(pixels)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    rank_in_cell = number_within(cells, int(cells.max()) + 1)
     return np.sort(np.argsort(rank_in_cell, kind="stable")[:count])
 
 

@@ -23,6 +23,7 @@ from spn_data.hdf5_schema import (
     Column,
     DatasetInfo,
     Role,
+    flag,
 )
 from spn_data.pose import Poses
 
@@ -95,10 +96,6 @@ class Dataset:
 
         return _guarded(self.path, f"group {name}", read)
 
-    def of_role(self, role: Role) -> list[DatasetGroup]:
-        """Groups of one role, by name."""
-        return [group for group in self.groups.values() if group.role is role]
-
     def close(self) -> None:
         self._file.close()
 
@@ -125,9 +122,9 @@ class DatasetGroup:
         self._path, self.name = path, name
         attributes = _attributes(group)
         self.role = Role(attributes["role"])
-        self.all_valid = _is_set(attributes["all_valid"])
+        self.all_valid = flag(attributes["all_valid"])
         points = _child(group, "points", h5py.Group)
-        self.points_for_training = _is_set(_attributes(points)["for_training"])
+        self.points_for_training = flag(_attributes(points)["for_training"])
         if self.points_for_training and self.role is not Role.TRAIN:
             raise ValueError(f"its points are marked for training, but it is of role {self.role}")
         rows = len(_child(group, "names", h5py.Dataset))
@@ -315,9 +312,3 @@ def _attributes(of: h5py.Group) -> dict[str, Any]:
         value = of.attrs[name]
         found[name] = value.decode() if isinstance(value, bytes) else value
     return found
-
-
-def _is_set(value: Any) -> bool:
-    if int(value) not in (0, 1):
-        raise ValueError(f"{value!r} is neither 0 nor 1")
-    return bool(int(value))

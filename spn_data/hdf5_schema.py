@@ -133,11 +133,11 @@ class DatasetInfo:
             raise ValueError("split, fingerprints or notes are not what is written there")
         return cls(
             units=_text(attributes["units"]),
-            origin=_origin(attributes) if _flag(attributes["has_origin"]) else None,
-            up_is_known=_flag(attributes["up_is_known"]),
+            origin=_origin(attributes) if flag(attributes["has_origin"]) else None,
+            up_is_known=flag(attributes["up_is_known"]),
             camera=None if camera is None else camera_from_json(camera),
-            has_images=_flag(attributes["has_images"]),
-            optimistic=_flag(attributes["optimistic"]),
+            has_images=flag(attributes["has_images"]),
+            optimistic=flag(attributes["optimistic"]),
             split=split,
             fingerprints={str(k): str(v) for k, v in prints.items()},
             notes=tuple(str(note) for note in notes),
@@ -176,7 +176,8 @@ def _text(value: Any) -> str:
     return value
 
 
-def _flag(value: Any) -> bool:
+def flag(value: Any) -> bool:
+    """Of an attribute; ValueError for what is neither 0 nor 1."""
     if int(value) not in (0, 1):
         raise ValueError(f"{value!r} is neither 0 nor 1")
     return bool(int(value))

@@ -130,18 +130,12 @@ class MapCovariance:
             own if options.clustered else variance * own,
         )
 
-    def functional_covariance(self, functional: Functional, *, own: bool = True) -> np.ndarray:
+    def functional_covariance(self, functional: Functional) -> np.ndarray:
         """(r, r) covariance of one functional: see functional_covariances."""
-        return self.functional_covariances([functional], own=own)[0]
+        return self.functional_covariances([functional])[0]
 
-    def functional_covariances(
-        self, functionals: Sequence[Functional], *, own: bool = True
-    ) -> list[np.ndarray]:
-        """(r, r) each: through frames and lenses, which all points share, and of each point by itself.
-
-        own : False leaves the points' own errors out, for one who has them already in the residuals of the
-        frame that looks at them.
-        """
+    def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
+        """(r, r) each: through frames and lenses, which all points share, and of each point by itself."""
         if not functionals:
             return []
         sides = [self._right_side(functional) for functional in functionals]
@@ -152,13 +146,10 @@ class MapCovariance:
         for (by_own, _), functional, a, b in zip(
             sides, functionals, ends[:-1], ends[1:], strict=True
         ):
-            covariance = solved[:, a:b].T @ pulled[:, a:b]
-            if own:
-                errors = self._own[self._place[functional.point_idx]]
-                covariance = covariance + np.tensordot(
-                    np.einsum("rki,kij->rkj", by_own, errors), by_own, axes=((1, 2), (1, 2))
-                )
-            found.append(covariance)
+            errors = self._own[self._place[functional.point_idx]]
+            each = np.einsum("rki,kij->rkj", by_own, errors)
+            of_points = np.tensordot(each, by_own, axes=((1, 2), (1, 2)))
+            found.append(solved[:, a:b].T @ pulled[:, a:b] + of_points)
         return found
 
     def pose_covariances(self, frames: np.ndarray | None = None) -> np.ndarray:
@@ -176,12 +167,6 @@ class MapCovariance:
             solved = solved.reshape(n, len(some), POSE)
             found[first : first + len(some)] = np.einsum("nfi,nfj->fij", solved, pulled)
         return found
-
-    def lens_covariance(self, camera_id: int) -> np.ndarray:
-        """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2; zero for what mapping held."""
-        return self.functional_covariance(
-            Functional(np.zeros(0, dtype=np.int64), np.zeros((8, 0, 3)), camera_id, np.eye(8))
-        )
 
     def _right_side(self, functional: Functional) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives by the points' own whitened errors (r, K, 3), and by frames and lenses (n, r)."""

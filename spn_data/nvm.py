@@ -19,6 +19,7 @@ import numpy as np
 from spn_data.camera import Camera
 from spn_data.errors import InputError
 from spn_data.files import writing_whole
+from spn_data.grouping import number_within
 from spn_data.pose import Poses, canonical_quats
 
 MAX_IMAGES = 1_000_000
@@ -71,7 +72,7 @@ def nvm_model(
         points[1][used],
         new_idx,
         image_idx,
-        _numbers_within(image_idx, len(names)),
+        number_within(image_idx, len(names)),
         offsets_px,
     )
 
@@ -79,15 +80,6 @@ def nvm_model(
 def offsets_from_center(camera: Camera, pixels: np.ndarray, focal_px: float) -> np.ndarray:
     """(K, 2) where a camera without distortion, of that focal length and centred, sees `pixels` (K, 2)."""
     return focal_px * camera.unproject(pixels) if len(pixels) else np.zeros((0, 2))
-
-
-def _numbers_within(image_idx: np.ndarray, images: int) -> np.ndarray:
-    """(M,) 0, 1, 2, … within each image, in the order of the measurements."""
-    order = np.argsort(image_idx, kind="stable")
-    counts = np.bincount(image_idx, minlength=images)
-    numbers = np.empty(len(image_idx), dtype=np.int64)
-    numbers[order] = np.arange(len(image_idx)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return numbers
 
 
 def write_nvm(path: Path, model: NvmModel) -> None:

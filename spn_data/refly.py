@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
-from spn_data.coverage import CoverageOptions, Stratum
+from spn_data.coverage import CoverageOptions, Stratum, distances_and_angles
 from spn_data.pose import (
     Poses,
     angles_from_rotations,
@@ -109,16 +108,14 @@ def _level(poses: Poses, limit_deg: float) -> Poses:
 
 def _within(stops: Poses, queries: Poses, limit: float, limit_deg: float) -> np.ndarray:
     """(K, N) bool: a frame at the stop covers the query."""
-    least = np.cos(np.deg2rad(limit_deg) / 2)
-    near = cdist(stops.centers, queries.centers) <= limit
-    return np.asarray(near & (np.abs(stops.quats_wxyz @ queries.quats_wxyz.T) >= least))
+    distance, angle = distances_and_angles(stops, queries)
+    return (distance <= limit) & (angle <= limit_deg)
 
 
 def _costs(stops: Poses, queries: Poses, deg_per_m: float) -> np.ndarray:
     """(K, N) distance plus angle, in the unit of length."""
-    cosine = np.minimum(np.abs(stops.quats_wxyz @ queries.quats_wxyz.T), 1.0)
-    angle = np.rad2deg(2 * np.arccos(cosine))
-    return np.asarray(cdist(stops.centers, queries.centers) + angle / deg_per_m)
+    distance, angle = distances_and_angles(stops, queries)
+    return distance + angle / deg_per_m
 
 
 def _cover(covers: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spn_data.camera import Camera
+from spn_data.grouping import number_within
 from spn_data.pose import Poses
 from spn_data.timing import Progress
 
@@ -124,20 +125,11 @@ def _share(
     points, ranges, cells = points[free], ranges[free], cells[free]
     covered = np.zeros(count, dtype=bool)
     # One known point covers a cell, and one of the first few mostly is: the rest is seldom looked at.
-    is_first = _rank_in_cell(cells, count) < _FIRST
+    is_first = number_within(cells, count) < _FIRST
     for wanted in (is_first, ~is_first):
         part = np.flatnonzero(wanted & ~covered[cells])
         covered[cells[part][_known(center, points[part], ranges[part], seen, options)]] = True
     return float(covered.mean())
-
-
-def _rank_in_cell(cells: np.ndarray, count: int) -> np.ndarray:
-    """(K,) how many points of the same cell come before."""
-    order = np.argsort(cells.astype(np.min_scalar_type(count)), kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=count))])
-    rank = np.empty(len(cells), dtype=np.int64)
-    rank[order] = np.arange(len(cells)) - starts[cells[order]]
-    return rank
 
 
 def _border(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

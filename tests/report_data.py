@@ -12,7 +12,7 @@ from spn_data.georegister.uncertainty import Uncertainty
 from spn_data.map_points import MapPoints
 from spn_data.pose import Poses, Similarity, rotations_from_angles
 from spn_data.record import StageRecord
-from spn_data.report.data import CoverageFacts, FlyAgain, FrameTable, ReportData, StageFacts
+from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.split import Split, SplitOptions
 
 
@@ -135,7 +135,7 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
         fov_tan={"flight1": (0.73, 0.41), "medium": (0.6, 0.34)},
         coverage=CoverageFacts(
             {"medium": {"high": 30, "medium": 6, "low": 2, "failed": 2}},
-            (FlyAgain((1.0, 2.0, 14.0), (49.000018, 8.4000137), 90.0, -30.0, 4),),
+            (PlaceToFly((1.0, 2.0, 14.0), (49.000018, 8.4000137), 90.0, -30.0, 4),),
             "high: near; medium: less near; low: farther.",
         ),
         split=Split(frames.names, group, frames.reason, SplitOptions()),

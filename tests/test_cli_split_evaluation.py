@@ -71,7 +71,7 @@ def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path)
     labelled = read_labelled_area(Area(split_area))
     with Dataset(split_area / SPLIT / "dataset.h5") as dataset:
         assert not dataset.info.optimistic
-        (medium,) = dataset.of_role(Role.TEST)
+        (medium,) = (g for g in dataset.groups.values() if g.role is Role.TEST)
         assert medium.name == "medium"
         assert not medium.points_for_training
         assert 0 < medium.dense.sum() < len(medium)

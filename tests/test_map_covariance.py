@@ -348,7 +348,6 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
     together = covariance.functional_covariances(wanted)
     for functional, found in zip(wanted, together, strict=True):
         assert np.allclose(found, covariance.functional_covariance(functional), rtol=1e-9)
-    assert np.allclose(together[2], covariance.lens_covariance(2))
     assert covariance.functional_covariances([]) == []
     some = covariance.pose_covariances(np.array([7, 2]))
     assert np.allclose(some, covariance.pose_covariances()[[7, 2]], rtol=1e-9)

@@ -31,7 +31,7 @@ from spn_data.audit_files import (
     check_labels,
     check_measured,
 )
-from spn_data.cambridge import read_cambridge
+from spn_data.cambridge import NVM, read_cambridge
 from spn_data.colmap.model import read_scene
 from spn_data.errors import FormatError, SpnError
 from spn_data.hdf5_reader import Dataset
@@ -39,7 +39,7 @@ from spn_data.labels import Labels
 from spn_data.map_hash import map_hash
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import REGISTRATION, LabelledArea, read_labelled_area
-from spn_data.pipeline.split_cambridge import NVM, image_name, list_of
+from spn_data.pipeline.split_cambridge import image_name, list_of
 from spn_data.record import VERSION, read_json, write_json
 from spn_data.split import TRAIN, Split
 from spn_data.split_file import read_split

@@ -120,9 +120,8 @@ def read_coverage(area: Area, folder: str = EVALUATED) -> dict[str, Any] | None:
 
 def stale_because(area: Area, coverage: Mapping[str, Any]) -> str | None:
     """Why what `read_coverage` gave no longer fits the area, or None."""
-    before, now = dict(coverage["made_of"]), _fingerprints(area)
-    if coverage.get("waypoints"):
-        now = {stage: now[stage] for stage in now if stage in (MODEL, GEO)}
+    before = dict(coverage["made_of"])
+    now = _fingerprints(area, of_plan=bool(coverage.get("waypoints")))
     for stage in sorted({*before, *now}):
         if stage not in now:
             return f"{stage} is missing"
@@ -240,12 +239,13 @@ def _together(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:
     )
 
 
-def _fingerprints(area: Area) -> dict[str, str]:
-    """Of the stages that coverage is made from, by name."""
-    kept = [s for s in area.stages() if s in (MODEL, GEO) or s.startswith(f"{EVALUATION}/")]
-    kept += [
-        f"{DENSE}/{name}" for name in area.sequences(DENSE) if name in area.sequences(EVALUATION)
-    ]
+def _fingerprints(area: Area, *, of_plan: bool) -> dict[str, str]:
+    """Of the stages that coverage is made from, by name; a plan's needs no evaluation sequence."""
+    kept = [stage for stage in area.stages() if stage in (MODEL, GEO)]
+    if not of_plan:
+        names = area.sequences(EVALUATION)
+        kept += [f"{EVALUATION}/{name}" for name in names]
+        kept += [f"{DENSE}/{name}" for name in area.sequences(DENSE) if name in names]
     return {stage: area.record(stage).fingerprint() for stage in kept}
 
 
@@ -257,16 +257,13 @@ def _write(area: Area, found: AreaCoverage, options: CoverageStageOptions, waypo
     path.mkdir(parents=True)
     for sequence, coverage in found.by_name.items():
         write_coverage(path / f"{sequence}.csv", coverage)
-    made_of = _fingerprints(area)
-    if waypoints:
-        made_of = {stage: made_of[stage] for stage in made_of if stage in (MODEL, GEO)}
     value = {
         "version": VERSION,
         "units": found.units,
         "options": asdict(found.options) if found.options else None,
         "refly_options": asdict(options.refly),
         "waypoints": waypoints,
-        "made_of": made_of,
+        "made_of": _fingerprints(area, of_plan=bool(waypoints)),
         "sequences": {n: c.summary() for n, c in found.by_name.items()},
         "fly_again": None if found.fly_again is None else _stops(found.stops),
         "notes": list(found.notes),

@@ -10,7 +10,16 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from spn_data.cambridge import CambridgeList, far_positions, oddities, read_cambridge
+from spn_data.cambridge import (
+    NVM,
+    TEST_LIST,
+    TRAIN_LIST,
+    VALIDATION_LIST,
+    CambridgeList,
+    far_positions,
+    oddities,
+    read_cambridge,
+)
 from spn_data.camera import Camera
 from spn_data.errors import GeometryError, InputError
 from spn_data.hdf5 import DatasetWriter
@@ -24,11 +33,10 @@ from spn_data.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_data.timing import Progress
 
 LISTS = {
-    Role.TRAIN: "dataset_train.txt",
-    Role.VALIDATION: "dataset_validation.txt",
-    Role.TEST: "dataset_test.txt",
+    Role.TRAIN: TRAIN_LIST,
+    Role.VALIDATION: VALIDATION_LIST,
+    Role.TEST: TEST_LIST,
 }
-NVM = "reconstruction.nvm"
 _NO_PLACE = (
     "the world of these lists has no known origin and no known up: it can't be flown by as it is"
 )

@@ -23,7 +23,7 @@ from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.pose import Poses
 from spn_data.record import read_json, versions
-from spn_data.report.data import CoverageFacts, FlyAgain, FrameTable, ReportData, StageFacts
+from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import Verdict, verdict
 from spn_data.split_file import read_split
@@ -39,16 +39,8 @@ class ReportOptions:
     max_frames: int = 30_000
 
 
-def report(area: Area, options: ReportOptions | None = None) -> Path:
-    """Write report.html at the area's root, in place of an earlier one; gives its path.
-
-    Raises as `write_report`.
-    """
-    return write_report(area, options)[0]
-
-
 def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, Verdict]:
-    """The same, with the verdict that the page shows.
+    """Write report.html at the area's root, in place of an earlier one; its path, and the verdict on it.
 
     Stale stages are named and otherwise left out. Raises StageError where the area holds no frames yet,
     FormatError or InputError for a damaged file.
@@ -221,7 +213,7 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
             for name, summary in value["sequences"].items()
         }
         again = tuple(
-            FlyAgain(
+            PlaceToFly(
                 (float(stop["x_m"]), float(stop["y_m"]), float(stop["z_m"])),
                 (float(stop["lat_deg"]), float(stop["lon_deg"])),
                 float(stop["heading_deg"]),

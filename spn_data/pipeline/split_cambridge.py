@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.audit import MIN_TRAINING_VIEWS
-from spn_data.cambridge import write_cambridge
+from spn_data.cambridge import NVM, TEST_LIST, TRAIN_LIST, VALIDATION_LIST, write_cambridge
 from spn_data.camera import Camera
 from spn_data.files import write_whole
 from spn_data.map_points import MapPoints
@@ -17,9 +17,7 @@ from spn_data.pipeline.split_dataset import GivenFrames
 from spn_data.rendering import Renderer, undistorted_camera
 from spn_data.split import TRAIN, VALIDATION
 
-NVM = "reconstruction.nvm"
-_LISTS = {TRAIN: "dataset_train.txt", VALIDATION: "dataset_validation.txt"}
-TEST_LIST = "dataset_test.txt"
+_LISTS = {TRAIN: TRAIN_LIST, VALIDATION: VALIDATION_LIST}
 
 
 def list_of(group: str) -> str:

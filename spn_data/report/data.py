@@ -132,7 +132,7 @@ class StageFacts:
 
 
 @dataclass(frozen=True)
-class FlyAgain:
+class PlaceToFly:
     """A view that mapping lacks: of a camera there, and how many evaluation frames it would help."""
 
     east_north_up_m: tuple[float, float, float]
@@ -151,7 +151,7 @@ class CoverageFacts:
     """
 
     strata: dict[str, dict[str, int]]
-    fly_again: tuple[FlyAgain, ...]
+    fly_again: tuple[PlaceToFly, ...]
     limits: str
     stale: str | None = None
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from spn_data import audit
 from spn_data.record import StageRecord
-from spn_data.report.data import FAILED, STRATA, FlyAgain, FrameTable, ReportData
+from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
 from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import Finding, Level, Verdict
@@ -147,7 +147,7 @@ def coverage(data: ReportData) -> str:
     return "".join(parts)
 
 
-def _fly_again(places: Sequence[FlyAgain]) -> str:
+def _fly_again(places: Sequence[PlaceToFly]) -> str:
     """Table of places; a long one is folded after its first rows."""
     header = (
         *("", "latitude, longitude", "east, north, up (m)", "heading (deg)", "pitch (deg)"),
