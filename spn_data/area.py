@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -51,8 +52,8 @@ _READY = "ready"
 class Facts:
     """What the user says of the area: facts, not tuning.
 
-    sources : folders and files that were reconstructed, in the order in which they were given.
-    evaluation : what each evaluation sequence was registered from, by its name.
+    sources : folders and files that were reconstructed, in the order in which they were given; relative ones
+    count from the area's folder. evaluation : what each evaluation sequence was registered from, by its name.
     """
 
     sources: tuple[str, ...] = ()
@@ -137,7 +138,8 @@ class Area:
         """The stages that `stage` is made from, as the area is now."""
         group, _, name = stage.partition("/")
         if stage == SPLIT:
-            return tuple(s for s in self.stages() if s != SPLIT)
+            found = [s for s in self.stages() if s != SPLIT]
+            return tuple(dict.fromkeys((FRAMES, MODEL, *found)))
         if group == DENSE:
             evaluation = f"{EVALUATION}/{name}"
             return (MODEL, evaluation) if self.has(evaluation) else (FRAMES, MODEL)
@@ -282,6 +284,13 @@ class Area:
                 for old in (self.root / group).glob(".old-*")
             ]
         return [s for s in names if self._old(s).exists() and not self.folder(s).exists()]
+
+    def place_of(self, path: Path) -> str:
+        """A user's path as area.toml holds it: a relative one from the area's folder on, so that it is found
+        from any current folder, and where both have moved together."""
+        if not path.is_absolute():
+            path = Path(os.path.relpath(os.path.abspath(path), os.path.realpath(self.root)))
+        return str(path).encode(errors="backslashreplace").decode()
 
     def write_facts(self, facts: Facts) -> None:
         if facts == self.facts and (self.root / _FACTS).exists():

@@ -11,7 +11,7 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames
-from spn_data.files import write_csv
+from spn_data.files import read_csv, write_csv
 from spn_data.pose import Poses
 from spn_data.timing import Progress
 from spn_data.view_share import SeenMap, view_shares
@@ -205,6 +205,11 @@ def write_coverage(path: Path, coverage: Coverage) -> None:
         "reason": queries.reason,
     }
     write_csv(path, {name: [str(cell) for cell in columns[name]] for name in COLUMNS})
+
+
+def read_strata(path: Path) -> dict[str, str]:
+    """Of coverage CSV: stratum by name. Raises InputError where it is not what `write_coverage` writes."""
+    return {row["name"]: row["stratum"] for _, row in read_csv(path, COLUMNS)}
 
 
 def _cells(values: np.ndarray, digits: int) -> list[str]:

@@ -1,16 +1,16 @@
-"""Files that stand under their name only when they are complete."""
+"""Files that stand under their name only when they are complete; CSV read as strictly as it is written."""
 
 from __future__ import annotations
 
 import csv
 import io
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from spn_data.errors import StageError
+from spn_data.errors import InputError, StageError
 
 
 @contextmanager
@@ -49,3 +49,33 @@ def write_csv(path: Path, columns: Mapping[str, Iterable[object]]) -> None:
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
     write_whole(path, text.getvalue())
+
+
+def read_csv(
+    path: Path, columns: Collection[str], *, max_bytes: int = 500_000_000
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """(line, cells by column) of each row that `write_csv` wrote with these columns.
+
+    Raises InputError, with the line, where it is another file, and beyond `max_bytes`.
+    """
+    try:
+        if path.stat().st_size > max_bytes:
+            raise InputError(f"is larger than {max_bytes // 1_000_000} MB", path=path)
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file, strict=True)
+            try:
+                if next(reader, None) != list(columns):
+                    told = f"the header is not that of {path.name}: {','.join(columns)}"
+                    raise InputError(told, path=path, line=1)
+                for cells in reader:
+                    if len(cells) != len(columns):
+                        told = f"{len(cells)} cells, expected {len(columns)}"
+                        raise InputError(told, path=path, line=reader.line_num)
+                    yield reader.line_num, dict(zip(columns, cells, strict=True))
+            except csv.Error as error:
+                told = f"is not a CSV file: {error}"
+                raise InputError(told, path=path, line=reader.line_num) from error
+    except OSError as error:
+        raise InputError(f"can't be read: {error.strerror}", path=path) from error
+    except UnicodeDecodeError as error:
+        raise InputError("is not UTF-8 text", path=path) from error

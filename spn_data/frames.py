@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import write_csv
+from spn_data.files import read_csv, write_csv
 from spn_data.telemetry.track import Telemetry
 
-_MAX_CSV_BYTES = 500_000_000
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,200}/[A-Za-z0-9._-]{1,200}\.jpg", re.ASCII)
 _KEY = re.compile(r"[A-Za-z0-9._-]{1,200}", re.ASCII)
 
@@ -160,16 +157,15 @@ def write_frames(path: Path, frames: Frames) -> None:
 
 def read_frames(path: Path) -> Frames:
     """From frames.csv; InputError with the line where it is not what `write_frames` writes."""
-    try:
-        if path.stat().st_size > _MAX_CSV_BYTES:
-            raise InputError(f"is larger than {_MAX_CSV_BYTES // 1_000_000} MB", path=path)
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = _parse(path, csv.reader(file, strict=True))
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputError("is not UTF-8 text", path=path) from error
-    table = {column: [row[i] for row in rows] for i, column in enumerate(_COLUMNS)}
+    table: dict[str, list[object]] = {column: [] for column in _COLUMNS}
+    seen: set[str] = set()
+    for line, row in read_csv(path, _COLUMNS):
+        try:
+            for column, cell in row.items():
+                table[column].append(_convert(column, cell))
+            _check_row(row, seen)
+        except ValueError as error:
+            raise InputError(str(error), path=path, line=line) from error
     arrays: dict[str, np.ndarray] = {}
     for column, (field, index) in _COLUMNS.items():
         dtype = np.str_ if column in _STRINGS else np.int64 if column in _INTEGERS else np.float64
@@ -181,32 +177,6 @@ def read_frames(path: Path) -> Frames:
         else:
             arrays[field] = np.column_stack([arrays[field], values])
     return Frames(**arrays)
-
-
-def _parse(path: Path, reader: Any) -> list[list[object]]:
-    """Rows of converted values, each checked."""
-    rows: list[list[object]] = []
-    seen: set[str] = set()
-    try:
-        header = next(reader, None)
-        if header != list(_COLUMNS):
-            raise InputError(
-                f"the header is not that of frames.csv: {','.join(_COLUMNS)}", path=path, line=1
-            )
-        for cells in reader:
-            line = reader.line_num
-            if len(cells) != len(_COLUMNS):
-                message = f"{len(cells)} cells, expected {len(_COLUMNS)}"
-                raise InputError(message, path=path, line=line)
-            try:
-                row = [_convert(c, cell) for c, cell in zip(_COLUMNS, cells, strict=True)]
-                _check_row(cells, seen)
-            except ValueError as error:
-                raise InputError(str(error), path=path, line=line) from error
-            rows.append(row)
-    except csv.Error as error:
-        raise InputError(str(error), path=path, line=reader.line_num) from error
-    return rows
 
 
 def _convert(column: str, cell: str) -> object:
@@ -223,8 +193,8 @@ def _convert(column: str, cell: str) -> object:
     return value
 
 
-def _check_row(cells: list[str], seen: set[str]) -> None:
-    name, sequence, camera, source = cells[:4]
+def _check_row(row: dict[str, str], seen: set[str]) -> None:
+    name, sequence, camera, source = (row[column] for column in _TEXT)
     check_name(name)
     if not name.startswith(sequence + "/"):
         raise ValueError(f"name {name!r} does not begin with its sequence {sequence!r}")
@@ -232,7 +202,7 @@ def _check_row(cells: list[str], seen: set[str]) -> None:
         raise ValueError(f"camera {camera!r} holds other characters than A-Z a-z 0-9 . _ -")
     if "/" in source or "\\" in source or source in ("", ".", ".."):
         raise ValueError(f"source {source!r} is not the name of a file")
-    status = cells[list(_COLUMNS).index("status")]
+    status = row["status"]
     if status not in set(FrameStatus):
         raise ValueError(f"status {status!r} is none of {', '.join(FrameStatus)}")
     if name in seen:

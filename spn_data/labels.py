@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import write_csv, writing_whole
+from spn_data.files import read_csv, write_csv, writing_whole
 from spn_data.frames import Frames, check_name
 from spn_data.pose import Poses, Similarity, canonical_quats
 
@@ -213,31 +212,16 @@ def write_labels(path: Path, labels: Labels) -> None:
 
 def read_labels(path: Path) -> Labels:
     """From poses.csv. Raises InputError with the line where it is not what `write_labels` writes."""
-    try:
-        if path.stat().st_size > _MAX_CSV_BYTES:
-            raise InputError(f"is larger than {_MAX_CSV_BYTES // 1_000_000} MB", path=path)
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file, strict=True)
-            if next(reader, None) != _COLUMNS:
-                raise InputError(
-                    f"the header is not that of poses.csv: {','.join(_COLUMNS)}", path=path, line=1
-                )
-            rows = [_parse(path, reader.line_num, cells) for cells in reader]
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"is not a CSV file ({error})", path=path) from error
+    table = read_csv(path, _COLUMNS, max_bytes=_MAX_CSV_BYTES)
+    rows = [_parse(path, line, row) for line, row in table]
     try:
         return _labels_of(rows)
     except ValueError as error:
         raise InputError(str(error), path=path) from error
 
 
-def _parse(path: Path, line: int, cells: list[str]) -> dict[str, Any]:
+def _parse(path: Path, line: int, row: dict[str, Any]) -> dict[str, Any]:
     try:
-        if len(cells) != len(_COLUMNS):
-            raise ValueError(f"{len(cells)} cells, expected {len(_COLUMNS)}")
-        row: dict[str, Any] = dict(zip(_COLUMNS, cells, strict=True))
         check_name(row["name"])
         if row["status"] not in set(LabelStatus):
             raise ValueError(f"status {row['status']!r} is none of {', '.join(LabelStatus)}")

@@ -10,6 +10,7 @@ import numpy as np
 from spn_data.labels import Labels
 
 TRAIN, VALIDATION, TEST, LEFT_OUT = "train", "validation", "test", ""
+GROUPS = (TRAIN, VALIDATION, TEST)  # no evaluation sequence may have the name of one
 OPTIMISTIC = "same flight as training: optimistic"
 GUARD_GAP, GUARD_DISTANCE = "guard gap", "guard distance"
 

@@ -14,6 +14,7 @@ from spn_data.labels import Labels
 from spn_data.split import (
     GUARD_DISTANCE,
     GUARD_GAP,
+    GROUPS,
     LEFT_OUT,
     SLACK,
     TEST,
@@ -32,6 +33,12 @@ from spn_data.split import (
 _ENOUGH_LEFT = 0.5
 # A block in time has so many frames, where validation has as many at all: photos are seconds apart.
 _MIN_FRAMES = 4
+# What leaves more frames to training when it is smaller.
+_NARROWER = {
+    Policy.TIME: "--gap or --validation-share",
+    Policy.SPACE: "--gap, --guard-distance or --validation-share",
+    Policy.HEIGHT: "--gap, --guard-height or --validation-share",
+}
 # So many places for a block are tried at most.
 _MAX_CANDIDATES = 64
 
@@ -53,7 +60,7 @@ def make_split(
     Raises GeometryError where a group would stay empty.
     """
     for name in evaluation:
-        if name in (TRAIN, VALIDATION, TEST):
+        if name in GROUPS:
             raise StageError(f"an evaluation sequence may not be called {name!r}: that is a group")
     if options.validation is not Policy.TIME and not metric:
         raise GeometryError(
@@ -303,5 +310,6 @@ def _check_filled(plan: _Plan, groups: Sequence[str]) -> None:
             registered = int((plan.flights.registered & ~plan.flights.dense).sum())
             raise GeometryError(
                 f"--validation {options.validation} with a gap of {options.gap_s:g} s leaves no frame for "
-                f"{group}, of {registered} mapping frames with a pose; try a smaller --gap, or another policy"
+                f"{group}, of {registered} mapping frames with a pose; try a smaller "
+                f"{_NARROWER[options.validation]}, or another --validation"
             )

@@ -391,3 +391,10 @@ def test_checks_and_fields_are_documented(split_area: Path) -> None:
     listed = re.findall(r"^\| `([^`]+)` \|", text.split("## The audit")[1], re.MULTILINE)
     assert {finding["check"] for finding in findings} <= set(listed)
     assert set(read_json(split_area / SPLIT / "split.json")) <= set(listed)
+
+
+def test_where_nothing_is_mapped_nothing_is_left_behind(tmp_path: Path) -> None:
+    result = run("split", "--area", tmp_path / "new")
+    assert result.exit_code == 1
+    assert "1-frames is missing; run spn-data reconstruct first" in result.stderr
+    assert not (tmp_path / "new").exists()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.errors import StageError
-from spn_data.files import write_csv, write_whole, writing_whole
+from spn_data.errors import InputError, StageError
+from spn_data.files import read_csv, write_csv, write_whole, writing_whole
 
 
 def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> None:
@@ -36,3 +36,24 @@ def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
     """A folder that is missing is the user's to see, with the file's name."""
     with pytest.raises(StageError, match=r"none/a\.txt cannot be written: No such file"):
         write_whole(tmp_path / "none" / "a.txt", "")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"a,c\n1,2\n", r"t\.csv:1: the header is not that of t\.csv: a,b"),
+        (b"", r"t\.csv:1: the header is not"),
+        (b"a,b\n1,2\n3\n", r"t\.csv:3: 1 cells, expected 2"),
+        (b'a,b\n1,"2\n', r"t\.csv:2: is not a CSV file: unexpected end"),
+        (b"a,b\n1,\xff\n", r"t\.csv: is not UTF-8 text"),
+        (b"a,b\n" + b"1,2\n" * 99, r"t\.csv: is larger than 0 MB"),
+    ],
+)
+def test_csv_of_others_is_refused_with_its_line(
+    tmp_path: Path, content: bytes, message: str
+) -> None:
+    """Another header, a row cut short, quotes that never end, bytes that are no text, too much of it."""
+    path = tmp_path / "t.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        list(read_csv(path, ["a", "b"], max_bytes=300))

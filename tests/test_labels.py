@@ -100,7 +100,7 @@ def test_a_file_of_bytes_or_none_at_all_is_an_input_error(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="can't be read"):
         read_labels(tmp_path / "missing.csv")
     (tmp_path / "poses.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="is not a CSV file"):
+    with pytest.raises(InputError, match="is not UTF-8 text"):
         read_labels(tmp_path / "poses.csv")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
@@ -22,6 +23,7 @@ from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.camera_file import camera_from_json, camera_to_json
 from spn_data.labels import _COLUMNS, Labels, read_labels, read_seen_points
 from spn_data.map_hash import map_hash
+from spn_data.pipeline.frames import FramesOptions, plan
 from spn_data.pipeline.labels import (
     LabelledArea,
     read_labelled_area,
@@ -322,6 +324,89 @@ def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
     options = ("--all-frames", "--name", "medium", "--threads", "1", "--video", flight2)
     register(area, *options)
     assert read_labels(poses_file(area, group=DENSE)).registered.sum() > 3
+
+
+def test_a_relative_video_is_found_from_any_folder_and_with_the_area_moved_along(
+    bare: Path, flight2: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """area.toml holds its place from the area's own folder on."""
+    both = tmp_path / "together"
+    shutil.copytree(bare, both / "area")
+    shutil.copytree(flight2, both / "second day")
+    monkeypatch.chdir(both)
+    register(Path("area"), Path("second day") / "flight2.mp4", "--name", "medium", *FAST)
+    monkeypatch.chdir(tmp_path)
+    both.rename(tmp_path / "moved")
+    register(tmp_path / "moved" / "area", "--name", "medium", "--all-frames", "--threads", "1")
+
+
+def test_a_remembered_folder_without_videos_does_not_hide_the_one_named(
+    bare: Path, flight1: Path, tmp_path: Path
+) -> None:
+    emptied = tmp_path / "emptied"
+    emptied.mkdir()
+    facts = bare / "area.toml"
+    facts.write_text(facts.read_text().replace(str(flight1), str(emptied)))
+    register(bare, "--name", "flight1", "--all-frames", "--threads", "1", "--video", flight1)
+
+
+def test_frames_between_follow_a_lens_that_was_kept(
+    bare: Path, flight2: Path, tmp_path: Path
+) -> None:
+    """--fixed-lens estimates nothing: the lens has no covariance, the frames have."""
+    lens = tmp_path / "lens.json"
+    lens.write_text(
+        json.dumps(
+            {"model": "PINHOLE", "width": 320, "height": 180, "params": [220.2, 220.2, 160, 90]}
+        )
+    )
+    options = ("--name", "medium", *FAST, "--all-frames", "--camera", lens, "--fixed-lens")
+    register(bare, flight2 / "flight2.mp4", *options)
+    assert read_json(bare / EVALUATION / "medium" / "camera.json")["estimated"] == []
+    between = read_labels(poses_file(bare, group=DENSE))
+    assert between.registered.sum() > 2
+    assert np.isfinite(between.covariance[between.registered]).all()
+
+
+def test_groups_of_the_split_are_no_names_of_sequences(bare: Path, flight2: Path) -> None:
+    for name in ("train", "validation", "test"):
+        result = run("register", flight2, "--name", name, "--area", bare)
+        assert result.exit_code == 1
+        assert f"may not be called '{name}'" in result.stderr
+
+
+def test_an_evaluation_flight_stays_out_of_the_map(registered: Path, flight2: Path) -> None:
+    """Whether the map is extended or made anew."""
+    for how in ("--add", "--overwrite"):
+        result = run("reconstruct", flight2, how, "--area", registered)
+        assert result.exit_code == 1
+        assert "flight2.mp4: is of the evaluation sequence medium" in result.stderr
+        assert "remove its folders" in result.stderr
+
+
+def test_a_mapping_flight_does_not_take_an_evaluation_sequence_s_name(
+    registered: Path, other_place: Path, tmp_path: Path
+) -> None:
+    video = tmp_path / "Medium.mp4"
+    shutil.copy(other_place, video)
+    found = plan([video], FramesOptions(), extended=Area(registered), tested=Area(registered))
+    assert [source.sequence for source in found.sources] == ["Medium-2"]
+
+
+def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
+    """Split sends to `register --all-frames`, which says what to remove; then it runs."""
+    shutil.rmtree(area / EVALUATION / "medium")
+    refused = run("split", "--area", area)
+    assert "4-dense/medium is stale" in refused.stderr
+    told = run("register", "--all-frames", "--name", "medium", "--area", area)
+    assert told.exit_code == 1
+    assert "4-dense/medium is left of one, remove that folder" in told.stderr
+
+
+def test_frames_between_need_a_map(tmp_path: Path) -> None:
+    result = run("register", "--all-frames", "--area", tmp_path)
+    assert result.exit_code == 1
+    assert "2-model is missing; run spn-data reconstruct first" in result.stderr
 
 
 def test_an_unknown_sequence_is_named(bare: Path) -> None:

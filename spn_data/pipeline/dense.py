@@ -43,7 +43,8 @@ from spn_data.timing import Progress, Stopwatch
 
 
 def sequences_with_video(area: Area) -> list[str]:
-    """Mapping and evaluation sequences that are made of video."""
+    """Mapping and evaluation sequences that are made of video. StageError where nothing is mapped."""
+    area.record(MODEL)
     frames = read_frames(area.folder(FRAMES) / "frames.csv")
     names = np.unique(frames.sequences[frames.video_frame >= 0]).tolist()
     for name in area.sequences(EVALUATION):
@@ -120,7 +121,9 @@ def _frames_of(area: Area, sequence: str) -> Frames:
         frames = read_frames(area.folder(FRAMES) / "frames.csv")
         frames = frames.select(frames.sequences == sequence)
     if not len(frames):
-        raise InputError(f"there is no sequence {sequence!r} in {area.root}")
+        left = f"{DENSE}/{sequence}"
+        more = f"; {left} is left of one, remove that folder" if area.has(left) else ""
+        raise InputError(f"there is no sequence {sequence!r} in {area.root}{more}")
     return frames
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area import FRAMES, Area
+from spn_data.area import DENSE, EVALUATION, FRAMES, Area
 from spn_data.camera_file import camera_to_json, read_camera
 from spn_data.candidates import Candidates, analyse, frames_of
 from spn_data.errors import InputError
@@ -22,7 +22,7 @@ from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks
 from spn_data.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
-from spn_data.sources import Source, SourceKind, discover
+from spn_data.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.timing import Progress, Stopwatch
@@ -53,10 +53,18 @@ class Plan:
     cost: Cost
 
 
-def plan(inputs: list[Path], options: FramesOptions, *, extended: Area | None = None) -> Plan:
+def plan(
+    inputs: list[Path],
+    options: FramesOptions,
+    *,
+    extended: Area | None = None,
+    tested: Area | None = None,
+) -> Plan:
     """Sources of all inputs, with names that no two of them and none of the area to extend have.
 
-    Sources whose every file is in that area are ignored; InputError where there are no others.
+    tested : the area whose evaluation sequences must stay out of the map, and keep their names.
+    Sources whose every file is in the area to extend are ignored; InputError where there are no others, and
+    for the file of an evaluation sequence.
     """
     sources: list[Source] = []
     ignored: list[tuple[Path, str]] = []
@@ -66,11 +74,21 @@ def plan(inputs: list[Path], options: FramesOptions, *, extended: Area | None = 
         frames = read_frames(extended.folder(FRAMES) / "frames.csv")
         names |= {name.lower() for name in np.unique(frames.sequences).tolist()}
         held = set(extended.record(FRAMES).inputs.values())
+    evaluated = {} if tested is None else _evaluated(tested)
+    names |= {name.lower() for name in evaluated.values()}
     for path in inputs:
         found = discover(path)
         ignored += found.ignored
         for source in found.sources:
-            known = [part for part in source.parts if content_fingerprint(part) in held]
+            prints = {part: content_fingerprint(part) for part in source.parts}
+            for part, print_ in prints.items():
+                if print_ in evaluated:
+                    raise InputError(
+                        f"is of the evaluation sequence {evaluated[print_]}, which would be no test of a map "
+                        f"that holds it; to map it all the same, remove its folders in {EVALUATION} and {DENSE}",
+                        path=part,
+                    )
+            known = [part for part, print_ in prints.items() if print_ in held]
             if len(known) == len(source.parts):
                 ignored += [(part, "already in the area") for part in known]
                 continue
@@ -89,6 +107,16 @@ def plan(inputs: list[Path], options: FramesOptions, *, extended: Area | None = 
         tuple(ignored),
         estimate_cost(sources, target_count=options.selection.target_count),
     )
+
+
+def _evaluated(area: Area) -> dict[str, str]:
+    """Name of the evaluation sequence of each video or photo, by the file's fingerprint."""
+    return {
+        print_: name
+        for name in area.sequences(EVALUATION)
+        for file, print_ in area.record(f"{EVALUATION}/{name}").inputs.items()
+        if Path(file).suffix.lower() in VIDEO_SUFFIXES | PHOTO_SUFFIXES
+    }
 
 
 def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:

@@ -24,13 +24,19 @@ def frame_images(
 
     Raises InputError for a file that can't be read, StageError where a video is not found.
     """
-    for sequence in np.unique(labels.sequences).tolist():
+    sequences = np.unique(labels.sequences).tolist()
+    videos = {  # all of them first: a missing one is told before any work
+        sequence: find_videos(area, sequence, video_folder)
+        for sequence in sequences
+        if labels.dense[labels.sequences == sequence].any()
+    }
+    for sequence in sequences:
         mine = np.flatnonzero(labels.sequences == sequence)
         for row in mine[~labels.dense[mine]].tolist():
             yield row, _stored(area, str(labels.names[row]), sequence)
         dense = mine[labels.dense[mine]]
         if len(dense):
-            yield from _decoded(find_videos(area, sequence, video_folder), labels, dense)
+            yield from _decoded(videos[sequence], labels, dense)
 
 
 def image_path(area: Area, name: str, sequence: str) -> Path:

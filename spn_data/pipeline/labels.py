@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
+from spn_data.pipeline.model import REGISTRATION as MISSING
+from spn_data.pipeline.model import read_reasons
 from spn_data.pose import Similarity
 from spn_data.record import read_json
 
@@ -177,7 +178,7 @@ def _mapping_labels(
         inliers[row] = mine.stop - mine.start
         coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
         error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
-    reasons = _missing_reasons(area)
+    reasons = read_reasons(area.folder(MODEL) / MISSING)
     labels = Labels.of_frames(
         chosen,
         scene.poses.at_rows(rows, n),
@@ -203,15 +204,6 @@ def _with_covariance(labels: Labels, scene: Scene, observations: Observations) -
     rows = [row_of[name] for name in scene.names]
     covariance[rows] = MapCovariance.of(scene, observations).pose_covariances()
     return replace(labels, covariance=covariance)
-
-
-def _missing_reasons(area: Area) -> dict[str, str]:
-    path = area.folder(MODEL) / "registration.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return {row["name"]: row["reason"] for row in csv.DictReader(file)}
-    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"{path}: cannot be read ({error!r})") from error
 
 
 def _read_stage(area: Area, stage: str, world_from_model: Similarity) -> tuple[Labels, SeenPoints]:

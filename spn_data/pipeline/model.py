@@ -18,7 +18,7 @@ from spn_data.colmap.model import Scene, read_observations
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
-from spn_data.files import write_csv
+from spn_data.files import read_csv, write_csv
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
@@ -166,6 +166,12 @@ def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
     columns["registered"] = ["registered" if row.registered else "missing" for row in rows]
     columns["error_px"] = ["" if math.isnan(r.error_px) else f"{r.error_px:.4f}" for r in rows]
     write_csv(path, columns)
+
+
+def read_reasons(path: Path) -> dict[str, str]:
+    """Of registration.csv: why a frame is missing, by name; empty where it is not."""
+    columns = [f.name for f in fields(FrameRegistration)]
+    return {row["name"]: row["reason"] for _, row in read_csv(path, columns)}
 
 
 def _name_results(work: Path, result: ReconstructResult) -> None:

@@ -55,7 +55,7 @@ def reconstruct(
     Without telemetry there is no stage 3-geo. Raises StageError where telemetry does not determine the
     place in the world; the model stands then all the same.
     """
-    found = plan(inputs, options.frames)
+    found = plan(inputs, options.frames, tested=area)
     _stages(area, found, inputs, options, watcher, overwrite=overwrite, extended=None)
 
 
@@ -76,7 +76,7 @@ def add(
         origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
         geo = replace(geo, fit=replace(geo.fit, origin=origin))
     options = replace(options, geo=geo)
-    found = plan(inputs, options.frames, extended=area)
+    found = plan(inputs, options.frames, extended=area, tested=area)
     if overwrite:
         area.drop_next()
     following = area.next_area()
@@ -109,9 +109,9 @@ def _stages(
         tell=watcher.telemetry,
     )
     earlier = () if extended is None else extended.facts.sources
-    given = [str(path).encode(errors="backslashreplace").decode() for path in inputs]
-    kept = (area if extended is None else extended).facts.evaluation
-    area.write_facts(Facts(sources=(*earlier, *given), evaluation=kept))
+    lasting = area if extended is None else extended
+    given = [lasting.place_of(path) for path in inputs]
+    area.write_facts(Facts(sources=(*earlier, *given), evaluation=lasting.facts.evaluation))
     tell(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
     tell(model, before.get(MODEL))

@@ -73,9 +73,8 @@ def register(
     work = area.begin(stage, made_with, inputs, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
-    place = str(video).encode(errors="backslashreplace").decode()
     record = _register(area, work, source, given, options, progress, workers)
-    known = {**area.facts.evaluation, source.sequence: place}
+    known = {**area.facts.evaluation, source.sequence: area.place_of(video)}
     area.write_facts(Facts(sources=area.facts.sources, evaluation=known))
     return record
 

@@ -20,6 +20,7 @@ from spn_data.pipeline.images import STORED
 from spn_data.pipeline.telemetry import telemetry_of
 from spn_data.selection import Choice
 from spn_data.sources import Source, SourceKind, discover, safe_name
+from spn_data.split import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.timing import Progress
@@ -53,6 +54,11 @@ def find_source(area: Area, video: Path, name: str | None) -> Source:
             f"{name!r} cannot name a folder; use letters, digits, dot, dash and underscore"
         )
     source = replace(source, sequence=name or source.sequence)
+    if source.sequence in GROUPS:
+        raise InputError(
+            f"a sequence may not be called {source.sequence!r}: that is a group of the split; "
+            "give another one as --name"
+        )
     record = area.record(FRAMES)
     mapped = {file.split("/", 1)[0] for file in record.inputs}
     if source.sequence.lower() in {sequence.lower() for sequence in mapped}:
@@ -105,7 +111,7 @@ def take_frames(
     if len(keys) != 1:
         raise InputError(
             f"is taken with {len(keys)} lenses or focal lengths: register each part by itself",
-            path=source.parts[0],
+            path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
     starts = start_cameras(frames, candidates.photos, fov, {} if given is None else {"*": given})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,7 +12,8 @@ import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
 from spn_data.camera import Camera
-from spn_data.errors import FormatError, StageError
+from spn_data.coverage_table import read_strata
+from spn_data.errors import FormatError, InputError, StageError
 from spn_data.files import write_whole
 from spn_data.frames import Frames, read_frames
 from spn_data.georegister.result import GeoFit
@@ -234,9 +234,8 @@ def _strata(area: Area) -> dict[str, str]:
     folder = area.folder(coverage_stage.EVALUATED)
     try:
         for table in sorted(folder.glob("*.csv")):
-            with table.open(newline="", encoding="utf-8") as file:
-                strata |= {row["name"]: row["stratum"] for row in csv.DictReader(file)}
-    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
+            strata |= read_strata(table)
+    except InputError as error:
         raise _damaged(folder, error) from error
     return strata
 

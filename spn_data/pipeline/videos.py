@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from spn_data.area import EVALUATION, FRAMES, Area
-from spn_data.errors import StageError
+from spn_data.errors import InputError, StageError
 from spn_data.record import content_fingerprint
 from spn_data.sources import VIDEO_SUFFIXES, discover
 
@@ -25,17 +25,14 @@ def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[P
     }
     if not wanted:
         raise StageError(f"{area.root}: {sequence} is not made of video: it has no other frames")
-    remembered = area.facts.evaluation.get(sequence)
+    remembered = area.facts.evaluation.get(sequence) if area.has(stage) else None
     places = [remembered] if remembered is not None else list(area.facts.sources)
-    folders = [*([given] if given is not None else []), *map(Path, places)]
-    folders += [area.root / place for place in places]
+    folders = [*([given] if given is not None else []), *(area.root / place for place in places)]
     found: dict[str, Path] = {}
     for folder in folders:
-        if folder.exists():
-            for source in discover(folder).sources:
-                for part in source.parts:
-                    if wanted.get(part.name) == content_fingerprint(part):
-                        found.setdefault(part.name, part)
+        for part in _videos_in(folder):
+            if wanted.get(part.name) == content_fingerprint(part):
+                found.setdefault(part.name, part)
     missing = [name for name in wanted if name not in found]
     if missing:
         looked = ", ".join(str(folder) for folder in folders) or "nowhere"
@@ -44,3 +41,11 @@ def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[P
             "give the place where it lies now as --video"
         )
     return tuple(found[name] for name in wanted)
+
+
+def _videos_in(folder: Path) -> list[Path]:
+    """None where there is no such folder any more, or nothing in it."""
+    try:
+        return [part for source in discover(folder).sources for part in source.parts]
+    except InputError:
+        return []

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 
 from spn_data import audit
+from spn_data.coverage import Stratum
 from spn_data.georegister.result import GeoFit
+from spn_data.labels import LabelStatus
 from spn_data.map_points import MapPoints
 from spn_data.pose import Poses
 from spn_data.record import StageRecord
 from spn_data.split import Split
 
-REGISTERED, FAILED = "registered", "failed"
-STRATA = ("high", "medium", "low")
+REGISTERED, FAILED = LabelStatus.REGISTERED.value, LabelStatus.FAILED.value
+STRATA = tuple(stratum.value for stratum in Stratum)
 
 
 @dataclass(frozen=True, eq=False)

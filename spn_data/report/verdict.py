@@ -186,7 +186,7 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
             yield Finding(
                 Level.STOP,
                 text + ". It is of another place, or the map lacks its views.",
-                "Map those views, or remove the sequence's folder",
+                "Map those views, or remove the sequence's folders in 4-eval and 4-dense",
             )
         elif share < limits.good_evaluation_share:
             few = "; a test on so few says little" if share < limits.min_evaluation_share else ""
