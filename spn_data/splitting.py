@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from spn_data.errors import GeometryError, StageError
 from spn_data.labels import Labels
 from spn_data.split import (
+    GROUPS,
     GUARD_DISTANCE,
     GUARD_GAP,
-    GROUPS,
     LEFT_OUT,
     SLACK,
     TEST,

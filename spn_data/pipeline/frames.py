@@ -84,8 +84,9 @@ def plan(
             for part, print_ in prints.items():
                 if print_ in evaluated:
                     raise InputError(
-                        f"is of the evaluation sequence {evaluated[print_]}, which would be no test of a map "
-                        f"that holds it; to map it all the same, remove its folders in {EVALUATION} and {DENSE}",
+                        f"is of the evaluation sequence {evaluated[print_]}, which would be no test of a "
+                        "map that holds it; to map it all the same, remove its folders in "
+                        f"{EVALUATION} and {DENSE}",
                         path=part,
                     )
             known = [part for part, print_ in prints.items() if print_ in held]
