@@ -19,25 +19,16 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from truth import error_figures, true_poses
 
 from spn_data.area import Area
 from spn_data.labels import Labels
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
-from spn_data.pose import Poses, Similarity, pose_errors, rotation_vectors
+from spn_data.pose import Similarity, pose_errors, rotation_vectors
 from spn_data.simulate.truth import read_truth
 
 CHI2_MEDIAN, CHI2_FAR = 5.348, 22.5
 WRONG_M, WRONG_DEG = 0.5, 2.0
-
-
-def true_poses(labels: Labels, truth_folder: Path) -> Poses:
-    """(N,) exact poses of frames, by their place in the video."""
-    centers, quats = np.empty((len(labels), 3)), np.empty((len(labels), 4))
-    for sequence in np.unique(labels.sequences).tolist():
-        rows = np.flatnonzero(labels.sequences == sequence)
-        poses = read_truth(truth_folder, sequence).poses[labels.video_frame[rows]]
-        centers[rows], quats[rows] = poses.centers, poses.quats_wxyz
-    return Poses(centers, quats)
 
 
 def compare(area: Area, flights: Path) -> dict[str, Any]:
@@ -73,11 +64,7 @@ def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[
     error = np.concatenate([true.centers - found.poses.centers, turned], axis=1)
     distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance), error)
     return figures | {
-        "position_median_m": float(np.median(error_m)),
-        "position_p95_m": float(np.quantile(error_m, 0.95)),
-        "position_max_m": float(error_m.max()),
-        "rotation_median_deg": float(np.median(error_deg)),
-        "rotation_p95_deg": float(np.quantile(error_deg, 0.95)),
+        **error_figures(found.poses, true),
         "rotation_max_deg": float(error_deg.max()),
         "wrong": int(((error_m > WRONG_M) | (error_deg > WRONG_DEG)).sum()),
         "calibration": float(np.median(distance) / CHI2_MEDIAN),

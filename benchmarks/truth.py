@@ -22,18 +22,20 @@ from spn_data.colmap.model import Scene, read_scene
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.result import GeoFit
+from spn_data.labels import Labels
 from spn_data.pose import Poses, Similarity, pose_errors
 from spn_data.record import read_json
 from spn_data.simulate.truth import read_truth
 
 
-def true_poses(frames: Frames, truth_folder: Path) -> Poses:
+def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:
     """(N,) exact poses of frames, by their place in the video."""
-    poses = []
-    for sequence, index in zip(frames.sequences.tolist(), frames.video_frame.tolist(), strict=True):
-        truth = read_truth(truth_folder, sequence)
-        poses.append(truth.poses[index : index + 1])
-    return Poses.concatenate(poses)
+    true = Poses.unknown(len(frames))
+    for sequence in np.unique(frames.sequences).tolist():
+        rows = np.flatnonzero(frames.sequences == sequence)
+        poses = read_truth(truth_folder, sequence).poses[frames.video_frame[rows]]
+        true.centers[rows], true.quats_wxyz[rows] = poses.centers, poses.quats_wxyz
+    return true
 
 
 def at_origin(true: Poses, true_origin: GeoOrigin, origin: GeoOrigin) -> Poses:

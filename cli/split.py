@@ -158,9 +158,10 @@ def _options(
 
 
 def _show(record: StageRecord) -> None:
+    from cli import show_labels
+
     counts = record.counts
     sizes = ", ".join(f"{width}x{height}" for width, height in counts["image_px"])
-    seconds = sum(record.seconds.values())
     console.table(
         f"{record.stage}: what networks train on",
         [
@@ -168,7 +169,7 @@ def _show(record: StageRecord) -> None:
             ("left out", f"{counts['left_out']} frames (guards, or no pose)"),
             ("images", f"{sizes} pixels"),
             ("points for training", str(counts["training_points"])),
-            ("time", f"{seconds:.0f} s ({sum(record.cpu_seconds.values()):.0f} s of CPU)"),
+            show_labels.time_row(record),
         ],
     )
     for note in record.notes:

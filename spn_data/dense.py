@@ -10,7 +10,8 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.dense_segments import SequenceToLabel, read_segments
-from spn_data.dense_tracking import DenseOptions, TrackedFrame, between, failed, track_segment
+from spn_data.dense_tracking import between, track_segment
+from spn_data.dense_values import DenseOptions, TrackedFrame, failed
 from spn_data.frames import Frames
 from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints

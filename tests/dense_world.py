@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.dense_segments import SequenceToLabel
-from spn_data.dense_tracking import Anchor, Segment
+from spn_data.dense_values import Anchor, Segment
 from spn_data.frames import Frames, FrameStatus
 from spn_data.labels import Labels, LabelStatus, SeenPoints
 from spn_data.map_points import MapPoints
