@@ -130,10 +130,6 @@ class MapCovariance:
             own if options.clustered else variance * own,
         )
 
-    def functional_covariance(self, functional: Functional) -> np.ndarray:
-        """(r, r) covariance of one functional: see functional_covariances."""
-        return self.functional_covariances([functional])[0]
-
     def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
         """(r, r) each: through frames and lenses, which all points share, and of each point by itself."""
         if not functionals:

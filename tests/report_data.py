@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+
 import numpy as np
 
 from spn_data import audit
@@ -144,3 +146,9 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
             audit.Finding("guard gap", audit.Verdict.PASS, "kept"),
         ),
     )
+
+
+def unpack(packed: dict[str, str]) -> np.ndarray:
+    """What `pack` was given, flattened and rounded to its kind; as the page's script reads it."""
+    kinds = {"f4": "<f4", "i2": "<i2", "i4": "<i4", "u1": "|u1"}
+    return np.frombuffer(base64.b64decode(packed["base64"]), dtype=kinds[packed["kind"]])

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from cli.data import main
 from spn_data.colmap.model import read_scene
-from spn_data.report.pack import unpack
+from tests.report_data import unpack
 
 
 def run(area: Path, *options: str) -> Result:

@@ -234,7 +234,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
                 wanted.by_lens @ unknowns.lens_mixing[camera_id]
             )
         expected = row @ dense @ row.T
-        found = covariance.functional_covariance(wanted)
+        found = covariance.functional_covariances([wanted])[0]
         assert np.allclose(found, expected, rtol=0, atol=1e-4 * np.trace(expected))
 
 
@@ -284,7 +284,7 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
         for seed in range(8):
             wanted = some_functional(made.scene, seed=seed)
             value = np.einsum("rki,ki->r", wanted.by_points, point_errors[wanted.point_idx])
-            spread = covariance.functional_covariance(wanted)
+            spread = covariance.functional_covariances([wanted])[0]
             told["points"].append(scores(value[None], spread[None]))
     mean = {name: float(np.mean(values)) for name, values in told.items()}
     assert mean["poses"] / 6 == pytest.approx(1, abs=0.35)
@@ -317,7 +317,9 @@ def test_a_similarity_moves_covariances_with_the_map() -> None:
     assert wanted.by_lens is not None
     same = replace(wanted, by_points=wanted.by_points @ turn.T / 7)
     assert np.allclose(
-        after.functional_covariance(same), before.functional_covariance(wanted), rtol=1e-5
+        after.functional_covariances([same])[0],
+        before.functional_covariances([wanted])[0],
+        rtol=1e-5,
     )
     assert after.sigma_px == pytest.approx(before.sigma_px, rel=1e-6)
 
@@ -333,7 +335,9 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
     assert np.allclose(in_pieces.pose_covariances(), at_once.pose_covariances(), rtol=1e-6)
     wanted = some_functional(made.scene, 1)
     assert np.allclose(
-        in_pieces.functional_covariance(wanted), at_once.functional_covariance(wanted), rtol=1e-6
+        in_pieces.functional_covariances([wanted])[0],
+        at_once.functional_covariances([wanted])[0],
+        rtol=1e-6,
     )
 
 
@@ -347,7 +351,7 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
     wanted.append(Functional(np.zeros(0, np.int64), np.zeros((8, 0, 3)), 2, np.eye(8)))
     together = covariance.functional_covariances(wanted)
     for functional, found in zip(wanted, together, strict=True):
-        assert np.allclose(found, covariance.functional_covariance(functional), rtol=1e-9)
+        assert np.allclose(found, covariance.functional_covariances([functional])[0], rtol=1e-9)
     assert covariance.functional_covariances([]) == []
     some = covariance.pose_covariances(np.array([7, 2]))
     assert np.allclose(some, covariance.pose_covariances()[[7, 2]], rtol=1e-9)
@@ -371,9 +375,9 @@ def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> Non
     covariance = MapCovariance.of(replace(scene, points=far), kept)
     independent = MapCovariance.of(replace(scene, points=far), kept, INDEPENDENT)
     toward = Functional(np.array([point]), (far[point] / np.linalg.norm(far[point]))[None, None])
-    depth = independent.functional_covariance(toward)[0, 0]
+    depth = independent.functional_covariances([toward])[0][0, 0]
     assert depth > 1e12
-    assert 0.01 < covariance.functional_covariance(toward)[0, 0] / depth < 100
+    assert 0.01 < covariance.functional_covariances([toward])[0][0, 0] / depth < 100
     before = MapCovariance.of(scene, seen, INDEPENDENT).pose_covariances()
     assert np.allclose(independent.pose_covariances(), before, rtol=0, atol=0.1 * before.max())
 

@@ -13,12 +13,12 @@ import pytest
 from spn_data import audit
 from spn_data.report.data import CoverageFacts, FrameTable, ReportData, StageFacts
 from spn_data.report.html import render
-from spn_data.report.pack import pack, script_json, unpack
+from spn_data.report.pack import pack, script_json
 from spn_data.report.residual_map import residual_map, round_down
 from spn_data.report.scene import display_of, thin
 from spn_data.report.thinning import thin_frames
 from spn_data.report.verdict import Level, VerdictLimits, verdict
-from tests.report_data import area, flight, points, record
+from tests.report_data import area, flight, points, record, unpack
 
 ROOT = Path(__file__).resolve().parents[1]
 

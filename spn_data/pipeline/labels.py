@@ -19,7 +19,6 @@ from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
-from spn_data.pipeline.model import REGISTRATION as MISSING
 from spn_data.pipeline.model import read_reasons
 from spn_data.pose import Similarity
 from spn_data.record import read_json
@@ -178,7 +177,7 @@ def _mapping_labels(
         inliers[row] = mine.stop - mine.start
         coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
         error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
-    reasons = read_reasons(area.folder(MODEL) / MISSING)
+    reasons = read_reasons(area.folder(MODEL))
     labels = Labels.of_frames(
         chosen,
         scene.poses.at_rows(rows, n),

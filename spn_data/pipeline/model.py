@@ -168,10 +168,10 @@ def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
     write_csv(path, columns)
 
 
-def read_reasons(path: Path) -> dict[str, str]:
-    """Of registration.csv: why a frame is missing, by name; empty where it is not."""
+def read_reasons(folder: Path) -> dict[str, str]:
+    """Why a frame is missing in the model of a folder, by name; empty where it is not."""
     columns = [f.name for f in fields(FrameRegistration)]
-    return {row["name"]: row["reason"] for _, row in read_csv(path, columns)}
+    return {row["name"]: row["reason"] for _, row in read_csv(folder / REGISTRATION, columns)}
 
 
 def _name_results(work: Path, result: ReconstructResult) -> None:

@@ -17,11 +17,6 @@ def pack(values: np.ndarray, kind: str) -> dict[str, str]:
     return {"kind": kind, "base64": base64.b64encode(flat.tobytes()).decode("ascii")}
 
 
-def unpack(packed: dict[str, str]) -> np.ndarray:
-    """What `pack` was given, flattened and rounded to its kind."""
-    return np.frombuffer(base64.b64decode(packed["base64"]), dtype=_KINDS[packed["kind"]])
-
-
 def pack_texts(values: np.ndarray) -> dict[str, Any]:
     """Texts (N,) that repeat: the different ones once, and which of them each is."""
     different, which = np.unique(values, return_inverse=True)
