@@ -54,7 +54,9 @@ class Group(click.Group):
             # Without a file's name it is our mistake, but where a disk refused what was written.
             if ctx.params.get("verbose") or (error.filename is None and error.errno not in _DISK):
                 raise
-            where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+            # Of a copy to a full disk, the second name is the file that could not be written.
+            name = error.filename2 if error.errno in _DISK and error.filename2 else error.filename
+            where = "" if name is None else f"{os.fsdecode(name)}: "
             raise click.ClickException(
                 f"{where}{error.strerror}{_KEPT if error.errno in _DISK else ''}"
             ) from error

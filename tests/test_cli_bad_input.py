@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import resource
@@ -12,11 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import av
+import click
 import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from cli.console import Group
 from cli.data import main
 from spn_data.area import FRAMES, MODEL, Area
 from spn_data.record import VERSION
@@ -277,3 +280,19 @@ def test_garbage_lines_are_passed_over_and_no_fix_at_all_leaves_the_model_withou
     assert "0 of 16 records with a fix" in told
     assert "in units of the model: lengths there are no metres" in told
     assert not Area(tmp_path / "area").has("3-geo")
+
+
+def test_a_copy_that_fills_the_disk_names_the_file_that_was_not_written() -> None:
+    """Not the one that it was read from."""
+
+    @click.group(cls=Group)
+    def program() -> None:
+        pass
+
+    @program.command()
+    def copy() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "from.jpg", None, "to.jpg")
+
+    result = CliRunner().invoke(program, ["copy"])
+    assert result.exit_code == 1
+    assert "to.jpg: No space left on device. What is done is kept" in result.stderr

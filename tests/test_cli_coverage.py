@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli.data import main
-from spn_data.area import EVALUATION, GEO, Area
+from spn_data.area import EVALUATION, FRAMES, GEO, Area
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_to_json
 from spn_data.coverage import CoverageOptions, strata_of
@@ -236,6 +236,11 @@ def test_what_can_not_be_done_is_one_line(area, finished_area, tmp_path):
     plan.write_text("x,y,z,heading_deg,pitch_deg,camera\n0,0,4,0,0,wide\n")
     shown = run("--area", area, "--waypoints", plan, exit_code=1)
     assert "plan.csv:2: the area holds no camera 'wide'; it holds" in shown
+    for own in (area / "area.toml", area / FRAMES / "frames.csv"):
+        before = own.read_bytes()
+        shown = run("--area", area, "--fly-again", own, "--overwrite", exit_code=1)
+        assert "is not the name of a CSV file" in shown or "lies in a stage of an area" in shown
+        assert own.read_bytes() == before
     shown = run("--area", area, "--fly-again", plan, exit_code=1)
     assert "exists already; --overwrite replaces it" in shown
     assert plan.read_text().startswith("x,y,z")

@@ -302,3 +302,19 @@ def test_lists_read_as_they_are(shared_data):
         for name in ("train", "test")
     ]
     assert counts == [231, 103, 1532, 760]
+
+
+def test_only_files_that_are_data_sets_are_replaced(scene, tmp_path):
+    """A mistyped --to does not cost the user a list, nor a photo."""
+    mistyped = scene / "dataset_train.txt"
+    before = mistyped.read_bytes()
+    with pytest.raises(InputError, match="is not the name of an HDF5 file"):
+        run(scene, mistyped, overwrite=True)
+    assert mistyped.read_bytes() == before
+
+
+def test_lists_without_a_frame_are_refused(tmp_path):
+    write_cambridge(tmp_path / "dataset_train.txt", [], Poses(np.zeros((0, 3)), np.zeros((0, 4))))
+    with pytest.raises(InputError, match="lists no frame to train on"):
+        run(tmp_path, tmp_path / "dataset.h5")
+    assert not (tmp_path / "dataset.h5").exists()

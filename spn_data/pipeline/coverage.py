@@ -101,6 +101,10 @@ def cover_area(
 
 def check_new(path: Path, *, overwrite: bool) -> None:
     """Raises InputError where a file can't be made, or would be replaced without being asked to."""
+    if path.suffix.lower() != ".csv" or path.is_dir():
+        raise InputError("is not the name of a CSV file: it ends in .csv", path=path)
+    if any((parent / "stage.json").exists() for parent in path.resolve().parents):
+        raise InputError("lies in a stage of an area; name a file elsewhere", path=path)
     if path.exists() and not overwrite:
         raise InputError("exists already; --overwrite replaces it", path=path)
     if not path.parent.is_dir():

@@ -93,7 +93,8 @@ def _georegister(
     tracks = read_tracks(area)
     if not any(track.has_fix.any() for track in tracks.values()):
         raise GeometryError(
-            f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model)"
+            f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model). With "
+            "telemetry beside the sources, spn-data reconstruct VIDEO --overwrite places it"
         )
     scene = read_scene(area.folder(MODEL))
     frames = registered_frames(area, scene)

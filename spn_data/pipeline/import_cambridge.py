@@ -97,9 +97,13 @@ def import_cambridge(
     cut to a common view, for VisualSFM gives each image a focal length of its own. Raises InputError where
     a list is missing or damaged, or `target` exists and `overwrite` is false.
     """
+    if target.suffix.lower() not in (".h5", ".hdf5") or target.is_dir():
+        raise InputError("is not the name of an HDF5 file: it ends in .h5", path=target)
     if target.exists() and not overwrite:
         raise InputError("exists already; --overwrite replaces it", path=target)
     frames, notes = _read_lists(folder, options)
+    if not (frames.roles == Role.TRAIN).any():
+        raise InputError("lists no frame to train on", path=folder / LISTS[Role.TRAIN])
     model = None
     if (folder / NVM).is_file():
         is_training = frames.roles == Role.TRAIN
