@@ -27,7 +27,8 @@ from spn_data.timing import Progress
 # Names of the user's files are shown as they are: brackets in them are no markup, colons no emoji.
 out = Console(highlight=False, markup=False, emoji=False)
 _PLAIN_EVERY_S = 20.0
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK = (*_FULL, errno.EIO, errno.EROFS)
 _KEPT = ". What is done is kept: make room, and the same command goes on"
 
 
@@ -43,7 +44,7 @@ class Group(click.Group):
         except SpnError as error:
             if ctx.params.get("verbose"):
                 raise
-            refused = isinstance(error.__cause__, OSError) and error.__cause__.errno in _DISK
+            refused = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
             raise click.ClickException(f"{error}{_KEPT if refused else ''}") from error
         except KeyboardInterrupt:
             click.echo(
@@ -58,7 +59,7 @@ class Group(click.Group):
             name = error.filename2 if error.errno in _DISK and error.filename2 else error.filename
             where = "" if name is None else f"{os.fsdecode(name)}: "
             raise click.ClickException(
-                f"{where}{error.strerror}{_KEPT if error.errno in _DISK else ''}"
+                f"{where}{error.strerror}{_KEPT if error.errno in _FULL else ''}"
             ) from error
 
 

@@ -22,6 +22,7 @@ from click.testing import CliRunner, Result
 from cli.console import Group
 from cli.data import main
 from spn_data.area import FRAMES, MODEL, Area
+from spn_data.errors import StageError
 from spn_data.record import VERSION
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
@@ -296,3 +297,18 @@ def test_a_copy_that_fills_the_disk_names_the_file_that_was_not_written() -> Non
     result = CliRunner().invoke(program, ["copy"])
     assert result.exit_code == 1
     assert "to.jpg: No space left on device. What is done is kept" in result.stderr
+
+
+def test_a_disk_that_may_not_be_written_to_is_not_said_to_be_full() -> None:
+    @click.group(cls=Group)
+    def program() -> None:
+        pass
+
+    @program.command()
+    def write() -> None:
+        raise StageError("area cannot be written to") from OSError(errno.EROFS, "read-only")
+
+    result = CliRunner().invoke(program, ["write"])
+    assert result.exit_code == 1
+    assert "area cannot be written to" in result.stderr
+    assert "make room" not in result.stderr
