@@ -20,6 +20,7 @@ from click.testing import CliRunner, Result
 
 from cli.data import main
 from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
+from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json, camera_to_json
 from spn_data.labels import _COLUMNS, Labels, read_labels, read_seen_points
 from spn_data.map_hash import map_hash
@@ -552,3 +553,18 @@ def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
     files = text.split("## Files")[1].split("### poses.csv")[0]
     for path in folder.iterdir():
         assert f"`{path.name}" in files, path.name
+
+
+def test_a_lens_that_may_be_the_maps_own_is_compared_with_it() -> None:
+    """10 % apart on images of one size is told; the same lens, another one and another size are not."""
+    from spn_data.pipeline.register import lens_remarks
+
+    def lens(focal_px: float, width: int = 800) -> Camera:
+        return Camera("RADIAL", width, 600, np.array([focal_px, width / 2, 300.0, 0.0, 0.0]))
+
+    (told,) = lens_remarks(lens(486.0), {"east": lens(440.0)})
+    assert "486 px" in told
+    assert "east" in told
+    assert "about 10%" in told
+    for other in (lens(482.0), lens(800.0), lens(440.0, 1000)):
+        assert lens_remarks(lens(486.0), {"east": other}) == []

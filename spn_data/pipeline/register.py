@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spn_data.area import EVALUATION, GEO, MODEL, Area, Facts, StageWork
+from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.camera import Camera
-from spn_data.camera_file import camera_to_json, read_camera
+from spn_data.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
 from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
@@ -29,7 +30,7 @@ from spn_data.pipeline.labels import (
 )
 from spn_data.pipeline.register_source import find_source, take_frames
 from spn_data.pipeline.telemetry import check_telemetry
-from spn_data.record import VERSION, StageRecord, write_json
+from spn_data.record import VERSION, StageRecord, read_json, write_json
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.options import RegisterOptions
 from spn_data.registration.register import Registered, labels_of, register_sequence
@@ -38,6 +39,9 @@ from spn_data.telemetry.track import Telemetry
 from spn_data.timing import Progress, Stopwatch
 
 _MISFIT = 2.0  # times the map's own residuals
+# Relative difference of focal lengths from which two lenses contradict each other if they are one, and up
+# to which they may be one.
+_SAME_LENS, _OTHER_LENS = 0.02, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,6 +154,8 @@ def _register(
             },
         )
     notes = [*taken.notes, *_misfit(found)]
+    if labels.registered.any():
+        notes += lens_remarks(solution.camera, _mapping_lenses(area))
     if gnss is not None:
         notes.append(gnss.tell())
     return work.finish(
@@ -172,6 +178,31 @@ def _misfit(found: Registered) -> list[str]:
         "the map is bent or its lens is wrong, as after a flight at one height that looks one way, and "
         "labels may be off by more than is stated"
     ]
+
+
+def _mapping_lenses(area: Area) -> dict[str, Camera]:
+    """The mapping lenses as mapping estimated them, by key."""
+    sizes = read_json(area.folder(FRAMES) / "cameras.json")["cameras"]
+    estimated = area.record(MODEL).counts["cameras"]
+    return {
+        key: camera_from_json({**sizes[key], "model": lens["model"], "params": lens["params"]})
+        for key, lens in estimated.items()
+    }
+
+
+def lens_remarks(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
+    """A word where a lens came out a little apart from one of the map's that may be the same."""
+    for key, lens in mapping.items():
+        apart = camera.focal_px[0] / lens.focal_px[0] - 1
+        same_size = (camera.width, camera.height) == (lens.width, lens.height)
+        if same_size and _SAME_LENS < abs(apart) < _OTHER_LENS:
+            return [
+                f"its focal length came out at {camera.focal_px[0]:.0f} px, that of {key}, whose images have the "
+                f"same size, at {lens.focal_px[0]:.0f} px. If both are one lens, one of them is wrong, and with "
+                f"it heights by about {abs(apart):.0%}: a flight at one height that looks one way hardly tells "
+                "a focal length. Map from two heights, or give --camera"
+            ]
+    return []
 
 
 def _lens_json(covariance: SequenceCovariance) -> dict[str, Any]:
