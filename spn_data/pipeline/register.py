@@ -197,8 +197,8 @@ def lens_remarks(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
         same_size = (camera.width, camera.height) == (lens.width, lens.height)
         if same_size and _SAME_LENS < abs(apart) < _OTHER_LENS:
             return [
-                f"its focal length came out at {camera.focal_px[0]:.0f} px, that of {key} (images of the same "
-                f"size) at {lens.focal_px[0]:.0f} px. If both are one lens, one of them is wrong, and "
+                f"its focal length came out at {camera.focal_px[0]:.0f} px, that of {key} (images as large) "
+                f"at {lens.focal_px[0]:.0f} px. If both are one lens, one of them is wrong, and "
                 f"with it heights by about {abs(apart):.0%}: a flight at one height that looks one way "
                 "hardly tells a focal length. Map from two heights, or give --camera"
             ]
