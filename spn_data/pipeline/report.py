@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,10 @@ class _FreshStages(Area):
         return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
 
 
+def _utc(iso: str) -> str:
+    return datetime.fromisoformat(iso).strftime("%Y-%m-%d %H:%M UTC")
+
+
 def report_data(area: Area) -> ReportData:
     """All that the report shows. Raises as `write_report`."""
     if not area.has(FRAMES):
@@ -93,7 +97,8 @@ def report_data(area: Area) -> ReportData:
     return ReportData(
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
-        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        # Not the time of writing: of an area that has not changed, the page does not change either.
+        made=_utc(max(stage.record.finished for stage in stages)),
         version=versions()["squeezeposenet-toolkit"],
         units="m" if geo is not None else "model",
         stages=stages,

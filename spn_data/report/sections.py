@@ -33,7 +33,7 @@ def heading(data: ReportData) -> str:
     unit = "" if data.units == "m" else ' <span class="unit">units: model</span>'
     return (
         f"<h1>{escape(data.title)}{unit}</h1>"
-        f'<p class="note">{escape(data.path)} &middot; written {escape(data.made)} by spn-data '
+        f'<p class="note">{escape(data.path)} &middot; as of {escape(data.made)}, by spn-data '
         f"{escape(data.version)}</p>"
     )
 
