@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -40,7 +42,8 @@ class Group(click.Group):
 
     def invoke(self, ctx: click.Context) -> object:
         try:
-            return super().invoke(ctx)
+            with _interruptible():
+                return super().invoke(ctx)
         except SpnError as error:
             if ctx.params.get("verbose"):
                 raise
@@ -63,6 +66,35 @@ class Group(click.Group):
             ) from error
 
 
+_stop_wanted = False
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Remember Ctrl-C: raised inside a native library's callback, Python prints and drops it."""
+    global _stop_wanted
+    _stop_wanted = False
+
+    def stop(*_: object) -> None:
+        global _stop_wanted
+        _stop_wanted = True
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _stop_where_wanted() -> None:
+    if _stop_wanted:
+        raise KeyboardInterrupt
+
+
 @contextmanager
 def progress() -> Iterator[Progress]:
     """A bar for each step with the time left on a terminal, a line now and then elsewhere."""
@@ -81,6 +113,7 @@ def progress() -> Iterator[Progress]:
         tasks: dict[str, object] = {}
 
         def update(step: str, done: int, total: int) -> None:
+            _stop_where_wanted()
             if step not in tasks:
                 tasks[step] = bars.add_task(step, total=total or None)
             bars.update(tasks[step], completed=done, total=total or None)  # type: ignore[arg-type]
@@ -96,6 +129,7 @@ class _PlainProgress:
         self._started = self._last = 0.0
 
     def __call__(self, step: str, done: int, total: int) -> None:
+        _stop_where_wanted()
         now = time.monotonic()
         if step != self._step:
             self._step, self._started, self._last = step, now, now
