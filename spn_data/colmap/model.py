@@ -121,22 +121,32 @@ def read_observations(folder: Path) -> tuple[Scene, Observations]:
 
 def read_map(folder: Path) -> tuple[Scene, Observations, MapPoints]:
     """The scene, its measurements, and its points with ids and colours, in the order of Scene.points."""
+    return _map_of(load_native(folder))
+
+
+def read_map_with_features(
+    folder: Path,
+) -> tuple[Scene, Observations, MapPoints, dict[str, np.ndarray]]:
+    """As `read_map`, and the point id of every feature (K,) by image name, -1 where it is no point.
+
+    Features are in the order of the database.
+    """
     native = load_native(folder)
+    of_features = {
+        image.name: np.array(
+            [p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64
+        )
+        for image in registered_images(native)
+    }
+    return *_map_of(native), of_features
+
+
+def _map_of(native: pycolmap.Reconstruction) -> tuple[Scene, Observations, MapPoints]:
     scene = scene_of(native)
     ids = sorted(native.points3D)
     colors = np.array([native.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
     points = MapPoints(np.array(ids, np.int64), scene.points, colors, scene.track_lengths)
     return scene, observations_of(native, scene), points
-
-
-def read_feature_points(folder: Path) -> dict[str, np.ndarray]:
-    """Point id of every feature (K,) by image name, in the order of the database; -1 where it is none."""
-    return {
-        image.name: np.array(
-            [p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64
-        )
-        for image in registered_images(load_native(folder))
-    }
 
 
 def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observations:

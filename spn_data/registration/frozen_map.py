@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from spn_data.colmap.map_features import MapFeatures
-from spn_data.colmap.model import Observations, Scene, read_feature_points, read_map
+from spn_data.colmap.model import Observations, Scene, read_map_with_features
 from spn_data.errors import FormatError
 from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
@@ -35,8 +35,9 @@ class FrozenMap:
         self.scene: Scene
         self.observations: Observations
         self.points: MapPoints
-        self.scene, self.observations, self.points = read_map(folder)
-        self._feature_points = read_feature_points(folder)
+        self.scene, self.observations, self.points, self._feature_points = read_map_with_features(
+            folder
+        )
         self._features = features
         described = [features.descriptors(name) for name in self.scene.names]
         self.vocabulary = appearance_vocabulary(described, PairOptions())
