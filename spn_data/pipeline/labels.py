@@ -90,7 +90,7 @@ def read_labelled_area(
         for key, name in _camera_samples(chosen, scene).items()
     }
     geo = read_geo(area)
-    world_from_model = read_world_from_model(area)
+    world_from_model = Similarity.identity() if geo is None else geo.world_from_model
     between = area.sequences(DENSE) if dense else ()
     evaluation, evaluation_seen = {}, {}
     for name in area.sequences(EVALUATION):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,19 @@ class Solution:
         mine = first + np.flatnonzero(self.point_row[first:last] >= 0)
         return self.feature[mine], self.point_row[mine]
 
+    def with_measurements(self, stay: np.ndarray) -> Solution:
+        """Only some of the measurements (M,) bool, and own points numbered anew: those that are left."""
+        own = self.own[stay]
+        used = np.unique(own[own >= 0])
+        return replace(
+            self,
+            frame=self.frame[stay],
+            feature=self.feature[stay],
+            point_row=self.point_row[stay],
+            own=np.where(own >= 0, np.searchsorted(used, own), -1),
+            own_points=self.own_points[used],
+        )
+
     def least_squares(self, sequence: Sequence) -> tuple[SequenceState, SequenceObservations]:
         """The posed frames, numbered 0, 1, ..., and their measurements."""
         rows = np.flatnonzero(self.posed)
@@ -125,18 +138,12 @@ def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> 
         before, agree = agree, _agree(state, everything, options.max_error_px)
         if np.array_equal(before, agree):
             break
-    own = solution.own[agree]
-    used = np.unique(own[own >= 0])
-    settled = Solution(
-        solution.posed,
-        state.poses.at_rows(rows, len(solution.posed)),
-        state.camera,
-        solution.frame[agree],
-        solution.feature[agree],
-        solution.point_row[agree],
-        np.where(own >= 0, np.searchsorted(used, own), -1),
-        state.own_points[used],
-    )
+    settled = replace(
+        solution,
+        poses=state.poses.at_rows(rows, len(solution.posed)),
+        camera=state.camera,
+        own_points=state.own_points,
+    ).with_measurements(agree)
     left = np.bincount(settled.frame, minlength=len(solution.posed))
     open_ = solution.posed & (left < _FOR_A_POSE)
     return without(settled, open_) if open_.any() else settled
@@ -155,18 +162,8 @@ def without(solution: Solution, refused: np.ndarray) -> Solution:
     stay &= (solution.own < 0) | (np.append(seen, 0)[solution.own] >= 2)
     kept = np.flatnonzero(~refused)
     poses = solution.poses[kept].at_rows(kept, len(refused))
-    used = np.unique(solution.own[stay & (solution.own >= 0)])
-    own = solution.own[stay]
-    return Solution(
-        solution.posed & ~refused,
-        poses,
-        solution.camera,
-        solution.frame[stay],
-        solution.feature[stay],
-        solution.point_row[stay],
-        np.where(own >= 0, np.searchsorted(used, own), -1),
-        solution.own_points[used],
-    )
+    left = replace(solution, posed=solution.posed & ~refused, poses=poses)
+    return left.with_measurements(stay)
 
 
 def _agree(

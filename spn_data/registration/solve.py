@@ -40,11 +40,11 @@ def solve(
         camera = _guess_focal(sequence, camera, options)
     if not options.hold_lens:
         camera = _find_lens(sequence, camera, options)
-    found = {
-        row: pose
-        for row in range(len(sequence.pixels))
-        if (pose := _resect(sequence, row, sequence.putative[row], camera, options)) is not None
-    }
+    found = {}
+    for row in range(len(sequence.pixels)):
+        pose = _resect(sequence, row, camera, options, max_error_px=options.max_error_px)
+        if pose is not None:
+            found[row] = pose
     putative, own_points, own = carry(sequence, found, camera, options)
     return refine(sequence, found, camera, putative, own, own_points, options)
 
@@ -73,14 +73,8 @@ def _strongest(sequence: Sequence, count: int) -> list[int]:
 def _guess_focal(sequence: Sequence, camera: Camera, options: RegisterOptions) -> Camera:
     focals, weights = [], []
     for row in _strongest(sequence, _FOCAL_FRAMES):
-        matches = sequence.putative[row]
-        found = resect(
-            sequence.pixels[row][matches[:, 0]],
-            sequence.map_xyz[matches[:, 1]],
-            camera,
-            max_error_px=options.start_error_px,
-            find_focal=True,
-            seed=options.seed,
+        found = _resect(
+            sequence, row, camera, options, max_error_px=options.start_error_px, find_focal=True
         )
         if found is not None and found.inliers.sum() >= options.checks.min_inliers:
             focals.append(found.camera.focal_px[0])
@@ -99,13 +93,10 @@ def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> 
         poses: list[Poses] = []
         frame, pixels, places = [], [], []
         for row in rows:
-            matches = sequence.putative[row]
-            found = _resect(
-                sequence, row, matches, camera, replace(options, max_error_px=max_error_px)
-            )
+            found = _resect(sequence, row, camera, options, max_error_px=max_error_px)
             if found is None or found.inliers.sum() < options.checks.min_inliers:
                 continue
-            kept = matches[found.inliers]
+            kept = sequence.putative[row][found.inliers]
             frame.append(np.full(len(kept), len(poses)))
             pixels.append(sequence.pixels[row][kept[:, 0]])
             places.append(sequence.map_xyz[kept[:, 1]])
@@ -125,12 +116,21 @@ def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> 
 
 
 def _resect(
-    sequence: Sequence, row: int, matches: np.ndarray, camera: Camera, options: RegisterOptions
+    sequence: Sequence,
+    row: int,
+    camera: Camera,
+    options: RegisterOptions,
+    *,
+    max_error_px: float,
+    find_focal: bool = False,
 ) -> Resection | None:
+    """By all that a frame itself matches of the map."""
+    matches = sequence.putative[row]
     return resect(
         sequence.pixels[row][matches[:, 0]],
         sequence.map_xyz[matches[:, 1]],
         camera,
-        max_error_px=options.max_error_px,
+        max_error_px=max_error_px,
+        find_focal=find_focal,
         seed=options.seed,
     )
