@@ -11,7 +11,6 @@ sequence is hardly more than one draw.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from truth import error_figures, true_poses
+from truth import error_figures, read_arguments, true_poses
 
 from spn_data.area import Area
 from spn_data.labels import Labels
@@ -78,13 +77,7 @@ def focal_error(labelled: LabelledArea, name: str, truth: Path) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("area", type=Path)
-    parser.add_argument("flights", type=Path)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+    arguments = read_arguments(__doc__)
     figures = compare(Area(arguments.area), arguments.flights)
     table = Table(title="Labels against exact truth", title_justify="left", box=None)
     for column in (

@@ -89,14 +89,19 @@ def error_figures(poses: Poses, true: Poses) -> dict[str, float]:
     }
 
 
-def main() -> None:
+def read_arguments(description: str | None) -> argparse.Namespace:
+    """area, flights, and json: where to write the figures."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        description=description, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("area", type=Path)
     parser.add_argument("flights", type=Path)
     parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    arguments = read_arguments(__doc__)
     figures = compare(Area(arguments.area), arguments.flights)
     table = Table(title="Against exact truth", title_justify="left", box=None)
     for column in ("", "median", "p95", "max", "rotation median", "p95"):
