@@ -7,16 +7,22 @@ import os
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from types import FrameType
 from typing import Any
 
 from spn_data.errors import SpnError
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LOOK_S = 0.2  # how often a waiting process looks whether it is to stop
+
+Batch = tuple[str, tuple[Any, ...]]
 
 
 class WorkerDiedError(SpnError):
@@ -31,7 +37,7 @@ class WorkerDiedError(SpnError):
 
 def run_batches(
     function: Callable[..., Any],
-    batches: Iterable[tuple[str, tuple[Any, ...]]],
+    batches: Iterable[Batch],
     *,
     workers: int,
     on_result: Callable[[Any], None],
@@ -39,104 +45,161 @@ def run_batches(
     """Call function(*arguments) for each (label, arguments) and hand each result to on_result, here.
 
     function must be importable and pure: it runs in another process, each on one thread. Results come
-    in the order of completion. A batch whose worker dies is run once more, alone; batches finished
-    before are never repeated. Raises WorkerDiedError where it dies again. An exception of the function
-    itself is raised here.
+    in the order of completion. A batch whose worker dies is run once more; batches finished before are
+    never repeated. Raises WorkerDiedError where it dies again. An exception of the function itself is
+    raised here.
     """
-    died: list[tuple[str, tuple[Any, ...]]] = []
-    pending = iter(batches)
-    while not _run_until_broken(function, pending, workers, on_result, died):
-        suspects, died = died, []
-        for label, arguments in suspects:
-            lost: list[tuple[str, tuple[Any, ...]]] = []
-            if not _run_until_broken(function, iter([(label, arguments)]), 1, on_result, lost):
-                raise WorkerDiedError(label)
-
-
-def _run_until_broken(
-    function: Callable[..., Any],
-    pending: Iterator[tuple[str, tuple[Any, ...]]],
-    workers: int,
-    on_result: Callable[[Any], None],
-    died: list[tuple[str, tuple[Any, ...]]],
-) -> bool:
-    """True when all of pending is done; False when the pool broke, with the batches in flight in died."""
-    running: dict[Future[Any], tuple[str, tuple[Any, ...]]] = {}
-    others = set(multiprocessing.active_children())
-    with _pool(workers) as pool:
+    # Each worker has a pipe of its own, closed on this side: where it dies, even in the middle of an
+    # answer, reading ends. In concurrent.futures' shared queues such a death can be waited for for ever.
+    team: list[_Worker] = []
+    with _held_back_interrupts() as raise_if_interrupted:
         try:
-            exhausted = False
-            while running or not exhausted:
-                while not exhausted and len(running) < 2 * workers:
-                    batch = next(pending, None)
-                    if batch is None:
-                        exhausted = True
-                        break
-                    try:
-                        with _no_interrupt():
-                            running[pool.submit(function, *batch[1])] = batch
-                    except BrokenProcessPool:
-                        died.append(batch)
-                        raise
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    result = future.result()
-                    del running[future]
-                    on_result(result)
-        except BrokenProcessPool:
-            for future, batch in running.items():
-                if future.done() and future.exception() is None:
-                    on_result(future.result())
-                else:
-                    died.append(batch)
-            return False
+            _run(function, iter(batches), workers, on_result, team, raise_if_interrupted)
         except BaseException:
             # What they compute is not wanted any more, and nobody shall wait for it.
-            for worker in set(multiprocessing.active_children()) - others:
-                worker.kill()
-            pool.shutdown(wait=True, cancel_futures=True)
+            for worker in team:
+                worker.process.kill()
             raise
-    return True
+        finally:
+            for worker in team:
+                worker.connection.close()
+                worker.process.join()
 
 
-@contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Hold SIGINT back. Processes started meanwhile never see it, not even while they load."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+@dataclass(eq=False)
+class _Worker:
+    process: SpawnProcess
+    connection: Connection
+    batch: Batch | None = None
+
+    def take(self, batch: Batch) -> None:
+        self.batch = batch
+        # A worker that is dead already is found by the end of its pipe.
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(batch[1])
 
 
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    # Spawned processes inherit the environment, and BLAS reads its limit when it loads.
+def _run(
+    function: Callable[..., Any],
+    pending: Iterator[Batch],
+    workers: int,
+    on_result: Callable[[Any], None],
+    team: list[_Worker],
+    raise_if_interrupted: Callable[[], None],
+) -> None:
+    ready: list[Batch] = []  # made while the workers are busy
+    suspects: set[str] = set()
+    exhausted = False
+    while True:
+        while not exhausted and len(ready) < workers:
+            raise_if_interrupted()
+            batch = next(pending, None)
+            exhausted = batch is None
+            if batch is None:
+                break
+            ready.append(batch)
+            _hand_out(function, ready, workers, team)
+        _hand_out(function, ready, workers, team)
+        busy = {worker.connection: worker for worker in team if worker.batch is not None}
+        if not busy:
+            return
+        for connection in wait(list(busy), _LOOK_S):
+            assert isinstance(connection, Connection)
+            worker = busy[connection]
+            assert worker.batch is not None
+            try:
+                good, answer = connection.recv()
+            except (EOFError, ConnectionResetError):
+                label = worker.batch[0]
+                team.remove(worker)
+                connection.close()
+                worker.process.join()
+                if label in suspects:
+                    raise WorkerDiedError(label) from None
+                suspects.add(label)
+                ready.insert(0, worker.batch)
+                continue
+            worker.batch = None
+            if not good:
+                raise answer
+            _hand_out(function, ready, workers, team)
+            on_result(answer)
+        raise_if_interrupted()
+
+
+def _hand_out(
+    function: Callable[..., Any], ready: list[Batch], workers: int, team: list[_Worker]
+) -> None:
+    while ready:
+        idle = next((worker for worker in team if worker.batch is None), None)
+        if idle is None:
+            if len(team) == workers:
+                return
+            idle = _start_worker(function)
+            team.append(idle)
+        idle.take(ready.pop(0))
+
+
+def _start_worker(function: Callable[..., Any]) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    # Started with the first worker, it would lift the mask below.
+    resource_tracker.ensure_running()
+    # A worker never sees Ctrl-C, not even while it loads.
+    before_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # It inherits the environment, and BLAS reads its limit when it loads.
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
-    # Started with the first worker, it would lift the mask of `_no_interrupt`.
-    resource_tracker.ensure_running()
     try:
-        with ProcessPoolExecutor(
-            workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_prepare_worker,
-            initargs=(os.getpid(),),
-        ) as pool:
-            yield pool
+        process = context.Process(target=_serve, args=(theirs, function, os.getpid()))
+        process.start()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before_mask)
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+        theirs.close()
+    return _Worker(process, ours)
 
 
-def _prepare_worker(parent_pid: int) -> None:
+def _serve(connection: Connection, function: Callable[..., Any], parent_pid: int) -> None:
+    """In the worker: answer calls until the other end of the pipe is closed."""
     import cv2
 
     cv2.setNumThreads(1)
     exit_with_parent(parent_pid)
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            arguments = connection.recv()
+            try:
+                answer = True, function(*arguments)
+            except Exception as error:
+                error.add_note("".join(traceback.format_exception(error)))
+                answer = False, error
+            connection.send(answer)
+
+
+@contextmanager
+def _held_back_interrupts() -> Iterator[Callable[[], None]]:
+    """Ctrl-C only where the function given is called, not in the middle of a start or of a transfer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    caught: list[tuple[int, FrameType | None]] = []
+    before = signal.signal(signal.SIGINT, lambda *arguments: caught.append(arguments))
+
+    def raise_if_interrupted() -> None:
+        if caught:
+            signal.signal(signal.SIGINT, before)
+            signal.raise_signal(signal.SIGINT)
+
+    try:
+        yield raise_if_interrupted
+        raise_if_interrupted()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def exit_with_parent(parent_pid: int) -> None:

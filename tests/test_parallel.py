@@ -102,3 +102,31 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
             return
         time.sleep(0.05)
     pytest.fail("the worker outlived its parent")
+
+
+def test_ctrl_c_at_any_moment_ends_it_though_answers_are_under_way(tmp_path: Path) -> None:
+    """A worker killed in the middle of a large answer leaves half of it in the pipe."""
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        "from spn_data.parallel import run_batches\n"
+        "def answer(size):\n"
+        "    return bytes(size)\n"
+        "if __name__ == '__main__':\n"
+        "    batches = ((str(k), (30_000_000,)) for k in range(100_000))\n"
+        "    try:\n"
+        "        run_batches(answer, batches, workers=2, on_result=lambda r: print('go', flush=True))\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+    )
+    for delay_s in (0.0, 0.013, 0.037, 0.061, 0.083):
+        command = [sys.executable, str(script)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as parent:
+            assert parent.stdout is not None
+            parent.stdout.readline()
+            time.sleep(delay_s)
+            os.killpg(parent.pid, signal.SIGINT)
+            try:
+                assert parent.wait(10) == 130
+            finally:
+                parent.kill()
