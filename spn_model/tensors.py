@@ -86,7 +86,10 @@ def _check(name: str, found: Tensor, target: Tensor, path: Path) -> None:
             path=path,
         )
     if found.layout is not torch.strided or not found.is_floating_point():
-        raise InputError(f"{name!r} is of type {found.dtype}, not of real numbers", path=path)
+        sparsely = "" if found.layout is torch.strided else ", stored sparsely"
+        raise InputError(
+            f"{name!r} is of type {found.dtype}{sparsely}: plain real numbers are needed", path=path
+        )
     if not torch.isfinite(found).all():
         raise InputError(f"{name!r} holds values that are not finite", path=path)
 

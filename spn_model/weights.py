@@ -7,9 +7,9 @@ import os
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
-from http.client import HTTPException
+from http.client import HTTPException, HTTPResponse
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 from spn_data.errors import InputError
@@ -171,7 +171,7 @@ def fetch(weights: Weights, progress: Progress) -> Path:
     return target
 
 
-def _save(answer: IO[bytes], path: Path, weights: Weights, progress: Progress) -> str:
+def _save(answer: HTTPResponse, path: Path, weights: Weights, progress: Progress) -> str:
     """SHA-256 of what was written. Raises InputError where more comes than the file can be."""
     digest, done = hashlib.sha256(), 0
     expected_mb = round(weights.size_bytes / 1e6)
@@ -187,6 +187,8 @@ def _save(answer: IO[bytes], path: Path, weights: Weights, progress: Progress) -
             handle.write(chunk)
             digest.update(chunk)
             progress("MB", min(round(done / 1e6), expected_mb), expected_mb)
+    if answer.length:  # bytes announced and not received
+        raise ConnectionError(f"the connection broke off after {done} B")
     return digest.hexdigest()
 
 

@@ -43,8 +43,8 @@ def start_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
         for hook in hooks:
             hook.remove()
         network.train(was_training)
-    for layer, moments in measured.items():
-        mean, variance = moments.mean_and_variance()
+    found = {layer: moments.mean_and_variance() for layer, moments in measured.items()}
+    for layer, (mean, variance) in found.items():
         layer.running_mean.copy_(mean)  # type: ignore[union-attr]
         layer.running_var.copy_(variance)  # type: ignore[union-attr]
         layer.weight.copy_((variance + layer.eps).sqrt())
