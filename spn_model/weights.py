@@ -154,6 +154,8 @@ def fetch(weights: Weights, progress: Progress) -> Path:
                 digest = _save(answer, partial, weights, progress)
         except (urllib.error.URLError, TimeoutError, ConnectionError, HTTPException) as error:
             reason = getattr(error, "reason", None) or error
+            if isinstance(error, urllib.error.HTTPError):
+                error.close()
             raise InputError(
                 f"cannot be fetched ({reason}); without a network, fetch it elsewhere and put it at "
                 f"{target}, or give its path",

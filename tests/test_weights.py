@@ -418,12 +418,15 @@ def test_a_file_of_the_users_own_is_taken_as_it_is(tmp_path):
 class Server(http.server.ThreadingHTTPServer):
     """Serves one content under every path, counts the requests, and redirects where it is told to."""
 
-    daemon_threads = True
+    daemon_threads = False  # closing waits for them
     content = b""
     status = 200
     location = ""
     claimed = 0  # bytes announced beyond those sent
     requests = 0
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that hangs up early is part of the tests."""
 
     def url(self, name: str) -> str:
         return f"http://127.0.0.1:{self.server_address[1]}/models/{name}"
