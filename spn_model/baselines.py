@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -33,6 +33,13 @@ class Images(Protocol):
     def valid(self, row: int) -> np.ndarray | None:
         """(H, W) bool: pixels that show the scene; None where all do."""
         ...
+
+
+class PosedImages(Images, Protocol):
+    """Images with their true poses."""
+
+    @property
+    def poses(self) -> Poses: ...
 
 
 Describe = Callable[[Images], np.ndarray]
@@ -67,6 +74,24 @@ def mean_pose(training: Poses) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError("no poses have no mean")
     quats = training.quats_wxyz
     return training.centers.mean(axis=0), canonical_quats(np.linalg.eigh(quats.T @ quats)[1][:, -1])
+
+
+def baselines(
+    training: PosedImages, groups: Sequence[PosedImages], describe: Mapping[str, Describe]
+) -> list[list[Estimates]]:
+    """For each group: the mean training pose, the oracle, and each way of looking up, by its name.
+
+    Training images are described once. The training frames themselves are no group to look up: each would
+    find itself. Raises ValueError for them.
+    """
+    if any(group is training for group in groups):
+        raise ValueError("a training frame looked up finds itself")
+    found = [[guess_mean(training.poses, len(g)), oracle(training.poses, g.poses)] for g in groups]
+    for method, described in describe.items():
+        known = described(training)
+        for estimates, group in zip(found, groups, strict=True):
+            estimates.append(look_up(method, training.poses, known, described(group)))
+    return found
 
 
 def guess_mean(training: Poses, frames: int) -> Estimates:

@@ -9,10 +9,12 @@ from itertools import pairwise
 import numpy as np
 
 from spn_data.coverage import CoverageOptions, nearest_frames
+from spn_data.hdf5_schema import DatasetInfo
 from spn_data.pose import Poses, pose_errors, rotation_vectors
 from spn_model.calibration import Calibration, calibrate, sigmas, squared_distances
 
 ENU = ("east", "north", "up")
+_NO_PLACE = ("x", "y", "z")
 STRATA = ("high", "medium", "low")
 _UNIT_TOLERANCE = 1e-4
 # With no limit on either, every frame is of one stratum, and the nearest is that of the smallest sum.
@@ -150,6 +152,11 @@ class Evaluation:
     strata: dict[str, Summary]
     curve: tuple[CurveBin, ...]
     calibration: Calibration | None
+
+
+def axes_of(info: DatasetInfo) -> tuple[str, str, str]:
+    """Names of the axes of a data set's world."""
+    return _NO_PLACE if info.origin is None else ENU
 
 
 def evaluation_frames(

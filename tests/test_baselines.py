@@ -15,6 +15,7 @@ from spn_model.baselines import (
     PAPER_TABLE_1,
     GemOptions,
     VladOptions,
+    baselines,
     better,
     gem,
     guess_mean,
@@ -33,6 +34,7 @@ class Pictures:
 
     pixels: np.ndarray
     masks: list[np.ndarray | None] = field(default_factory=list)
+    poses: Poses | None = None
 
     def __len__(self):
         return len(self.pixels)
@@ -206,6 +208,57 @@ def test_gem_does_not_depend_on_batches():
     assert small.shape == (5, 3)
     np.testing.assert_allclose(small, large)
     np.testing.assert_allclose(np.linalg.norm(small, axis=1), 1, rtol=1e-6)
+
+
+def test_all_baselines_of_several_groups():
+    """Each group gets the mean, the oracle and each way of looking up; training frames are no group."""
+    images, poses = textures(6), some_poses(6)
+    training = Pictures(images, poses=poses)
+    groups = [Pictures(seen_again(images[rows]), poses=poses[rows]) for rows in ([4, 1], [2])]
+    describe = {"a": vlad(training, VladOptions(words=8)), "b": lambda i: np.ones((len(i), 1))}
+    first, second = baselines(training, groups, describe)
+    names = ["mean training pose", "nearest training pose (oracle)", "a", "b"]
+    assert [one.method for one in first] == [one.method for one in second] == names
+    for one in first[1:3]:
+        np.testing.assert_array_equal(one.poses.centers, poses.centers[[4, 1]])
+    np.testing.assert_array_equal(second[2].poses.centers, poses.centers[[2]])
+    np.testing.assert_array_equal(second[3].poses.centers, poses.centers[[0]])
+    with pytest.raises(ValueError, match="finds itself"):
+        baselines(training, [training], {})
+
+
+def test_feature_maps_are_those_of_squeezenet():
+    """fire9 of the shipped weights, against the layers written out as plain convolutions with ReLUs."""
+    torch = pytest.importorskip("torch")
+    from spn_model.feature_maps import squeezenet_maps
+    from spn_model.tensors import read_tensors
+    from spn_model.weights import find
+
+    weights = {k: v.float() for k, v in read_tensors(find("squeezenet1_1-features")).items()}
+
+    def conv(x, name, **how):
+        return torch.relu(
+            torch.conv2d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], **how)
+        )
+
+    def fire(x, name):
+        x = conv(x, f"{name}.squeeze")
+        wide = conv(x, f"{name}.expand3x3", padding=1)
+        return torch.cat([conv(x, f"{name}.expand1x1"), wide], 1)
+
+    images = textures(2)
+    x = torch.from_numpy(images).permute(0, 3, 1, 2) / 255
+    x = (x - torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)) / torch.tensor(
+        [0.229, 0.224, 0.225]
+    ).view(3, 1, 1)
+    x = conv(x, "features.0", stride=2)
+    for layer in range(2, 13):
+        pools = layer in (2, 5, 8)
+        x = torch.max_pool2d(x, 3, 2, ceil_mode=True) if pools else fire(x, f"features.{layer}")
+    found = squeezenet_maps()(images)
+    assert found.shape == (2, 512, 5, 9)
+    assert found.min() == 0
+    np.testing.assert_allclose(found, x.numpy(), atol=2e-3 * float(x.max()))
 
 
 def test_the_better_retrieval_has_the_smaller_error():

@@ -144,7 +144,7 @@ def bars(tree, colour):
 
 
 def test_bars_are_as_high_as_their_counts():
-    """Errors 1, 1, 1 and 2 m: one bar thrice as high as the other, none beyond the scale, all angles in one."""
+    """Errors 1, 1, 1 and 2 m: one bar thrice as high as the other, none beyond the scale."""
     centers = TRUE.centers + np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 2]])
     one = evaluate(Estimates("net", Poses(centers, TRUE.quats_wxyz)), frames())
     tree = parsed(figures.histograms([one]))

@@ -5,12 +5,16 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.hdf5_schema import DatasetInfo
 from spn_data.pose import Poses, rotations_from_vectors
 from spn_model.calibration import calibrate, is_covariance, sigmas, squared_distances
 from spn_model.metrics import (
@@ -18,6 +22,7 @@ from spn_model.metrics import (
     Estimates,
     EvaluationFrames,
     MetricOptions,
+    axes_of,
     evaluate,
     evaluation_frames,
     frame_errors,
@@ -316,6 +321,40 @@ def test_errors_csv_has_a_row_for_each_frame(tmp_path):
     )
     assert (first["sigma"], first["distance_sq"]) == ("", "")
     assert (second["nearest"], second["located"], second["error"]) == ("2.0000", "0", "")
+
+
+def test_docs_list_what_the_files_hold(tmp_path):
+    """docs/evaluation.md names every key of metrics.json and, in their order, the columns of errors.csv."""
+    page = (Path(__file__).resolve().parents[1] / "docs" / "evaluation.md").read_text()
+    json_part, csv_part = page.split("## metrics.json")[1].split("## errors.csv")
+    estimates, true, _ = sampled(5)
+    one = evaluate(estimates, frames_of(true))
+    write_errors(tmp_path / "errors.csv", [one])
+    columns = (tmp_path / "errors.csv").read_text().splitlines()[0].split(",")
+    cells = re.findall(r"^\| (`[^|]+) \|", csv_part.split("## Figures")[0], re.MULTILINE)
+    assert [name for cell in cells for name in re.findall(r"`(\w+)`", cell)] == columns
+    write_metrics(tmp_path / "metrics.json", [one], units="m", retrieval={}, facts={})
+
+    def keys(value):
+        if isinstance(value, dict):
+            for key, part in value.items():
+                yield key
+                yield from keys(part)
+        elif isinstance(value, list):
+            for part in value:
+                yield from keys(part)
+
+    written = set(keys(json.loads((tmp_path / "metrics.json").read_text())))
+    named = set(re.findall(r"`(\w+)`", json_part))
+    assert written - {"net", "medium"} == named - {"null", "m", "model"}
+
+
+def test_axes_are_named_where_the_world_has_a_place():
+    """East, north and up need an origin."""
+    facts = {"units": "m", "up_is_known": True, "camera": None}
+    somewhere = GeoOrigin(49.0, 8.4, 0.0, HeightReference.TAKEOFF)
+    assert axes_of(DatasetInfo(origin=somewhere, **facts)) == ("east", "north", "up")
+    assert axes_of(DatasetInfo(origin=None, **facts)) == ("x", "y", "z")
 
 
 def test_rows_of_the_table_fit_their_header():
