@@ -10,7 +10,7 @@ from spn_data.pose import Poses
 from spn_model import svg
 from spn_model.metrics import ENU, CurveBin, Estimates, Evaluation, EvaluationFrames
 from spn_model.svg import COLOURS, INK, SOFT, Panel
-from spn_model.trajectory_view import trajectory_panel
+from spn_model.trajectory_view import thinned, trajectory_panel
 
 _MOST_BARS = 25
 _FAR = 1.5  # times the p95: errors that are larger stretch no scale
@@ -23,9 +23,10 @@ def trajectories(
     """Training cameras, true trajectory and estimates, obliquely and from above (the paper's 6 and 8).
 
     Each estimate hangs on a thin line from its true place. Estimates far outside the place are not
-    drawn but counted.
+    drawn but counted. Of very many frames an even choice is drawn.
     """
     heading = f"{frames.group}: trajectories"
+    drawn = len(thinned(len(frames)))
     parts = [svg.text(20, 22, heading, bold=True)]
     for left, width, (azimuth, elevation), words in (
         (20.0, 560.0, (-60.0, 25.0), "from the south-east, above"),
@@ -43,6 +44,7 @@ def trajectories(
         notes = [
             *([f"{outside[k]} outside the picture"] if outside[k] else []),
             *([f"{missing} without a pose"] if missing else []),
+            *([f"{drawn} of {len(frames)} frames drawn"] if drawn < len(frames) else []),
         ]
         more = f" ({', '.join(notes)})" if notes else ""
         entries.append((one.method + more, COLOURS[k % len(COLOURS)]))

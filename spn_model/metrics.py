@@ -264,7 +264,7 @@ def quantile(values: np.ndarray, share: float) -> float:
     ordered = np.sort(values)
     at = share * (len(values) - 1)
     low, high = ordered[int(np.floor(at))], ordered[int(np.ceil(at))]
-    if low == high or not np.isfinite(high):
+    if low == high:  # also where both are infinite
         return float(high)
     return float(low + (high - low) * (at - np.floor(at)))
 

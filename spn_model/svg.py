@@ -58,7 +58,7 @@ def document(width: float, height: float, label: str, parts: Iterable[str]) -> s
     """The whole figure; label : what it shows, for readers that do not see it."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
-        f'aria-label="{escape(label)}" font-family="system-ui, sans-serif" font-size="12" '
+        f'aria-label="{_words(label)}" font-family="system-ui, sans-serif" font-size="12" '
         f'fill="none"><rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>'
         f"{''.join(parts)}</svg>\n"
     )
@@ -99,7 +99,7 @@ def dots(
     points: np.ndarray, colour: str, *, radius: float = 2.5, titles: Sequence[str] = ()
 ) -> str:
     """Filled circles at page positions (N, 2); titles : shown under the pointer."""
-    told = [f"<title>{escape(title)}</title>" for title in titles] or [""] * len(points)
+    told = [f"<title>{_words(title)}</title>" for title in titles] or [""] * len(points)
     circles = "".join(
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}">{title}</circle>'
         for (x, y), title in zip(points, told, strict=True)
@@ -128,7 +128,7 @@ def text(
     weight = ' font-weight="600"' if bold else ""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}"{weight}>'
-        f"{escape(words)}</text>"
+        f"{_words(words)}</text>"
     )
 
 
@@ -138,6 +138,11 @@ def legend(x: float, y: float, entries: Sequence[tuple[str, str]]) -> str:
         dots(np.array([[x, y + 17 * k - 4]]), colour, radius=4) + text(x + 10, y + 17 * k, words)
         for k, (words, colour) in enumerate(entries)
     )
+
+
+def _words(text: str) -> str:
+    """Text that no XML parser stumbles over: control characters are none, whatever a file's names hold."""
+    return escape("".join(c if c.isprintable() else "\ufffd" for c in text))
 
 
 def ticks(low: float, high: float, about: int = 6) -> list[float]:

@@ -12,6 +12,7 @@ from spn_model.metrics import Estimates, EvaluationFrames
 from spn_model.svg import COLOURS, GRID, INK, SOFT
 
 _AROUND = 0.25  # of the place's extent: estimates farther outside it are not drawn
+MOST_DRAWN = 1500  # cameras, and estimates of one method: more are thinned evenly
 _GAP = 8.0  # times the median step: a longer one is no step of the flight
 
 
@@ -77,22 +78,30 @@ def trajectory_panel(
 
     parts = [_floor(on_page, low, high, step, frames.axes, unit, view_deg=view_deg)]
     tick = 0.02 * float((high - low).max())
-    ahead = training.centers + tick * training.rotations[:, 2]
-    parts.append(svg.strokes(zip(on_page(training.centers), on_page(ahead), strict=True), SOFT))
-    parts.append(svg.dots(on_page(training.centers), SOFT, radius=1.6))
+    cameras = training[thinned(len(training))]
+    ahead = cameras.centers + tick * cameras.rotations[:, 2]
+    parts.append(svg.strokes(zip(on_page(cameras.centers), on_page(ahead), strict=True), SOFT))
+    parts.append(svg.dots(on_page(cameras.centers), SOFT, radius=1.6))
     parts.append(
         svg.strokes(_stretches(on_page(frames.poses.centers), frames.poses.centers), INK, width=1.6)
     )
-    for k, (one, shown) in enumerate(zip(estimates, inside, strict=True)):
+    rows = thinned(len(frames))
+    for k, (one, within) in enumerate(zip(estimates, inside, strict=True)):
         colour = COLOURS[k % len(COLOURS)]
+        shown = rows[within[rows]]
         ends, places = on_page(frames.poses.centers[shown]), on_page(one.poses.centers[shown])
-        if shown.any():
+        if len(shown):
             parts.append(
                 svg.strokes(zip(ends, places, strict=True), colour, width=0.6, opacity=0.5)
             )
             parts.append(svg.dots(places, colour, titles=frames.names[shown].tolist()))
     located = [np.isfinite(e.poses.centers).all(axis=1) for e in estimates]
     return "".join(parts), [int((a & ~b).sum()) for a, b in zip(located, inside, strict=True)]
+
+
+def thinned(count: int) -> np.ndarray:
+    """Rows, evenly spread, of what is drawn of `count`."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_DRAWN)).round().astype(int))
 
 
 def _floor(

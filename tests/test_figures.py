@@ -97,8 +97,8 @@ def test_what_is_not_drawn_is_counted():
 
 
 def test_names_cannot_break_out_of_a_figure():
-    """Markup in names of groups, frames and methods is shown as text."""
-    group = '<script>alert(1)</script>&"'
+    """Markup and control characters in names of groups, frames and methods are shown as text."""
+    group = '<script>alert(1)</script>&\x01"'
     mean = shifted([0, 0, 1], method="</svg><b>")
     drawn = figures.trajectories(TRAINING, frames(group=group), [mean])
     one = evaluate(mean, frames(group=group))
@@ -132,7 +132,23 @@ def test_nothing_with_a_pose_can_be_drawn():
     )
     words = texts(parsed(figures.histograms([one])))
     assert "no median: too few poses, 4 without a pose" in words
-    parsed(figures.error_curves([one]))
+    curve = parsed(figures.error_curves([one]))
+    assert [c for c in curve.iter(f"{SVG}circle") if c.get("r") == "3"] == []
+
+
+def test_very_many_frames_are_thinned():
+    """5,000 frames and training cameras stay a figure that a browser shows, and the legend says so."""
+    rng = np.random.default_rng(0)
+    true = level(rng.uniform(0, 10, (5000, 3)))
+    some = evaluation_frames(
+        "a", np.array([f"a/{k}" for k in range(5000)]), np.full(5000, ""), true, TRAINING
+    )
+    training = level(rng.uniform(0, 10, (5000, 3)))
+    figure = figures.trajectories(training, some, [Estimates("net", true)])
+    tree = parsed(figure)
+    assert len(circles(tree, svg.COLOURS[0])) == 2 * 1500
+    assert "net (1500 of 5000 frames drawn)" in texts(tree)
+    assert len(figure) < 1e6
 
 
 def bars(tree, colour):
