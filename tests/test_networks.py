@@ -217,6 +217,30 @@ def test_normalisation_is_measured_not_left_at_its_defaults():
 
 
 @torch.no_grad()
+def test_what_a_normalisation_was_before_does_not_matter():
+    """Measured a second time, on other images, it is what it would have been at once."""
+    network, fresh = pretrained_squeezeposenet(), pretrained_squeezeposenet()
+    start_as_identity(network, [photos(2) * 3 + 1])
+    for layer in network.modules():
+        if isinstance(layer, InsertedBatchNorm):
+            layer.weight.mul_(2)
+    for measured in (network, fresh):
+        start_as_identity(measured, [photos(4)])
+    for name, tensor in fresh.state_dict().items():
+        torch.testing.assert_close(network.state_dict()[name], tensor)
+
+
+@torch.no_grad()
+def test_a_channel_that_never_varied_still_lets_other_values_through():
+    """ReLU features are often dead on some images: a variance of 0 must not become a weight of 0."""
+    network = nn.Sequential(InsertedBatchNorm(2)).eval()
+    still = torch.stack([torch.full((4, 4), 3.0), torch.zeros(4, 4)])[None]
+    start_as_identity(network, [still])
+    other = torch.randn(5, 2, 4, 4, generator=torch.manual_seed(3))
+    torch.testing.assert_close(network(other), other, rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
 def test_training_mode_starts_where_eval_mode_is():
     """On the batch that was measured, statistics of the batch are the stored ones."""
     network = pretrained_squeezeposenet(dropout=0.0).eval()
@@ -286,6 +310,18 @@ def test_the_smallest_side_is_enough(name, vgg16):
         network = vgg16 if name == "vgg16" else build(name, options).eval()
         x, _ = network(torch.zeros(1, 3, network.min_side_px, network.min_side_px))
         assert x.shape == (1, 3)
+
+
+@torch.no_grad()
+def test_a_leaky_relu_follows_fc11():
+    """Without one, fc11 and the heads were one linear map, and opposite features gave opposite poses."""
+    network = build("squeezeposenet").eval()
+    features = torch.randn(1, 512, generator=torch.manual_seed(4))
+    descriptor = F.leaky_relu(features @ network.fc11.weight.T + network.fc11.bias, 0.01)
+    x, q = network.regress((features,))[0]
+    expected = descriptor @ network.x.weight.T + network.x.bias
+    torch.testing.assert_close(x, expected, rtol=1e-4, atol=1e-5)
+    assert q.shape == (1, 4)
 
 
 @torch.no_grad()

@@ -52,7 +52,10 @@ def start_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
 
 
 class _Moments:
-    """Count, mean and squared deviations by channel, in float64; Chan et al. 1979, equation 2.1."""
+    """Count, mean and squared deviations by channel; batches are joined in float64.
+
+    Chan, Golub, LeVeque 1979, "Updating formulae and a pairwise algorithm", equation 2.1.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -60,18 +63,16 @@ class _Moments:
         self.deviation: Tensor | float = 0.0
 
     def __call__(self, layer: nn.Module, given: tuple[Tensor, ...], output: Any) -> Tensor:
-        values = given[0].double().transpose(0, 1).flatten(1)  # (C, B * H * W)
-        count, mean = values.shape[1], values.mean(1)
+        variance, mean = torch.var_mean(given[0], (0, 2, 3), correction=0)  # (C,), (C,)
+        count = given[0].numel() // len(mean)
         total = self.count + count
-        away = mean - self.mean
+        away = mean.double() - self.mean
         self.deviation = (
-            self.deviation
-            + ((values - mean[:, None]) ** 2).sum(1)
-            + away**2 * (self.count * count / total)
+            self.deviation + variance.double() * count + away**2 * (self.count * count / total)
         )
         self.mean = self.mean + away * (count / total)
         self.count = total
-        return given[0].clone()  # the activation that follows works in place
+        return given[0]
 
     def mean_and_variance(self) -> tuple[Tensor, Tensor]:
         if not isinstance(self.mean, Tensor) or not isinstance(self.deviation, Tensor):

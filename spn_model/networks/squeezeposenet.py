@@ -14,8 +14,9 @@ What the paper leaves open, and what we do:
 - Where `fc11` attaches: to the global average of the last feature maps, where SqueezeNet averages too. This
   takes images of any size; a layer on all cells of the map would have 5 million weights and more.
 - What follows `fc11`: a Leaky ReLU. Without one, `fc11` and the heads would be a single linear map.
-- The slope: 0.01, that of the paper's reference for Leaky ReLUs (Maas et al. 2013). Pretrained ReLU
-  features stay nearly what they were.
+- The slope: 0.01, that of the paper's reference for Leaky ReLUs (Maas et al. 2013). SqueezeNet's
+  pre-activations are negative by hundreds, so that a larger slope drowns the pretrained features: on 60
+  frames, pooled features correlate with the original ones by 0.99 at 0.01, and by 0.68 at 0.1.
 - Dropout: 0.5 on the pooled features, SqueezeNet's own, in its own place before the classifier.
 - Batch normalisation of pretrained layers: as the identity (`start_as_identity`).
 - Input size: free. Optimiser and rates are matters of the training recipe.
