@@ -5,12 +5,14 @@ from __future__ import annotations
 import click
 
 from cli.console import Group
+from cli.weights import weights
 
 
 @click.group(cls=Group)
 @click.version_option(package_name="squeezeposenet-toolkit")
-def main() -> None:
-    """Train and evaluate pose regressors.
+@click.option("-v", "--verbose", is_flag=True, help="Show where an error comes from.")
+def main(verbose: bool) -> None:
+    """Networks that tell a pose from an image, in an area that `spn-data` has prepared."""
 
-    This version prepares areas (`spn-data`); it has no commands for networks yet.
-    """
+
+main.add_command(weights)

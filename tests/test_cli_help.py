@@ -22,28 +22,40 @@ COMMANDS = sorted(main.commands)
 GEO_PARAMETERS = set(inspect.signature(options.geo_options).parameters)
 
 
-def command_for(words: list[str]) -> click.Command:
-    """Resolve and parse the words after `spn-data` without running them. Raises click's usage errors."""
+def model_commands(group: click.Group = model_main) -> dict[str, click.Command]:
+    """Commands of spn-model and of its groups, by their words."""
+    found: dict[str, click.Command] = {}
+    for name, command in group.commands.items():
+        found[name] = command
+        if isinstance(command, click.Group):
+            found |= {f"{name} {inner}": c for inner, c in model_commands(command).items()}
+    return found
+
+
+def command_for(words: list[str], program: click.Group = main) -> click.Command:
+    """Resolve and parse the words after a program's name, run nothing. Raises click's usage errors."""
     while words and words[0] in ("-v", "--verbose"):
         words = words[1:]
     if words in (["--help"], ["--version"]):
-        return main
-    group = click.Context(main, info_name="spn-data")
-    name, command, rest = main.resolve_command(group, list(words))
+        return program
+    group = click.Context(program, info_name="spn")
+    name, command, rest = program.resolve_command(group, list(words))
     assert command is not None
+    if isinstance(command, click.Group) and rest:
+        return command_for(rest, command)
     context = command.make_context(name, rest, parent=group)
     if set(context.params) >= GEO_PARAMETERS:
         options.geo_options(**{name: context.params[name] for name in GEO_PARAMETERS})
     return command
 
 
-def command_lines(text: str) -> list[tuple[str, bool]]:
-    """(words after spn-data, whether they are a whole line): of fenced lines, and of inline code."""
+def command_lines(text: str, program: str = "spn-data") -> list[tuple[str, bool]]:
+    """(words after the program, whether they are a whole line): of fenced lines, and of inline code."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     fenced = "\n".join(block for language, block in blocks if language in ("", "sh"))
-    found = re.findall(r"^(?:\S*/)?spn-data( .*)$", fenced, re.MULTILINE)
+    found = re.findall(rf"^(?:\S*/)?{program}( .*)$", fenced, re.MULTILINE)
     outside = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
-    inline = re.findall(r"`spn-data( [^`\n]+)`", outside)
+    inline = re.findall(rf"`{program}( [^`\n]+)`", outside)
     return [(line.strip(), True) for line in found] + [(line.strip(), False) for line in inline]
 
 
@@ -103,10 +115,50 @@ def test_help_ends_with_examples_that_parse(name):
         assert command_for(shlex.split(example)) is main.commands[name]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_option_has_help(name):
+@pytest.mark.parametrize("name", sorted(model_commands()))
+def test_help_of_the_model_commands_is_whole(name):
+    """One sentence first, examples that click accepts at the end, and a page that shows the command."""
+    command = model_commands()[name]
+    text = command.help or ""
+    first = text.split("\n\n")[0]
+    assert first.endswith(".")
+    assert len(first) < 120
+    examples = re.findall(r"^\s+spn-model (.+)$", text.split("Example:")[1], re.MULTILINE)
+    assert command in [command_for(shlex.split(example), model_main) for example in examples]
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert any(line.startswith(name) for line, _ in command_lines(pages, "spn-model"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_model_commands_in_the_docs_parse(page):
+    """Every spn-model command that README and docs show is one that click accepts.
+
+    `\u2026`, `A|B` and words in capitals stand for something: only command and options are checked then.
+    """
+    known = model_commands()
+    for line, whole in command_lines(page.read_text(encoding="utf-8"), "spn-model"):
+        if re.search(r"[\u2026|]|\b[A-Z]{2,}\b|\bN\b", line):
+            command = next(c for n, c in known.items() if line.split()[0] == n)
+            nested = command.commands.values() if isinstance(command, click.Group) else ()
+            flags = {flag for c in (command, *nested) for p in c.params for flag in p.opts}
+            assert {word for word in line.split() if word.startswith("-")} <= flags, line
+            continue
+        try:
+            command_for(shlex.split(line), model_main)
+        except click.MissingParameter:
+            assert not whole, f"{page.name}: {line}"
+        except click.UsageError as error:
+            pytest.fail(f"{page.name}: spn-model {line}: {error.format_message()}")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*main.commands.values(), *model_commands().values()],
+    ids=[*main.commands, *model_commands()],
+)
+def test_every_option_has_help(command):
     """No option is left without a sentence."""
-    for parameter in main.commands[name].params:
+    for parameter in command.params:
         if isinstance(parameter, click.Option):
             assert parameter.help, parameter.name
             assert len(parameter.help) > 8, parameter.name

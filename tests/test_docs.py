@@ -189,7 +189,11 @@ def text_of(node: ast.AST) -> str | None:
 
 
 def sources() -> list[ast.Module]:
-    paths = [p for package in ("spn_data", "cli") for p in sorted((ROOT / package).rglob("*.py"))]
+    paths = [
+        p
+        for package in ("spn_data", "spn_model", "cli")
+        for p in sorted((ROOT / package).rglob("*.py"))
+    ]
     return [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
 
 

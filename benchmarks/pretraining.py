@@ -1,0 +1,102 @@
+"""What is left of SqueezeNet's pretraining after the paper's changes, on images of a data set.
+
+    python benchmarks/pretraining.py AREA/5-split/dataset.h5 [--images 60]
+
+Compares the pooled features of SqueezePoseNet's trunk with those of the plain network (ReLU, no
+normalisation): their difference in norm, their correlation about their means, and the share of images whose
+nearest other image, by features, is the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor, nn
+
+from spn_data.hdf5_reader import Dataset
+from spn_data.hdf5_schema import Role
+from spn_model.imagenet import MEAN, STD
+from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
+from spn_model.networks.registry import build
+from spn_model.networks.regressor import Regressor
+from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.weights import find
+
+
+def training_images(path: Path, count: int) -> Tensor:
+    """(B, 3, H, W) normalised, spread over the training frames."""
+    with Dataset(path) as dataset:
+        group = dataset.of_role(Role.TRAIN)[0]
+        rows = np.linspace(0, len(group) - 1, min(count, len(group))).astype(int)
+        # As training draws its batches: neighbours in time would share statistics of their own.
+        rows = np.random.default_rng(0).permutation(rows)
+        images = np.stack([group.image(int(row)) for row in rows])
+    values = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
+    return (values - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]
+
+
+def squeezeposenet(slope: float, *, normalised: bool) -> Regressor:
+    network = build("squeezeposenet", {"slope": slope})
+    path = find(network.weights_name)
+    load_pretrained(network, read_tensors(path), path)
+    if not normalised:
+        for name, layer in list(network.named_modules()):
+            if isinstance(layer, InsertedBatchNorm):
+                parent, _, slot = name.rpartition(".")
+                setattr(network.get_submodule(parent), slot, nn.Identity())
+    return network.eval()
+
+
+def nearest(features: Tensor) -> Tensor:
+    """(B,) which other image is nearest."""
+    return torch.cdist(features, features).fill_diagonal_(torch.inf).argmin(1)
+
+
+def row(name: str, features: Tensor, plain: Tensor) -> tuple[str, ...]:
+    away, base = features - features.mean(0), plain - plain.mean(0)
+    return (
+        name,
+        f"{float((features - plain).norm() / plain.norm()):.3g}",
+        f"{float((away * base).sum() / (away.norm() * base.norm())):.4f}",
+        f"{float((nearest(features) == nearest(plain)).float().mean()):.0%}",
+    )
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--images", type=int, default=60)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    images = training_images(given.dataset, given.images)
+
+    def features(network: Regressor) -> Tensor:
+        return torch.cat([network.trunk(batch)[0] for batch in images.split(10)])
+
+    plain = features(squeezeposenet(0.0, normalised=False))
+    table = Table("trunk", "difference", "correlation", "same nearest image", box=None)
+    for slope in (0.001, 0.01, 0.03, 0.1):
+        leaky = features(squeezeposenet(slope, normalised=False))
+        table.add_row(*row(f"slope {slope}", leaky, plain))
+    ours = squeezeposenet(0.01, normalised=True)
+    # Statistics of the batch, not running ones: the state in which training would begin.
+    table.add_row(*row("slope 0.01, fresh normalisation", features(ours.train()), plain))
+    ours = squeezeposenet(0.01, normalised=True)
+    start_as_identity(ours, images.split(10))
+    table.add_row(*row("slope 0.01, identity, in use", features(ours.eval()), plain))
+    table.add_row(*row("slope 0.01, identity, in training", features(ours.train()), plain))
+    console = Console()
+    console.print(f"{len(images)} images of {images.shape[3]} x {images.shape[2]}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""`spn-model weights`: published weights, listed and fetched."""
+
+from __future__ import annotations
+
+import click
+
+from cli import console
+
+
+@click.group(invoke_without_command=True)
+@click.pass_context
+def weights(context: click.Context) -> None:
+    """List published weights of networks, and whether they are on this machine.
+
+    \b
+    Example:
+        spn-model weights
+        spn-model weights fetch googlenet
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from spn_model.weights import CATALOGUE, cache_folder, state
+
+    rows = []
+    for entry in CATALOGUE:
+        size = f"{entry.size_bytes / 1e6:.1f} MB"
+        rows.append((entry.name, entry.holds, state(entry), entry.origin, size, entry.sha256[:8]))
+    console.table("Weights", rows, ("name", "holds", "here", "from", "size", "SHA-256"))
+    console.out.print(f"Fetched files are kept in {cache_folder()}.")
+    if any("damaged" in row for row in rows):
+        console.note("a damaged file is not used: spn-model weights fetch NAME replaces it.")
+
+
+@weights.command()
+@click.argument("name")
+def fetch(name: str) -> None:
+    """Download weights by their name in the list, checked against their hash.
+
+    \b
+    Example:
+        spn-model weights fetch googlenet
+    """
+    from spn_model.weights import fetch as download
+    from spn_model.weights import of_name
+
+    entry = of_name(name)
+    with console.progress() as progress:
+        path = download(entry, progress)
+    console.out.print(f"{path}: {entry.holds}; {entry.licence}.")

@@ -1,0 +1,34 @@
+"""Feature maps of ImageNet's SqueezeNet 1.1, for images that nothing was trained on."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from spn_model.baselines import FeatureMaps
+from spn_model.imagenet import MEAN, STD
+from spn_model.networks.squeezeposenet import SqueezePoseNet, SqueezePoseNetOptions
+from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.weights import find
+
+WEIGHTS = "squeezenet1_1-features"
+
+
+def squeezenet_maps(weights: str = WEIGHTS) -> FeatureMaps:
+    """Maps of fire9 (B, 512, about H / 16, about W / 16), all at least 0, of uint8 RGB (B, H, W, 3).
+
+    weights : a name of the catalogue, or a file. Raises InputError where they cannot be had.
+    """
+    # Slope 0 is the ReLU that it was pretrained with, and untrained normalisation the identity to 1e-5.
+    network = SqueezePoseNet(SqueezePoseNetOptions(slope=0.0))
+    path = find(weights)
+    load_pretrained(network, read_tensors(path), path)
+    network.eval()
+    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
+
+    def maps(images: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            pixels = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
+            return np.asarray(network.features((pixels - mean) / std).numpy())
+
+    return maps

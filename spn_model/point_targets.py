@@ -1,0 +1,141 @@
+"""What a scene-coordinate network learns from: for each cell of an image, the map's surface that it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay, QhullError
+
+from spn_data.hdf5_reader import DatasetGroup, FramePoints
+from spn_data.pose import Poses
+
+
+def cell_centers(columns: int, rows: int, first_px: float, stride_px: float) -> np.ndarray:
+    """(rows * columns, 2) pixels of the cells' centres, row by row."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    return np.stack([x, y], axis=-1).reshape(-1, 2) * stride_px + first_px
+
+
+def cell_targets(
+    pixels: np.ndarray,
+    xyz: np.ndarray,
+    grid: tuple[int, int],
+    *,
+    first_px: float,
+    stride_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each cell the map point that lies nearest to its centre: targets (3, h, w) float32, known (h, w).
+
+    pixels (N, 2) : of points xyz (N, 3), NaN where not in view; grid : (columns, rows). A target is 0 where
+    no point falls into the cell.
+    """
+    columns, rows = grid
+    at = (pixels - first_px) / stride_px
+    cell = np.floor(at + 0.5)
+    inside = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1)
+    off = np.abs(at[inside] - cell[inside]).max(axis=1)
+    index = cell[inside].astype(np.int64) @ [1, columns]
+    # Of several writes to one cell the last stays.
+    order = np.argsort(-off, kind="stable")
+    targets = np.zeros((rows * columns, 3), np.float32)
+    known = np.zeros(rows * columns, bool)
+    targets[index[order]] = xyz[inside][order]
+    known[index[order]] = True
+    return targets.T.reshape(3, rows, columns), known.reshape(rows, columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions:
+    """Which gaps between map points are taken for one surface."""
+
+    longest_px: float = 48.0  # side of a triangle of neighbouring points
+    depth_ratio: float = 1.35  # of its farthest to its nearest corner
+    ground_px: float = 96.0  # the same of a level triangle: the ground is seen at a flat angle
+    level_m: float = 0.2  # largest difference in height of its corners; 0 where up is not known
+    step_px: int = 2  # of the grid on which surfaces are stored
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What one image shows between its map points.
+
+    inverse_depth : (h, w) float32 per metre along the optical axis, at pixels (step/2 + k step), NaN where
+    unknown; pose : (1,); matrix : (3, 3), K.
+    """
+
+    inverse_depth: np.ndarray
+    step_px: int
+    pose: Poses
+    matrix: np.ndarray
+
+    def xyz(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the world that pixels (N, 2) show; NaN outside and where it is unknown."""
+        rows, columns = self.inverse_depth.shape
+        with np.errstate(invalid="ignore"):
+            cell = np.floor(pixels / self.step_px)
+            inside = np.all((cell >= 0) & (cell < [columns, rows]), axis=1)
+        x, y = np.where(inside[:, None], cell, 0).astype(np.int64).T
+        inverse = np.where(inside, self.inverse_depth[y, x], np.nan)
+        rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+        rays = rays @ np.linalg.inv(self.matrix).T
+        return rays / inverse[:, None] @ self.pose.rotations[0] + self.pose.centers[0]
+
+
+def surface(
+    points: FramePoints,
+    pose: Poses,
+    matrix: np.ndarray,
+    size: tuple[int, int],
+    options: SurfaceOptions,
+) -> Surface:
+    """Triangles between the map points that an image of size (width, height) sees.
+
+    Inverse depth is linear in the pixels of a plane: on flat ground and facades it is exact. Triangles that
+    are long or bridge a jump in depth are left out; without three points there is no surface.
+    """
+    width, height = size
+    columns, rows = width // options.step_px, height // options.step_px
+    inverse = np.full(rows * columns, np.nan)
+    depth = (points.xyz - pose.centers[0]) @ pose.rotations[0][2]
+    ahead = depth > 0
+    corners, values = points.pixels[ahead].astype(np.float64), 1 / depth[ahead]
+    try:
+        mesh = Delaunay(corners)
+    except (QhullError, ValueError):  # fewer than three, or all on one line
+        return Surface(
+            inverse.reshape(rows, columns).astype(np.float32), options.step_px, pose, matrix
+        )
+    of = corners[mesh.simplices]
+    longest = np.linalg.norm(of - np.roll(of, 1, axis=1), axis=2).max(axis=1)
+    ratio = values[mesh.simplices].max(axis=1) / values[mesh.simplices].min(axis=1)
+    height = points.xyz[ahead, 2][mesh.simplices]
+    level = height.max(axis=1) - height.min(axis=1) < options.level_m
+    sound = (longest <= options.longest_px) & (ratio <= options.depth_ratio)
+    sound |= level & (longest <= options.ground_px)
+    at = cell_centers(columns, rows, options.step_px / 2, options.step_px)
+    triangle = mesh.find_simplex(at)
+    hit = triangle >= 0
+    hit[hit] = sound[triangle[hit]]
+    transform = mesh.transform[triangle[hit]]  # (M, 3, 2): to barycentric coordinates
+    first = np.einsum("mij,mj->mi", transform[:, :2], at[hit] - transform[:, 2])
+    weights = np.concatenate([first, 1 - first.sum(axis=1, keepdims=True)], axis=1)
+    inverse[hit] = (weights * values[mesh.simplices[triangle[hit]]]).sum(axis=1)
+    return Surface(inverse.reshape(rows, columns).astype(np.float32), options.step_px, pose, matrix)
+
+
+def training_surfaces(group: DatasetGroup, options: SurfaceOptions) -> list[Surface]:
+    """Of every frame of a group whose points are for training. Raises InputError for any other group."""
+    size = group.image_size
+    if size is None:
+        raise ValueError(f"group {group.name} holds no images")
+    return [
+        surface(
+            group.training_points(k),
+            group.poses[k : k + 1],
+            group.intrinsics[k],
+            size,
+            options,
+        )
+        for k in range(len(group))
+    ]

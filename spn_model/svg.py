@@ -1,0 +1,159 @@
+"""Charts as SVG: panels with axes, lines, dots; styled by attributes alone, to stand in any page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+INK, SOFT, GRID = "#222222", "#8a8f98", "#e3e5e8"
+# Okabe & Ito's colours, which people with any colour vision tell apart.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A chart's area on the page (pixels) and the values at its edges."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+
+    def on_page(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Page positions (N, 2) of values; y grows upwards."""
+        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        across = (np.asarray(x, float) - x0) / (x1 - x0) * self.width + self.left
+        return np.stack(
+            [across, self.top + self.height * (1 - (np.asarray(y, float) - y0) / (y1 - y0))],
+            axis=-1,
+        )
+
+    def axes(self, x_label: str, y_label: str, title: str = "") -> str:
+        """Grid, ticks and labels."""
+        bottom, right = self.top + self.height, self.left + self.width
+        parts = []
+        for value in ticks(*self.x_range):
+            x = self.on_page(np.array([value]), np.array([self.y_range[0]]))[0, 0]
+            parts.append(line([(x, self.top), (x, bottom)], GRID))
+            parts.append(text(x, bottom + 15, f"{value:g}", anchor="middle"))
+        for value in ticks(*self.y_range):
+            y = self.on_page(np.array([self.x_range[0]]), np.array([value]))[0, 1]
+            parts.append(line([(self.left, y), (right, y)], GRID))
+            parts.append(text(self.left - 6, y + 4, f"{value:g}", anchor="end"))
+        parts.append(line([(self.left, self.top), (self.left, bottom), (right, bottom)], SOFT))
+        parts.append(text(self.left + self.width / 2, bottom + 32, x_label, anchor="middle"))
+        parts.append(text(self.left - 34, self.top - 10, y_label))
+        if title:
+            parts.append(text(right, self.top - 10, title, anchor="end", bold=True))
+        return "".join(parts)
+
+
+def document(width: float, height: float, label: str, parts: Iterable[str]) -> str:
+    """The whole figure; label : what it shows, for readers that do not see it."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
+        f'aria-label="{_words(label)}" font-family="system-ui, sans-serif" font-size="12" '
+        f'fill="none"><rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>'
+        f"{''.join(parts)}</svg>\n"
+    )
+
+
+def line(
+    points: Sequence[Sequence[float]] | np.ndarray,
+    colour: str,
+    *,
+    width: float = 1.0,
+    dash: str = "",
+    opacity: float = 1.0,
+) -> str:
+    """A line through page positions (N, 2)."""
+    return strokes([points], colour, width=width, dash=dash, opacity=opacity)
+
+
+def strokes(
+    lines: Iterable[Sequence[Sequence[float]] | np.ndarray],
+    colour: str,
+    *,
+    width: float = 1.0,
+    dash: str = "",
+    opacity: float = 1.0,
+) -> str:
+    """Many lines as one path; empty without lines."""
+    path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) for points in lines)
+    dashed = f' stroke-dasharray="{dash}"' if dash else ""
+    faint = f' stroke-opacity="{opacity:g}"' if opacity < 1 else ""
+    return (
+        f'<path d="{path}" stroke="{colour}" stroke-width="{width:g}"{dashed}{faint}/>'
+        if path
+        else ""
+    )
+
+
+def dots(
+    points: np.ndarray, colour: str, *, radius: float = 2.5, titles: Sequence[str] = ()
+) -> str:
+    """Filled circles at page positions (N, 2); titles : shown under the pointer."""
+    told = [f"<title>{_words(title)}</title>" for title in titles] or [""] * len(points)
+    circles = "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}">{title}</circle>'
+        for (x, y), title in zip(points, told, strict=True)
+    )
+    return f'<g fill="{colour}">{circles}</g>'
+
+
+def area(points: np.ndarray, colour: str, *, opacity: float = 0.15) -> str:
+    """A filled polygon of page positions (N, 2)."""
+    path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+    return f'<path d="M{path}Z" fill="{colour}" fill-opacity="{opacity:g}"/>'
+
+
+def box(x: float, y: float, width: float, height: float, colour: str, *, opacity: float = 1) -> str:
+    """A filled rectangle on the page."""
+    return (
+        f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" '
+        f'fill="{colour}" fill-opacity="{opacity:g}"/>'
+    )
+
+
+def text(
+    x: float, y: float, words: str, *, anchor: str = "start", bold: bool = False, colour: str = INK
+) -> str:
+    """Words at a page position; anchor : start, middle or end."""
+    weight = ' font-weight="600"' if bold else ""
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}"{weight}>'
+        f"{_words(words)}</text>"
+    )
+
+
+def legend(x: float, y: float, entries: Sequence[tuple[str, str]]) -> str:
+    """(words, colour) below each other."""
+    return "".join(
+        dots(np.array([[x, y + 17 * k - 4]]), colour, radius=4) + text(x + 10, y + 17 * k, words)
+        for k, (words, colour) in enumerate(entries)
+    )
+
+
+def _words(text: str) -> str:
+    """Text that no XML parser stumbles over: control characters are none, whatever a file's names hold."""
+    return escape("".join(c if c.isprintable() else "\ufffd" for c in text))
+
+
+def ticks(low: float, high: float, about: int = 6) -> list[float]:
+    """Round values within a range that isn't empty, 1, 2 or 5 times a power of ten apart."""
+    step = round_step((high - low) / about)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [round(k * step, 12) + 0.0 for k in range(first, last + 1)]
+
+
+def round_step(value: float) -> float:
+    """The smallest of 1, 2, 5 times a power of ten that is no smaller. Raises ValueError unless positive."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return min(m * power for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9))

@@ -1,0 +1,155 @@
+"""What evaluations become for others: metrics.json, errors.csv, and rows of a table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spn_data.files import write_csv
+from spn_data.record import write_json
+from spn_model.baselines import PAPER_SOURCE, PAPER_TABLE_1
+from spn_model.metrics import Evaluation, Summary
+
+VERSION = 1
+HEADER = (
+    *("method", "frames", "located", "position median", "mean", "p95"),
+    *("rotation median", "mean", "p95"),
+)
+
+
+def write_metrics(
+    path: Path,
+    evaluations: Sequence[Evaluation],
+    *,
+    units: str,
+    retrieval: Mapping[str, str],
+    facts: Mapping[str, Any],
+) -> None:
+    """metrics.json; the file appears whole.
+
+    units : "m" or "model", of all lengths. retrieval : the better retrieval method, by group.
+    facts : plain values of the run that stand beside (times, memory, seeds).
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    for one in evaluations:
+        methods = groups.setdefault(one.frames.group, {})
+        if one.method in methods:
+            raise ValueError(f"two evaluations of {one.method} on {one.frames.group}")
+        methods[one.method] = {
+            **asdict(one.summary),
+            "strata": {name: asdict(summary) for name, summary in one.strata.items()},
+            "curve": [asdict(part) for part in one.curve],
+            "calibration": None if one.calibration is None else asdict(one.calibration),
+        }
+    document = {
+        "version": VERSION,
+        "units": units,
+        "groups": groups,
+        "retrieval": dict(retrieval),
+        "paper": {"source": PAPER_SOURCE, "table_1": [asdict(row) for row in PAPER_TABLE_1]},
+        "facts": dict(facts),
+    }
+    write_json(path, _plain(document))
+
+
+def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
+    """errors.csv: a row for each frame and method, all in one world; empty cells are unknown."""
+    columns: dict[str, list[str]] = {}
+    for one in evaluations:
+        frames, errors = one.frames, one.errors
+        parts: dict[str, Sequence[str]] = {
+            "method": [one.method] * len(frames),
+            "group": [frames.group] * len(frames),
+            "name": [str(name) for name in frames.names],
+            "stratum": [str(stratum) for stratum in frames.strata],
+            "nearest": _cells(frames.nearest_m, 4),
+            "nearest_deg": _cells(frames.nearest_deg, 3),
+            "located": [str(int(found)) for found in errors.located],
+            "error": _cells(errors.error_m, 4),
+            "error_deg": _cells(errors.error_deg, 4),
+            **{
+                f"signed_{axis}": _cells(errors.signed_m[:, k], 4)
+                for k, axis in enumerate(frames.axes)
+            },
+            "sigma": _cells(errors.sigma_m, 4),
+            "sigma_deg": _cells(errors.sigma_deg, 4),
+            "distance_sq": _cells(errors.distance_sq, 4),
+        }
+        for name, cells in parts.items():
+            columns.setdefault(name, []).extend(cells)
+    write_csv(path, columns)
+
+
+def header(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Titles of the columns of `rows`."""
+    within = evaluations[0].summary.within
+    axes = evaluations[0].frames.axes
+    return [
+        *HEADER,
+        *(f"within {part.limit:g} m, {part.limit_deg:g} deg" for part in within),
+        *(f"{axis} signed" for axis in axes),
+        "calibration",
+    ]
+
+
+def rows(evaluations: Sequence[Evaluation]) -> list[list[str]]:
+    """The table of one group, a row a method, as texts; the paper's rows come from `paper_rows`."""
+    return [[one.method, *_figures(one.summary), _calibration(one)] for one in evaluations]
+
+
+def paper_rows(sequence: str, columns: int) -> list[list[str]]:
+    """The paper's table 1 for `medium` or `low`, as rows as long as those of `rows`; none for others.
+
+    Whether its figures are means or medians it does not say: they stand under the median, with a mark.
+    """
+    return [
+        [
+            *(f"{row.network} (paper, another court)", "", ""),
+            *(f"{row.position_m:.2f}*", "", "", f"{row.rotation_deg:.2f}*"),
+            *[""] * (columns - 7),
+        ]
+        for row in PAPER_TABLE_1
+        if row.sequence == sequence
+    ]
+
+
+def _figures(summary: Summary) -> list[str]:
+    position, rotation = summary.position, summary.rotation_deg
+    return [
+        *(str(summary.frames), str(summary.located)),
+        *(_text(value, 2) for value in (position.median, position.mean, position.p95)),
+        *(_text(value, 2) for value in (rotation.median, rotation.mean, rotation.p95)),
+        *(f"{100 * part.share:.0f} %" for part in summary.within),
+        *(_text(axis.signed_median, 2, sign="+") for axis in summary.axes),
+    ]
+
+
+def _calibration(one: Evaluation) -> str:
+    return "" if one.calibration is None else _text(one.calibration.ratio, 2)
+
+
+def _text(value: float, digits: int, sign: str = "") -> str:
+    """NaN is unknown; infinite: too few frames have a pose."""
+    if math.isnan(value):
+        return ""
+    return "none" if math.isinf(value) else f"{value:{sign}.{digits}f}"
+
+
+def _cells(values: np.ndarray, digits: int) -> list[str]:
+    return [f"{value + 0.0:.{digits}f}" if np.isfinite(value) else "" for value in values]
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: NaN and infinity are null."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,181 @@
+"""Cameras of a place seen from one direction, without perspective."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from spn_data.pose import Poses
+from spn_model import svg
+from spn_model.metrics import Estimates, EvaluationFrames
+from spn_model.svg import COLOURS, GRID, INK, SOFT
+
+_AROUND = 0.25  # of the place's extent: estimates farther outside it are not drawn
+MOST_DRAWN = 1500  # cameras, and estimates of one method: more are thinned evenly
+_GAP = 8.0  # times the median step: a longer one is no step of the flight
+
+
+def view_matrix(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    """(2, 3): page right and page up in the world, seen from a direction above the horizon.
+
+    azimuth : of where the eye stands, from the world's first axis towards its second. Elevation 90 with
+    azimuth -90 is a map: first axis right, second up.
+    """
+    azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    eye = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    return np.stack([right, np.cross(eye, right)])
+
+
+def trajectory_panel(
+    place_px: tuple[float, float, float, float],
+    view_deg: tuple[float, float],
+    training: Poses,
+    frames: EvaluationFrames,
+    estimates: Sequence[Estimates],
+    unit: str,
+) -> tuple[str, list[int]]:
+    """SVG of one view within (left, top, width, height), and how many estimates of each method lie outside.
+
+    view_deg : azimuth and elevation.
+    """
+    left, top, width, height = place_px
+    known = np.concatenate([training.centers, frames.poses.centers])
+    low, high = known.min(axis=0), known.max(axis=0)
+    around = max(_AROUND * float((high - low).max()), 1e-3)
+    inside = [
+        np.all((e.poses.centers >= low - around) & (e.poses.centers <= high + around), axis=1)
+        for e in estimates
+    ]
+    found = np.concatenate(
+        [known, *(e.poses.centers[i] for e, i in zip(estimates, inside, strict=True))]
+    )
+    low, high = found.min(axis=0), np.maximum(found.max(axis=0), found.min(axis=0) + 1e-3)
+    step = svg.round_step(float((high - low).max()) / 6)
+    low = np.floor(low / step - 1e-9) * step
+    high = np.ceil(high / step + 1e-9) * step
+    matrix = view_matrix(*view_deg)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T @ matrix.T
+    first, last = corners.min(axis=0), corners.max(axis=0)
+    scale = min((width - 70) / (last[0] - first[0]), (height - 50) / (last[1] - first[1]))
+    offset = (
+        np.array([left + 40, top + 10])
+        + (np.array([width - 70, height - 50]) - (last - first) * scale) / 2
+    )
+
+    def on_page(points: np.ndarray) -> np.ndarray:
+        flat = (np.atleast_2d(points) @ matrix.T - first) * scale
+        return np.stack(
+            [offset[0] + flat[:, 0], offset[1] + (last - first)[1] * scale - flat[:, 1]], 1
+        )
+
+    parts = [_floor(on_page, low, high, step, frames.axes, unit, view_deg=view_deg)]
+    tick = 0.02 * float((high - low).max())
+    cameras = training[thinned(len(training))]
+    ahead = cameras.centers + tick * cameras.rotations[:, 2]
+    parts.append(svg.strokes(zip(on_page(cameras.centers), on_page(ahead), strict=True), SOFT))
+    parts.append(svg.dots(on_page(cameras.centers), SOFT, radius=1.6))
+    parts.append(
+        svg.strokes(_stretches(on_page(frames.poses.centers), frames.poses.centers), INK, width=1.6)
+    )
+    rows = thinned(len(frames))
+    for k, (one, within) in enumerate(zip(estimates, inside, strict=True)):
+        colour = COLOURS[k % len(COLOURS)]
+        shown = rows[within[rows]]
+        ends, places = on_page(frames.poses.centers[shown]), on_page(one.poses.centers[shown])
+        if len(shown):
+            parts.append(
+                svg.strokes(zip(ends, places, strict=True), colour, width=0.6, opacity=0.5)
+            )
+            parts.append(svg.dots(places, colour, titles=frames.names[shown].tolist()))
+    located = [np.isfinite(e.poses.centers).all(axis=1) for e in estimates]
+    return "".join(parts), [int((a & ~b).sum()) for a, b in zip(located, inside, strict=True)]
+
+
+def thinned(count: int) -> np.ndarray:
+    """Rows, evenly spread, of what is drawn of `count`."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_DRAWN)).round().astype(int))
+
+
+def _floor(
+    on_page: Callable[[np.ndarray], np.ndarray],
+    low: np.ndarray,
+    high: np.ndarray,
+    step: float,
+    axes: tuple[str, str, str],
+    unit: str,
+    *,
+    view_deg: tuple[float, float],
+) -> str:
+    """Grid at the lowest height, with figures at its front edges; a scale of heights at its left corner."""
+    eye = np.array([np.cos(np.deg2rad(view_deg[0])), np.sin(np.deg2rad(view_deg[0]))])
+    # The edges that the eye is nearest to; straight from above, the left and the lower one.
+    front = np.where(eye > 1e-9, high[:2], low[:2])
+    grids = [_steps(low[k], high[k], step) for k in range(3)]
+    floor = low[2]
+    lines = [([x, low[1], floor], [x, high[1], floor]) for x in grids[0]]
+    lines += [([low[0], y, floor], [high[0], y, floor]) for y in grids[1]]
+    parts = []
+    for k, other in ((0, 1), (1, 0)):
+        places = np.full((len(grids[k]), 3), floor)
+        places[:, k], places[:, other] = grids[k], front[other]
+        parts.append(
+            _figures(on_page(places), grids[k], axes[k], unit, on_page(_middle(low, high))[0])
+        )
+    if view_deg[1] != 90:
+        corners = np.array([[x, y, floor] for x in (low[0], high[0]) for y in (low[1], high[1])])
+        left = corners[on_page(corners)[:, 0].argmin()]
+        places = np.tile(left, (len(grids[2]), 1))
+        places[:, 2] = grids[2]
+        lines.append((places[0].tolist(), places[-1].tolist()))
+        parts.append(
+            _figures(on_page(places), grids[2], axes[2], unit, on_page(_middle(low, high))[0])
+        )
+    grid = svg.strokes([on_page(np.array(ends)) for ends in lines], GRID)
+    return grid + "".join(parts)
+
+
+def _figures(
+    places: np.ndarray, values: np.ndarray, axis: str, unit: str, middle: np.ndarray
+) -> str:
+    """Figures beside places on the page, away from its middle; the last one carries the axis's name."""
+    along = places[-1] - places[0]
+    across = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
+    if np.dot(across, places.mean(axis=0) - middle) < 0:
+        across = -across
+    anchor = "middle" if abs(across[0]) < 0.5 else "start" if across[0] > 0 else "end"
+    words = [f"{value:g}" for value in values]
+    # Where an axis is short on the page, figures would cover each other.
+    every = max(1, int(np.ceil(26 / max(float(np.hypot(*along)) / max(len(values) - 1, 1), 1e-9))))
+    parts = [
+        svg.text(x, y, word, anchor=anchor, colour=SOFT)
+        for k, ((x, y), word) in enumerate(zip(places + 13 * across + [0, 4], words, strict=True))
+        if k % every == 0
+    ]
+    x, y = (places[0] + places[-1]) / 2 + 34 * across + [0, 4]
+    parts.append(svg.text(x, y, f"{axis} ({unit})", anchor=anchor, colour=SOFT))
+    return "".join(parts)
+
+
+def _middle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    return np.asarray((low + high) / 2)
+
+
+def _steps(low: float, high: float, step: float) -> np.ndarray:
+    """Multiples of step from low to high, which are multiples themselves."""
+    return np.round(np.arange(round(low / step), round(high / step) + 1) * step, 9) + 0.0
+
+
+def _stretches(on_page: np.ndarray, centers: np.ndarray) -> list[np.ndarray]:
+    """The trajectory, interrupted where frames are left out or another sequence begins."""
+    apart = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    usual = float(np.median(apart)) if len(apart) else 0.0
+    breaks = np.flatnonzero(apart > _GAP * max(usual, 1e-9)) + 1
+    return [part for part in np.split(on_page, breaks) if len(part) > 1]

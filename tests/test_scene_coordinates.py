@@ -1,0 +1,335 @@
+"""Scene coordinates: the network's cells, its loss, and what it learns from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from spn_data.camera import Camera
+from spn_data.hdf5_reader import FramePoints
+from spn_data.pose import Poses, rotations_from_angles
+from spn_model.augment import WarpOptions, random_warp
+from spn_model.networks.scene_coordinates import (
+    FIRST_CELL_PX,
+    STRIDE_PX,
+    SceneCoordinates,
+    grid_size,
+    laplace_loss,
+)
+from spn_model.point_targets import (
+    Surface,
+    SurfaceOptions,
+    cell_centers,
+    cell_targets,
+    surface,
+)
+from spn_model.virtual_views import ViewOptions, random_place, view_from
+
+SIZE = (480, 270)
+LENS = Camera.from_horizontal_fov(*SIZE, 72.0)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """These networks are tiny here: more threads only wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("size", [(480, 270), (216, 121), (63, 64), (65, 97)])
+def test_the_grid_is_that_of_the_network(size):
+    """grid_size tells the cells of any image; outputs are three coordinates and one log scale."""
+    columns, rows = grid_size(*size)
+    coordinates, log_scale = SceneCoordinates()(torch.zeros(2, 3, size[1], size[0]))
+    assert coordinates.shape == (2, 3, rows, columns)
+    assert log_scale.shape == (2, 1, rows, columns)
+
+
+def test_a_small_image_is_refused():
+    """Below the smallest size there are no cells at stride 16."""
+    with pytest.raises(ValueError, match="62 x 270 is smaller than 63"):
+        grid_size(62, 270)
+
+
+def test_it_is_small():
+    """At most 5 MB in float32, everything that it needs included."""
+    state = SceneCoordinates().state_dict()
+    assert 4.3e6 < sum(4 * tensor.numel() for tensor in state.values()) < 5e6
+
+
+def test_cells_lie_where_they_are_said_to():
+    """What a cell sees is centred on its stated pixel, by both of its paths, at even and odd cells.
+
+    With averages for maxima and equal positive weights the network is linear and symmetric: the centroid of
+    its gradient is its cell's centre.
+    """
+    net = SceneCoordinates()
+    for k in (2, 5, 8):
+        net.features[k] = nn.AvgPool2d(3, stride=2, ceil_mode=True)
+    for parameter in net.parameters():
+        nn.init.constant_(parameter, 0.01 if parameter.dim() > 1 else 0.0)
+    for cell in ((30, 31), (31, 30)):
+        image = torch.ones(1, 3, 497, 497, requires_grad=True)
+        net(image)[0][0, 0, cell[1], cell[0]].backward()
+        seen = image.grad[0, 0].double()
+        pixel = torch.arange(497) + 0.5
+        at = [(seen.sum(0) * pixel).sum() / seen.sum(), (seen.sum(1) * pixel).sum() / seen.sum()]
+        expected = np.array(cell) * STRIDE_PX + FIRST_CELL_PX
+        assert np.array([float(v) for v in at]) == pytest.approx(expected, abs=1e-3)
+
+
+def test_names_of_the_features_are_the_published_ones():
+    """SqueezeNet 1.1's parameters load by torchvision's names; all others are said to be added."""
+    net = SceneCoordinates()
+    published = {name for name in net.state_dict() if name.startswith("features.")}
+    assert {"features.0.weight", "features.12.expand3x3.bias"} <= published
+    assert len(published) == 50
+    assert {n.partition(".")[0] for n in set(net.state_dict()) - published} == set(net.added)
+    groups = net.parameter_groups()
+    assert sum(p.numel() for p in groups["pretrained"]) == 722_496
+
+
+def test_frozen_features_take_no_gradient():
+    """The first layers stay, the later ones and the head learn."""
+    net = SceneCoordinates()
+    net.freeze_features(5)
+    coordinates, log_scale = net(torch.rand(1, 3, 64, 64))
+    (coordinates.sum() + log_scale.sum()).backward()
+    assert net.features[4].squeeze.weight.grad is None
+    assert net.features[6].squeeze.weight.grad is not None
+    assert net.fine.weight.grad is not None
+
+
+def test_the_head_starts_from_features_of_size_one():
+    """After measuring, what the head receives is centred and of unit variance on the same images."""
+    net = SceneCoordinates()
+    images = torch.rand(3, 3, 96, 96)
+    net.measure_features(images)
+    received = net._normalised("fine", net.features[:8](images)).detach()
+    assert float(received.mean()) == pytest.approx(0, abs=1e-4)
+    assert float(received.square().mean()) == pytest.approx(1, abs=1e-3)
+    before = net(images)[0]
+    net.fine_std.mul_(2)
+    assert not torch.equal(net(images)[0], before)
+
+
+def test_coordinates_are_not_rounded_in_bfloat16():
+    """Under autocast coordinates keep digits that bfloat16 has not."""
+    net = SceneCoordinates()
+    nn.init.normal_(net.out.weight, std=0.1)
+    with torch.autocast("cpu", torch.bfloat16):
+        coordinates, _ = net(torch.rand(1, 3, 96, 96))
+    assert coordinates.dtype == torch.float32
+    lost = coordinates - coordinates.bfloat16().float()
+    assert float((lost / coordinates).abs().median().detach()) > 1e-4
+
+
+def test_the_scene_is_measured_by_medians():
+    """A point at the end of the world changes neither centre nor spread much."""
+    net = SceneCoordinates()
+    xyz = torch.randn(999, 3) + torch.tensor([5.0, 6.0, 7.0])
+    net.set_scene(torch.cat([xyz, torch.full((1, 3), 1e6)]))
+    assert net.center.tolist() == pytest.approx([5, 6, 7], abs=0.15)
+    assert 1 < float(net.spread) < 2
+
+
+def test_the_loss_is_least_at_the_true_scale():
+    """For errors drawn from the distribution, their own scale has the greatest likelihood."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(1, 3, 40, 50))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    errors = torch.from_numpy(direction * rng.gamma(3.0, 0.7, (1, 1, 40, 50)))
+    known = torch.ones(1, 40, 50, dtype=torch.bool)
+
+    def loss(scale: float) -> float:
+        log_scale = torch.full((1, 1, 40, 50), float(np.log(scale)))
+        return float(laplace_loss(errors, log_scale, torch.zeros_like(errors), known))
+
+    assert loss(0.7) < min(loss(0.63), loss(0.77))
+
+
+def test_cells_without_a_target_teach_nothing():
+    """Their coordinates have no gradient, whatever stands in the target."""
+    coordinates = torch.randn(1, 3, 4, 5, requires_grad=True)
+    known = torch.zeros(1, 4, 5, dtype=torch.bool)
+    known[0, 1, 2] = True
+    laplace_loss(coordinates, torch.zeros(1, 1, 4, 5), torch.ones(1, 3, 4, 5), known).backward()
+    moved = coordinates.grad[0].abs().sum(0) > 0
+    assert torch.equal(moved, known[0])
+
+
+def test_it_learns_one_image():
+    """Thirty steps on one small image halve the distance to its targets, and certainty follows."""
+    net = SceneCoordinates()
+    image = torch.rand(1, 3, 96, 96)
+    columns, rows = grid_size(96, 96)
+    targets = torch.from_numpy(cell_centers(columns, rows, 0.0, 1.0)).float().T
+    targets = torch.cat([targets, targets[:1] * 0.5]).reshape(1, 3, rows, columns) + 20
+    net.set_scene(targets[0].reshape(3, -1).T)
+    net.measure_features(image)
+    known = torch.ones(1, rows, columns, dtype=torch.bool)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=1e-3)
+    distances, scales = [], []
+    for _ in range(30):
+        coordinates, log_scale = net(image)
+        loss = laplace_loss(coordinates, log_scale, targets, known)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        distances.append(float((coordinates - targets).norm(dim=1).mean().detach()))
+        scales.append(float(log_scale.mean().detach()))
+    assert distances[-1] < 0.5 * distances[0]
+    assert scales[-1] < scales[0] - 0.3
+
+
+def test_a_cell_takes_the_point_nearest_to_its_middle():
+    """Of two points in a cell the nearer one counts; points outside all cells count nowhere."""
+    pixels = np.array(
+        [[10.9, 7.0], [7.6, 7.6], [-3.0, 5.0], [np.nan, np.nan], [15.5, 23.4], [900, 9]]
+    )
+    xyz = np.arange(18.0).reshape(6, 3)
+    targets, known = cell_targets(pixels, xyz, (3, 4), first_px=7.5, stride_px=8)
+    assert np.argwhere(known).tolist() == [[0, 0], [2, 1]]
+    assert targets[:, 0, 0].tolist() == [3, 4, 5]
+    assert targets[:, 2, 1].tolist() == [12, 13, 14]
+    assert targets.dtype == np.float32
+    assert np.count_nonzero(targets[:, ~known]) == 0
+
+
+def look_at_the_ground(pitch_deg: float) -> Poses:
+    return Poses.from_rotations(
+        [[5.0, -3.0, 8.0]], rotations_from_angles(np.array([[30.0, pitch_deg, 4.0]]))
+    )
+
+
+def ground_points(pose: Poses, count: int, seed: int = 0) -> FramePoints:
+    """Points of level ground at height 1 that a camera sees at random pixels."""
+    pixels = np.random.default_rng(seed).uniform([0, 0], SIZE, (count, 2))
+    rays = np.column_stack([LENS.unproject(pixels), np.ones(count)]) @ pose.rotations[0]
+    xyz = pose.centers[0] + rays * ((1.0 - pose.centers[0, 2]) / rays[:, 2])[:, None]
+    return FramePoints(np.arange(count), pixels, xyz)
+
+
+def test_flat_ground_between_points_is_exact():
+    """The surface of a plane, seen at an angle, lies on the plane to 1e-4 m, at any pixel's own ray."""
+    pose = look_at_the_ground(-50.0)
+    seen = surface(ground_points(pose, 600), pose, LENS.matrix, SIZE, SurfaceOptions())
+    rng = np.random.default_rng(1)
+    # Within a cell of the stored grid depth is constant: pixels at the cells' middles.
+    pixels = np.floor(rng.uniform([40, 40], [440, 230], (300, 2)) / 2) * 2 + 1
+    xyz = seen.xyz(pixels)
+    assert np.isfinite(xyz).all()
+    assert xyz[:, 2] == pytest.approx(1.0, abs=1e-4)
+    back = LENS.project((xyz - pose.centers[0]) @ pose.rotations[0].T)
+    assert back == pytest.approx(pixels, abs=1e-6)
+
+
+def test_a_jump_in_depth_is_no_surface():
+    """Between a near and a far wall nothing is known, on either nearly everything is."""
+    pose = Poses.from_rotations([[0.0, 0, 0]], np.eye(3)[None])
+    pixels = np.random.default_rng(0).uniform([0, 0], SIZE, (1500, 2))
+    pixels = pixels[np.abs(pixels[:, 0] - 240) > 8]
+    depth = np.where(pixels[:, 0] < 240, 5.0, 12.0)
+    xyz = np.column_stack([LENS.unproject(pixels), np.ones(len(pixels))]) * depth[:, None]
+    seen = surface(
+        FramePoints(np.arange(len(xyz)), pixels, xyz), pose, LENS.matrix, SIZE, SurfaceOptions()
+    )
+    at = cell_centers(120, 67, 2.0, 4.0)
+    z = seen.xyz(at)[:, 2]
+    assert np.isnan(z[np.abs(at[:, 0] - 240) < 6]).all()
+    inner = (np.abs(at[:, 0] - 240) > 20) & (np.abs(at - [240, 135]) < [215, 110]).all(axis=1)
+    assert np.isfinite(z[inner]).mean() > 0.98
+    assert set(np.round(z[inner & np.isfinite(z)], 3)) == {5.0, 12.0}
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_without_points_nothing_is_known(count):
+    """An image with fewer than three points has no surface, and no error."""
+    pose = look_at_the_ground(-50.0)
+    some = ground_points(pose, 3)
+    few = FramePoints(some.ids[:count], some.pixels[:count], some.xyz[:count])
+    seen = surface(few, pose, LENS.matrix, SIZE, SurfaceOptions())
+    assert np.isnan(seen.xyz(np.array([[100.0, 100.0]]))).all()
+    with pytest.raises(ValueError, match="nothing is known"):
+        random_place(np.random.default_rng(0), seen, ViewOptions())
+
+
+def test_targets_of_a_virtual_camera_are_what_its_pixels_show():
+    """Cells of a turned and zoomed image get points that it sees exactly at their middles."""
+    pose = look_at_the_ground(-45.0)
+    seen = surface(ground_points(pose, 800), pose, LENS.matrix, SIZE, SurfaceOptions())
+    virtual = random_warp(np.random.default_rng(2), LENS.matrix, SIZE, WarpOptions(), zoom=0.8)
+    at = cell_centers(*grid_size(*SIZE), FIRST_CELL_PX, STRIDE_PX)
+    xyz = seen.xyz(virtual.source_pixels(at))
+    known = np.isfinite(xyz).all(axis=1)
+    assert known.mean() > 0.4
+    turned = virtual.pose(pose)
+    lens = Camera("PINHOLE", *SIZE, virtual.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+    pixels = lens.project((xyz[known] - turned.centers[0]) @ turned.rotations[0].T)
+    assert pixels == pytest.approx(at[known], abs=1e-6)
+    assert xyz[known][:, 2] == pytest.approx(1.0, abs=0.08)
+
+
+def checkered(pose: Poses) -> np.ndarray:
+    """Smoothly chequered ground at height 1, as a camera sees it; one value a place."""
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    rays = np.column_stack([LENS.unproject(pixels), np.ones(len(pixels))]) @ pose.rotations[0]
+    place = pose.centers[0] + rays * ((1.0 - pose.centers[0, 2]) / rays[:, 2])[:, None]
+    value = 128 + 60 * np.sin(2 * place[:, 0]) + 60 * np.cos(2 * place[:, 1])
+    return np.repeat(np.rint(value).astype(np.uint8).reshape(270, 480, 1), 3, axis=2)
+
+
+def test_a_virtual_view_is_what_a_camera_there_would_see():
+    """Ground seen from 4 m higher and 2 m aside: image within 3 of 255 levels, surface on the ground."""
+    pose = look_at_the_ground(-50.0)
+    seen = surface(ground_points(pose, 900), pose, LENS.matrix, SIZE, SurfaceOptions())
+    there = Poses.from_rotations(
+        [[6.0, -4.5, 12.0]], rotations_from_angles(np.array([[26.0, -58.0, 2.0]]))
+    )
+    image, moved = view_from(checkered(pose), seen, there, (255, 0, 255))
+    drawn = ~(image == [255, 0, 255]).all(axis=2)
+    assert drawn.mean() > 0.2
+    error = np.abs(image[..., 0].astype(float) - checkered(there)[..., 0])[drawn]
+    assert np.median(error) < 3
+    assert np.percentile(error, 95) < 12
+    z = moved.xyz(cell_centers(240, 135, 1.0, 2.0))[:, 2]
+    assert np.nanmax(np.abs(z - 1.0)) < 0.1
+    assert moved.pose is there
+
+
+def test_a_near_wall_hides_what_is_behind():
+    """Where two surfaces fall on the same pixels, the nearer one is seen."""
+    depth = np.full((135, 240), 10.0, np.float32)
+    depth[:, :120] = 4.0
+    here = Poses.from_rotations([[0.0, 0, 0]], np.eye(3)[None])
+    seen = Surface(1 / depth, 2, here, LENS.matrix)
+    image = np.where(np.arange(480)[None, :, None] < 240, [[[200, 0, 0]]], [[[0, 0, 200]]])
+    image = np.broadcast_to(image, (270, 480, 3)).astype(np.uint8)
+    left = Poses.from_rotations([[-1.0, 0, 0]], np.eye(3)[None])
+    drawn, moved = view_from(image, seen, left, (0, 0, 0))
+    edge = int(240 + LENS.focal_px[0] * 1.0 / 4.0)
+    assert drawn[135, edge - 12].tolist() == [200, 0, 0]
+    assert drawn[135, edge + 12].tolist() == [0, 0, 200]
+    assert 1 / moved.inverse_depth[67, (edge - 12) // 2] == pytest.approx(4.0, rel=0.01)
+
+
+def test_virtual_cameras_rise_and_keep_their_view():
+    """Drawn places lie within the options, above the real one, and look at what it looked at."""
+    pose = look_at_the_ground(-40.0)
+    seen = surface(ground_points(pose, 600), pose, LENS.matrix, SIZE, SurfaceOptions())
+    rng = np.random.default_rng(0)
+    aim = np.array([[240.0, 135.0]])
+    for _ in range(20):
+        place = random_place(rng, seen, ViewOptions(rise_m=6.0, side_m=2.0))
+        move = (place.centers - pose.centers)[0]
+        assert 0 <= move[2] <= 6
+        assert np.abs(move[:2]).max() <= 2
+        pixel = LENS.project((seen.xyz(aim) - place.centers) @ place.rotations[0].T)[0]
+        assert 0 < pixel[0] < 480
+        assert 0 < pixel[1] < 270
