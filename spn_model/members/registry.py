@@ -1,0 +1,25 @@
+"""Kinds of networks by name, as recipes and checkpoints have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from spn_data.errors import InputError
+from spn_model.members.member import Member
+
+# Imported when they are asked for: one kind does not need what another does.
+KINDS = {
+    "regression": ("spn_model.members.regression", "RegressionMember"),
+    "scene-coordinates": ("spn_model.members.scene_coordinates", "SceneCoordinatesMember"),
+}
+
+
+def make(kind: str, options: Mapping[str, Any], *, seed: int = 0) -> Member:
+    """A member with weights drawn from a seed. Raises InputError for a kind or an option that there isn't."""
+    if kind not in KINDS:
+        raise InputError(f"there is no kind of network {kind!r}; there are {', '.join(KINDS)}")
+    module, name = KINDS[kind]
+    member: Member = getattr(import_module(module), name).make(options, seed)
+    return member

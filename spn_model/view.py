@@ -1,0 +1,98 @@
+"""What a network was trained to see, and the world that its poses are in; no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from spn_data.camera import Camera
+from spn_data.camera_file import camera_from_json, camera_to_json
+from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.hdf5_reader import Dataset
+from spn_data.hdf5_schema import Role
+from spn_data.record import content_fingerprint
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View:
+    """Of the data set that a network was trained on.
+
+    camera : the one pinhole of all images, None where frames have their own; size : (width, height) of its
+    images; units : "m", or "model" for a world whose unit means nothing; origin : of the East-North-Up
+    world, with what heights refer to, None where the place is not known; up_is_known : z points up;
+    dataset : fingerprint of the file; made_from : fingerprints of what the file was made from, by name.
+    """
+
+    camera: Camera | None
+    size: tuple[int, int]
+    units: str
+    origin: GeoOrigin | None
+    up_is_known: bool
+    dataset: str
+    made_from: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> View:
+        """Raises ValueError for a data set without training images."""
+        sizes = {g.image_size for g in dataset.groups.values() if g.role is Role.TRAIN} - {None}
+        if len(sizes) != 1:
+            raise ValueError(f"training images are of {len(sizes)} sizes")
+        info, size = dataset.info, sizes.pop()
+        assert size is not None
+        return cls(
+            camera=info.camera,
+            size=size,
+            units=info.units,
+            origin=info.origin,
+            up_is_known=info.up_is_known,
+            dataset=content_fingerprint(dataset.path),
+            made_from=dict(info.fingerprints),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for json.dumps; what is not known is null."""
+        place = self.origin
+        return {
+            "camera": None if self.camera is None else camera_to_json(self.camera),
+            "size": list(self.size),
+            "units": self.units,
+            "origin": None
+            if place is None
+            else {
+                "lat_deg": place.lat_deg,
+                "lon_deg": place.lon_deg,
+                "alt_m": place.alt_m,
+                "height_reference": place.height_reference.value,
+            },
+            "up_is_known": self.up_is_known,
+            "dataset": self.dataset,
+            "made_from": dict(self.made_from),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> View:
+        """Raises KeyError, TypeError or ValueError where it is not what `to_json` gives."""
+        camera, units, up = value["camera"], value["units"], value["up_is_known"]
+        width, height = (int(side) for side in value["size"])
+        if units not in ("m", "model") or not isinstance(up, bool):
+            raise ValueError(f"units {units!r}, up_is_known {up!r}")
+        if not (0 < width <= 65_536 and 0 < height <= 65_536):
+            raise ValueError(f"images of {width}x{height}")
+        return cls(
+            camera=None if camera is None else camera_from_json(camera),
+            size=(width, height),
+            units=units,
+            origin=None if value["origin"] is None else _origin(value["origin"]),
+            up_is_known=up,
+            dataset=str(value["dataset"]),
+            made_from={str(k): str(v) for k, v in dict(value["made_from"]).items()},
+        )
+
+
+def _origin(value: Mapping[str, Any]) -> GeoOrigin:
+    lat_deg, lon_deg, alt_m = (float(value[name]) for name in ("lat_deg", "lon_deg", "alt_m"))
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360 and math.isfinite(alt_m)):
+        raise ValueError(f"the origin {lat_deg}, {lon_deg}, {alt_m} is no place")
+    return GeoOrigin(lat_deg, lon_deg, alt_m, HeightReference(value["height_reference"]))

@@ -1,0 +1,183 @@
+"""A coloured field seen from straight above, and a small network that tells where from the colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from spn_data.camera import Camera
+from spn_data.errors import InputError
+from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.hdf5 import DatasetWriter
+from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.pose import Poses, canonical_quats
+from spn_model.members import registry
+from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.training_set import TrainingSet
+
+CAMERA = Camera("SIMPLE_PINHOLE", 64, 48, np.array([40.0, 32.0, 24.0]))
+INFO = DatasetInfo(
+    units="m",
+    origin=GeoOrigin(-33.86, 151.2, 12.5, HeightReference.TAKEOFF),
+    up_is_known=True,
+    camera=CAMERA,
+    fingerprints={"3-geo": "0123456789abcdef"},
+)
+HEIGHT_M, PX_PER_M = 10.0, 4.0
+
+
+def field_image() -> np.ndarray:
+    """(400, 400, 3) uint8: red grows eastwards, green northwards, blue blobs do not repeat."""
+    y, x = np.mgrid[0:400, 0:400] / 400.0
+    noise = np.random.default_rng(5).standard_normal((400, 400)).astype(np.float32)
+    blobs = cv2.GaussianBlur(noise, (0, 0), 9)
+    return np.clip(
+        np.stack([40 + 180 * x, 220 - 180 * y, 128 + 30 * blobs / blobs.std()], axis=-1), 0, 255
+    ).astype(np.uint8)
+
+
+def frame(group: str, k: int) -> DatasetFrame:
+    """Seen from a place of its own, north up in the image, with four points of the ground."""
+    rng = np.random.default_rng([k, *group.encode()])
+    east, north = rng.uniform(-36, 36, 2)
+    yaw = rng.uniform(-0.2, 0.2)
+    # Straight down, image x to the east, then turned about the optical axis.
+    quat = canonical_quats(np.array([0.0, np.cos(yaw / 2), np.sin(yaw / 2), 0.0]))
+    center = np.array([east, north, HEIGHT_M])
+    rotation = Poses(center[None], quat[None]).rotations[0]
+    pixels = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([CAMERA.unproject(pixels), np.ones(len(pixels))]) @ rotation
+    ground = center + rays * (-HEIGHT_M / rays[:, 2])[:, None]
+    at = (ground[:, :2] * [1, -1] * PX_PER_M + 200).astype(np.float32).reshape(48, 64, 2)
+    image = cv2.remap(field_image(), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=4)
+    seen = [0, 63, 64 * 47, 64 * 47 + 63]
+    return DatasetFrame(
+        name=f"flight {group}/{k:06d}.jpg",
+        sequence=f"flight {group}",
+        time_s=0.1 * k,
+        center=center,
+        quat_wxyz=quat,
+        intrinsics=CAMERA.matrix,
+        image=image,
+        point_ids=np.arange(4) + 1,
+        point_pixels=pixels[seen],
+        point_xyz=ground[seen],
+    )
+
+
+def write_field(path: Path, train: int = 24, validation: int = 6) -> Path:
+    """A data set of the field at a path, which is returned."""
+    roles = {"train": Role.TRAIN, "validation": Role.VALIDATION}
+    with DatasetWriter(path, INFO, roles) as writer:
+        for group, count in (("train", train), ("validation", validation)):
+            for k in range(count):
+                writer.append(group, frame(group, k))
+    return path
+
+
+class TinyNet(nn.Module):
+    """Images (B, 3, H, W) in 0..1 -> (B, 7): position in the scale of the training poses, quaternion."""
+
+    center: Tensor
+    scale: Tensor
+
+    def __init__(self, width: int, dropout: float):
+        super().__init__()
+        self.convolution = nn.Conv2d(3, width, 4, stride=4)
+        self.normalisation = nn.BatchNorm2d(width)
+        self.dropout = nn.Dropout(dropout)
+        self.out = nn.Linear(width, 7)
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("scale", torch.ones(()))
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = self.normalisation(self.convolution(images)).relu()
+        return self.out(self.dropout(x.mean(dim=(2, 3))))
+
+
+class TinyMember(Member):
+    """A real regression, small enough for tests."""
+
+    kind: ClassVar[str] = "tiny"
+    weights_name = ""
+
+    def __init__(self, width: int, dropout: float):
+        self._options = {"width": width, "dropout": dropout}
+        self.network: TinyNet = TinyNet(width, dropout)
+        self._brightness = 0.0
+        self._sick_at = 2.0
+
+    @classmethod
+    def make(cls, options: Mapping[str, Any], seed: int) -> Self:
+        unknown = [name for name in options if name not in ("width", "dropout")]
+        if unknown:
+            raise InputError(f"kind tiny has no option {unknown[0]!r}")
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return cls(int(options.get("width", 8)), float(options.get("dropout", 0.1)))
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return dict(self._options)
+
+    def load_pretrained(self, weights: str) -> None:
+        raise InputError("has no published weights", path=weights)
+
+    def fit(self, data: TrainingSet) -> None:
+        centers = torch.from_numpy(data.poses.centers).float()
+        self.network.center.copy_(centers.mean(dim=0))
+        self.network.scale.copy_(centers.std(dim=0).max())
+
+    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+        unknown = [name for name in stage if name not in ("frozen", "brightness", "sick_at")]
+        if unknown:
+            raise InputError(f"kind tiny has no option {unknown[0]!r}")
+        self._brightness = float(stage.get("brightness", 0.0))
+        self._sick_at = float(stage.get("sick_at", 2.0))
+        self.network.convolution.requires_grad_(not stage.get("frozen", False))
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        first = [p for p in self.network.convolution.parameters() if p.requires_grad]
+        rest = [*self.network.normalisation.parameters(), *self.network.out.parameters()]
+        groups = [{"name": "added", "params": rest, "rate": 1.0}]
+        return groups + ([{"name": "pretrained", "params": first, "rate": 0.3}] if first else [])
+
+    def batch(
+        self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
+    ) -> Batch:
+        gain = 1 + self._brightness * generator.standard_normal((len(rows), 1, 1, 1))
+        images = np.stack([data.image(int(row)) for row in rows]) / 255 * gain
+        if progress >= self._sick_at:  # what a broken camera or overflow would make of it
+            images = images * np.nan
+        return {
+            "images": torch.from_numpy(images.astype(np.float32)).permute(0, 3, 1, 2),
+            "centers": torch.from_numpy(data.poses.centers[rows]).float(),
+            "quats": torch.from_numpy(data.poses.quats_wxyz[rows]).float(),
+        }
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        out = self.network(batch["images"]).float()
+        where = (batch["centers"] - self.network.center) / self.network.scale
+        position = (out[:, :3] - where).norm(dim=1).mean()
+        turn = (out[:, 3:] - batch["quats"]).norm(dim=1).mean()
+        return position + turn, {"position": position.detach(), "turn": turn.detach()}
+
+    @torch.no_grad()
+    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+        device = self.network.center.device
+        out = self.network(torch.from_numpy(images / 255.0).float().permute(0, 3, 1, 2).to(device))
+        centers = (out[:, :3] * self.network.scale + self.network.center).double().cpu().numpy()
+        quats = nn.functional.normalize(out[:, 3:].double(), dim=1).cpu().numpy()
+        covariance = np.full((len(images), 6, 6), np.nan)
+        return PoseEstimates(Poses(centers, quats), covariance, np.full(len(images), ""))
+
+
+def register_tiny() -> None:
+    """Let recipes and checkpoints of this process know the kind."""
+    registry.KINDS["tiny"] = (__name__, "TinyMember")
