@@ -16,7 +16,7 @@ from typing import Any
 
 import tomli_w
 
-from spn_data.errors import FormatError, StageError
+from spn_data.errors import FormatError, InputError, StageError
 from spn_data.files import write_whole
 from spn_data.record import (
     VERSION,
@@ -27,11 +27,15 @@ from spn_data.record import (
     versions,
     write_json,
 )
+from spn_data.sources import safe_name
 
 FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"
 STAGES = (FRAMES, MODEL, GEO)  # of the map; --add exchanges them together
 EVALUATION, DENSE = "4-eval", "4-dense"  # folders with one stage a sequence
 _GROUPS = (EVALUATION, DENSE)
+RUNS = "runs"  # trained networks, a folder each; made by spn-model
+CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
+ERRORS, FIGURES = "errors.csv", "figures"
 
 # What only unfinished work holds: it is removed once the stage's record stands.
 SCRATCH: dict[str, tuple[str, ...]] = {
@@ -124,7 +128,7 @@ class Area:
         return folder.with_name(f".{folder.name}.partial")
 
     def sequences(self, group: str) -> tuple[str, ...]:
-        """Names of the complete stages of a group (EVALUATION or DENSE), sorted."""
+        """Names of the complete stages of a group (EVALUATION or DENSE), or of RUNS, sorted."""
         folder = self.root / group
         found = folder.iterdir() if folder.is_dir() else iter(())
         return tuple(sorted(p.name for p in found if p.is_dir() and not p.name.startswith(".")))
@@ -133,6 +137,14 @@ class Area:
         """All stages that stand, in the order of work."""
         after = [f"{group}/{name}" for group in _GROUPS for name in self.sequences(group)]
         return tuple(stage for stage in (*STAGES, *after, SPLIT) if self.has(stage))
+
+    def run(self, name: str) -> Path:
+        """Folder of a trained network, which need not exist. Raises InputError for what names no folder."""
+        if safe_name(name) != name:
+            raise InputError(
+                f"{name!r} cannot name a run; use letters, digits, dot, dash and underscore"
+            )
+        return self.root / RUNS / name
 
     def upstream_names(self, stage: str) -> tuple[str, ...]:
         """The stages that `stage` is made from, as the area is now."""
