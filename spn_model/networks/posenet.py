@@ -153,8 +153,9 @@ class PoseNet(Regressor):
             return (pooled,)
         return pooled, F.adaptive_avg_pool2d(after4a, 4), F.adaptive_avg_pool2d(after4d, 4)
 
-    def regress(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
-        kept = self.dropout(F.relu(self.fc1(features[0]), inplace=True))  # (B, 2048)
-        main = self.x(kept), self.q(kept)
-        auxiliary = zip((self.aux1, self.aux2), features[1:], strict=False)
-        return main, *(head(cells) for head, cells in auxiliary)
+    def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        return self.dropout(F.relu(self.fc1(features[0]), inplace=True))  # (B, 2048)
+
+    def auxiliary(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
+        cells = zip((self.aux1, self.aux2), features[1:], strict=False)
+        return tuple(head(maps) for head, maps in cells)

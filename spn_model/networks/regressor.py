@@ -45,9 +45,18 @@ class Regressor(nn.Module):
         """
         raise NotImplementedError
 
+    def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        """(B, D), what the heads `x` and `q` read, from what `trunk` gives."""
+        raise NotImplementedError
+
+    def auxiliary(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
+        """Further estimates that exist for training."""
+        return ()
+
     def regress(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
         """Estimates from what `trunk` gives, the main one first."""
-        raise NotImplementedError
+        descriptor = self.describe(features)
+        return (self.x(descriptor), self.q(descriptor)), *self.auxiliary(features)
 
     def estimates(self, images: Tensor) -> tuple[Estimate, ...]:
         """All estimates from images (B, 3, H, W), for a loss with `estimate_weights`."""

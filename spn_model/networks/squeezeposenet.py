@@ -30,7 +30,7 @@ import torch
 from torch import Tensor, nn
 
 from spn_model.networks.normalization import normalized_leaky_relu
-from spn_model.networks.regressor import Estimate, Regressor, he_start, heads
+from spn_model.networks.regressor import Regressor, he_start, heads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +107,8 @@ class SqueezePoseNet(Regressor):
             maps = self.classifier(maps)  # (B, 1000, ...)
         return (maps.mean((2, 3)),)  # (B, 512 or 1000)
 
-    def regress(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
-        descriptor = self.fc11_activation(self.fc11(self.dropout(features[0])))  # (B, 500)
-        return ((self.x(descriptor), self.q(descriptor)),)
+    def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        return self.fc11_activation(self.fc11(self.dropout(features[0])))  # (B, 500)
 
 
 def squeezenet1_1(slope: float) -> nn.Sequential:

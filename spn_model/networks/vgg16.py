@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from spn_model.networks.regressor import Estimate, Regressor, he_start, heads
+from spn_model.networks.regressor import Regressor, he_start, heads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +62,8 @@ class VGG16(Regressor):
         maps = self.avgpool(self.features(images))  # (B, 512, 7, 7)
         return (self.classifier(maps.flatten(1)),)  # (B, 4096)
 
-    def regress(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
-        kept = self.dropout(features[0])
-        return ((self.x(kept), self.q(kept)),)
+    def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        return self.dropout(features[0])  # (B, 4096)
 
 
 def vgg16(slope: float) -> nn.Sequential:
