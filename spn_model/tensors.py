@@ -14,6 +14,7 @@ from torch import Tensor
 from spn_data.errors import InputError
 from spn_model.networks.normalization import InsertedBatchNorm
 from spn_model.networks.regressor import Regressor
+from spn_model.networks.scene_coordinates import SceneCoordinates
 
 _MAX_BYTES = 2 * 10**9  # VGG16 in float64 has 1.1 GB
 _SAFETENSORS = ".safetensors"
@@ -35,7 +36,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def load_pretrained(
-    network: Regressor, tensors: Mapping[str, Tensor], path: Path
+    network: Regressor | SceneCoordinates, tensors: Mapping[str, Tensor], path: Path
 ) -> tuple[str, ...]:
     """Set the trunk's parameters and statistics from tensors in torchvision's names; nothing else changes.
 
@@ -63,7 +64,7 @@ def load_pretrained(
     return left
 
 
-def _trunk_state(network: Regressor) -> dict[str, Tensor]:
+def _trunk_state(network: Regressor | SceneCoordinates) -> dict[str, Tensor]:
     """Parameters and statistics that torchvision's network has too; they share memory with ours."""
     inserted = tuple(
         f"{name}."

@@ -14,16 +14,24 @@ MEMORY_BYTES = 2_000_000_000  # of decoded images that are kept
 class TrainingSet:
     """A group of role "train": rows k, images of one size, exact poses, map points.
 
-    poses : N; intrinsics : (N, 3, 3); size : (width, height). Images are kept in memory as far as
-    memory_bytes reaches, and read from the file beyond it. Raises InputError where nothing can be trained on.
+    poses : N; intrinsics : (N, 3, 3); size : (width, height); up_is_known : z points up. Images are kept in
+    memory as far as memory_bytes reaches, and read from the file beyond it. Raises InputError where nothing
+    can be trained on.
     """
 
-    def __init__(self, group: DatasetGroup, *, memory_bytes: int = MEMORY_BYTES):
+    def __init__(
+        self,
+        group: DatasetGroup,
+        *,
+        memory_bytes: int = MEMORY_BYTES,
+        up_is_known: bool = True,
+    ):
         if not len(group):
             raise InputError(f"group {group.name} is empty: there is nothing to train on")
         if group.image_size is None:
             raise InputError(f"group {group.name} holds no images: there is nothing to train on")
         self._group = group
+        self.up_is_known = up_is_known
         self.size: tuple[int, int] = group.image_size
         self.poses: Poses = group.poses
         self.intrinsics: np.ndarray = group.intrinsics

@@ -20,7 +20,8 @@ class ViewOptions:
     """Where virtual cameras stand, against the real one."""
 
     rise_m: float = 11.0  # largest, evenly from 0
-    side_m: float = 4.0  # largest move along east and north, to either side
+    side_m: float = 4.0  # largest level move along each axis, to either side
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, of length 1
 
 
 def random_place(generator: np.random.Generator, seen: Surface, options: ViewOptions) -> Poses:
@@ -36,7 +37,9 @@ def random_place(generator: np.random.Generator, seen: Surface, options: ViewOpt
     # The sky and distant hills would draw the view away from the scene.
     depth = (xyz - center) @ rotation[2]
     aim = np.median(xyz[depth < 3 * np.median(depth)], axis=0)
-    move = generator.uniform([-1, -1, 0], 1) * [options.side_m, options.side_m, options.rise_m]
+    up = np.array(options.up)
+    aside = generator.uniform(-1, 1, 3) * options.side_m
+    move = aside + up * (generator.uniform(0, options.rise_m) - aside @ up)
     before, after = aim - center, aim - center - move
     axis = np.cross(before, after)
     sine = np.linalg.norm(axis)

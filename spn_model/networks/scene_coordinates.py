@@ -61,6 +61,7 @@ class SceneCoordinates(nn.Module):
     center (3,), spread () : of the training images' points; outputs are centred and scaled by them.
     fine_mean (256,), coarse_mean (512,), fine_std, coarse_std () : of the published features on training
     images; what the head receives is centred and scaled by them, once for all.
+    covariance_scale () : factor of the covariances of decoded poses, measured on validation images.
     """
 
     min_side_px: ClassVar[int] = 63
@@ -68,6 +69,7 @@ class SceneCoordinates(nn.Module):
     added: ClassVar[tuple[str, ...]] = (
         *("coarse", "context", "fine", "merge", "out", "center", "spread"),
         *("fine_mean", "fine_std", "coarse_mean", "coarse_std"),
+        "covariance_scale",
     )
     replaced: ClassVar[tuple[str, ...]] = ("classifier.1.",)
     center: Tensor
@@ -76,6 +78,7 @@ class SceneCoordinates(nn.Module):
     fine_std: Tensor
     coarse_mean: Tensor
     coarse_std: Tensor
+    covariance_scale: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -101,6 +104,7 @@ class SceneCoordinates(nn.Module):
         self.out = nn.Conv2d(128, 4, 1)
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("spread", torch.ones(()))
+        self.register_buffer("covariance_scale", torch.ones(()))
         for name, channels in (("fine", 256), ("coarse", 512)):
             self.register_buffer(f"{name}_mean", torch.zeros(channels))
             self.register_buffer(f"{name}_std", torch.ones(()))

@@ -1,0 +1,34 @@
+"""Options that a recipe or a checkpoint gives by name, as a dataclass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from spn_data.errors import InputError
+
+_T = TypeVar("_T")
+
+
+def from_mapping(kind: type[_T], given: Mapping[str, Any], where: str) -> _T:
+    """A dataclass of numbers, bools and texts with defaults, from values by the names of its fields.
+
+    A whole number is taken for a float, nothing else is converted. Raises InputError for an unknown name, a
+    value of another type, and a number that is not finite; where : the beginning of its message.
+    """
+    defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        if name not in defaults:
+            raise InputError(f"{where}: {name!r} is not known; known are {', '.join(defaults)}")
+        wanted = type(defaults[name])
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if type(value) is not wanted:
+            raise InputError(f"{where}: {name} is {value!r}, needs a {wanted.__name__}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{where}: {name} is {value}, needs a finite number")
+        values[name] = value
+    return kind(**values)

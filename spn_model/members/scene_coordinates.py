@@ -1,0 +1,186 @@
+"""The scene-coordinate network as a member: what it learns from each image, and a pose from its cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spn_data.errors import GeometryError, InputError
+from spn_data.pose import Poses
+from spn_model.decoding import DecodingOptions, PoseEstimate, decode
+from spn_model.imagenet import MEAN, STD
+from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.members.options import from_mapping
+from spn_model.members.scene_examples import Examples, StageOptions
+from spn_model.networks.scene_coordinates import (
+    FIRST_CELL_PX,
+    STRIDE_PX,
+    SceneCoordinates,
+    grid_size,
+    laplace_loss,
+)
+from spn_model.precision import bfloat16_is_fast
+from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.training_set import TrainingSet
+from spn_model.weights import find
+
+_MEASURED = 16  # training images, spread evenly, by which features are normalised
+
+
+class SceneCoordinatesMember(Member):
+    """Learns, for each cell of an image, the point of the map that it shows; PnP makes a pose of them.
+
+    Fixed options, in `make`: those of DecodingOptions. Of a stage: StageOptions.
+    """
+
+    kind: ClassVar[str] = "scene-coordinates"
+    network: SceneCoordinates
+
+    def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):
+        self.network = network
+        self.decoding = decoding
+        self._stage = StageOptions()
+        self._examples: tuple[TrainingSet, Examples] | None = None
+
+    @classmethod
+    def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesMember:
+        """With weights drawn by the seed. Raises InputError for an unknown option."""
+        decoding = from_mapping(DecodingOptions, options, f"network {cls.kind}")
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = SceneCoordinates()
+        return cls(network.eval(), decoding)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return asdict(self.decoding)
+
+    @property
+    def weights_name(self) -> str:
+        return SceneCoordinates.weights_name
+
+    def load_pretrained(self, weights: str) -> None:
+        path = find(weights)
+        load_pretrained(self.network, read_tensors(path), path)
+
+    def fit(self, data: TrainingSet) -> None:
+        """Centre and spread of the scene, size of published features. Raises InputError without points."""
+        xyz = np.concatenate([data.points(k).xyz for k in range(len(data))])
+        if len(xyz) < 100:
+            raise InputError(
+                f"the training images see {len(xyz)} map points: a scene-coordinate network learns from "
+                "points; train another network, or make the data set from a model with points"
+            )
+        grid_size(*data.size)
+        self.network.set_scene(torch.from_numpy(xyz.astype(np.float32)))
+        chosen = np.unique(np.linspace(0, len(data) - 1, _MEASURED).astype(int))
+        images = np.stack([data.image(k) for k in chosen])
+        self.network.measure_features(_normalised(torch.from_numpy(images)))
+
+    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+        self._stage = from_mapping(StageOptions, stage, f"stage of {self.kind}")
+        self.network.freeze_features(self._stage.freeze_layers)
+        self._examples = None
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        rates = {"added": 1.0, "pretrained": self._stage.features_rate}
+        groups = [
+            {"name": name, "params": [p for p in of if p.requires_grad], "rate": rates[name]}
+            for name, of in self.network.parameter_groups().items()
+        ]
+        return [group for group in groups if group["params"]]
+
+    def batch(
+        self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
+    ) -> Batch:
+        """images (N, h, w, 3) uint8, targets (N, 3, r, c), known (N, r, c).
+
+        See `Examples.batch`: all images have one zoom, and smaller ones are more than the rows.
+        """
+        if self._examples is None or self._examples[0] is not data:
+            center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
+            self._examples = (data, Examples(data, self._stage, center, spread))
+        images, targets, known = self._examples[1].batch(rows, generator, progress)
+        return {
+            "images": torch.from_numpy(images),
+            "targets": torch.from_numpy(targets),
+            "known": torch.from_numpy(known),
+        }
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Laplace likelihood; figures: median distance of cells, and median scale, in the scene's unit.
+
+        Where no cell of the batch has a target the loss is 0.
+        """
+        images, known = batch["images"], batch["known"]
+        with torch.autocast(
+            images.device.type, torch.bfloat16, enabled=bfloat16_is_fast(images.device.type)
+        ):
+            coordinates, log_scale = self.network(_normalised(images))
+        if not known.any():
+            return (coordinates.sum() + log_scale.sum()) * 0, {}
+        loss = laplace_loss(coordinates, log_scale, batch["targets"], known)
+        with torch.no_grad():
+            distance = (coordinates - batch["targets"]).norm(dim=1)[known].median()
+            scale = log_scale[:, 0][known].median().exp()
+        return loss, {"distance": distance, "scale": scale}
+
+    @property
+    def covariance_scale(self) -> float:
+        """Factor of all covariances; see `spn_model.covariance_scale`."""
+        return float(self.network.covariance_scale)
+
+    def set_covariance_scale(self, factor: float) -> None:
+        """Scale all covariances by a factor more; kept in the network's state."""
+        self.network.covariance_scale.mul_(factor)
+
+    def decode(
+        self, coordinates: np.ndarray, log_scale: np.ndarray, matrix: np.ndarray
+    ) -> PoseEstimate:
+        """A pose from the network's output (3, h, w), (h, w) for one image of K (3, 3)."""
+        cells = self.decoding.cells_per_observation * self.covariance_scale
+        return decode(
+            coordinates,
+            log_scale,
+            matrix,
+            first_px=FIRST_CELL_PX,
+            stride_px=STRIDE_PX,
+            options=replace(self.decoding, cells_per_observation=cells),
+        )
+
+    @torch.inference_mode()
+    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+        """As `Member.estimate`; in float32, as the exported network computes."""
+        grid_size(images.shape[2], images.shape[1])
+        device = self.network.center.device
+        poses = Poses.unknown(len(images))
+        covariance = np.full((len(images), 6, 6), np.nan)
+        reasons = np.full(len(images), "", dtype=object)
+        for k, (image, matrix) in enumerate(zip(images, intrinsics, strict=True)):
+            if not np.isfinite(matrix).all():
+                reasons[k] = "its camera is not known"
+                continue
+            # One at a time: as fast on a processor, and no image changes another's result.
+            x = torch.from_numpy(np.ascontiguousarray(image[None])).to(device)
+            coordinates, log_scale = (t[0].cpu().numpy() for t in self.network(_normalised(x)))
+            try:
+                found = self.decode(coordinates, log_scale[0], matrix)
+            except GeometryError as error:
+                reasons[k] = str(error)
+                continue
+            poses.centers[k] = found.poses.centers[0]
+            poses.quats_wxyz[k] = found.poses.quats_wxyz[0]
+            covariance[k] = found.covariance
+        return PoseEstimates(poses, covariance, reasons.astype(str))
+
+
+def _normalised(images: Tensor) -> Tensor:
+    """(N, 3, H, W) for the network, channels last, from (N, H, W, 3) uint8 RGB."""
+    mean = torch.tensor([v * 255 for v in MEAN], device=images.device)
+    std = torch.tensor([v * 255 for v in STD], device=images.device)
+    return ((images - mean) / std).permute(0, 3, 1, 2)

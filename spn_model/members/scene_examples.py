@@ -1,0 +1,199 @@
+"""What a scene-coordinate network is shown in one step: images, and the point of the map at each cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.errors import InputError
+from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
+from spn_model.networks.scene_coordinates import (
+    FIRST_CELL_PX,
+    STRIDE_PX,
+    SceneCoordinates,
+    grid_size,
+)
+from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, cell_targets, surface
+from spn_model.training_set import TrainingSet
+from spn_model.virtual_views import ViewOptions, random_place, view_from
+
+_FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
+_LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
+_VIEWS_KEPT = 1500  # rendered images that are kept: 0.5 MB each
+_COARSE_ZOOM = (0.42, 0.6)  # of a stage's beginning
+_WARP_AT_START = 0.3  # of tilt and roll there
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOptions:
+    """How one stage of a training varies its images, and what it trains."""
+
+    freeze_layers: int = 5  # first layers of SqueezeNet that stay as published
+    features_rate: float = 0.3  # rate of SqueezeNet's other layers against that of the head
+    surfaces: bool = True  # learn from surfaces between map points; else from the points alone
+    tilt_deg: float = 20.0  # largest turn about each of the image's axes
+    roll_deg: float = 20.0  # and about the optical axis
+    zoom_min: float = 0.45  # focal length against the real one
+    zoom_max: float = 1.35
+    coarse_share: float = 0.35  # first share of the stage, at about half the resolution
+    look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
+    views_share: float = 0.0  # share of images rendered from another place
+    views_per_image: int = 4  # places, for each training image
+    views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
+    views_side: float = 0.2  # how far aside
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("freeze_layers", 0, 13),
+            ("features_rate", 0, 10),
+            ("tilt_deg", 0, 60),
+            ("roll_deg", 0, 180),
+            ("zoom_min", 0.1, 4),
+            ("zoom_max", self.zoom_min, 4),
+            ("coarse_share", 0, 1),
+            ("views_share", 0, 1),
+            ("views_per_image", 1, 1000),
+            ("views_rise", 0, 10),
+            ("views_side", 0, 10),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} is {value}, needs to lie from {low} to {high}")
+
+
+class Examples:
+    """Examples of one data set, as one stage varies them; surfaces and views are kept once they are made.
+
+    center (3,), spread : of the scene. What is kept is made of the data alone, whichever row comes first.
+    """
+
+    def __init__(self, data: TrainingSet, options: StageOptions, center: np.ndarray, spread: float):
+        self._data, self._options = data, options
+        self._center, self._spread = center, spread
+        level = _LEVEL * spread if data.up_is_known else 0.0
+        self._surface_options = SurfaceOptions(level_m=level)
+        self._view_options = ViewOptions(
+            rise_m=options.views_rise * spread,
+            side_m=options.views_side * spread,
+            up=(0.0, 0.0, 1.0) if data.up_is_known else _mean_up(data),
+        )
+        self._surfaces: dict[int, Surface] = {}
+        self._views: dict[tuple[int, int], tuple[np.ndarray, Surface]] = {}
+
+    def batch(
+        self, rows: np.ndarray, generator: np.random.Generator, progress: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Images (N, h, w, 3) uint8, targets (N, 3, r, c) float32, known (N, r, c), of one zoom and size.
+
+        Images that the zoom makes smaller are up to twice as many, of further rows.
+        """
+        data = self._data
+        zoom, warp = self._variation(generator, progress)
+        scale = min(1.0, zoom * 1.05)
+        width, height = (
+            max(round(side * scale), min(side, SceneCoordinates.min_side_px)) for side in data.size
+        )
+        count = round(len(rows) * min(2.0, data.size[0] * data.size[1] / (width * height)))
+        more = generator.integers(len(data), size=max(0, count - len(rows)))
+        made = [
+            self._example(int(row), generator, warp, zoom, (width, height))
+            for row in np.concatenate([rows, more])
+        ]
+        images, targets, known = (np.stack(part) for part in zip(*made, strict=True))
+        return images, targets, known
+
+    def _variation(
+        self, generator: np.random.Generator, progress: float
+    ) -> tuple[float, WarpOptions]:
+        options = self._options
+        low, high, ramp = options.zoom_min, options.zoom_max, 1.0
+        if progress < options.coarse_share:
+            low, high = _COARSE_ZOOM
+            ramp = _WARP_AT_START + (1 - _WARP_AT_START) * progress / options.coarse_share
+        warp = WarpOptions(tilt_deg=options.tilt_deg * ramp, roll_deg=options.roll_deg * ramp)
+        return float(np.exp(generator.uniform(np.log(low), np.log(high)))), warp
+
+    def _example(
+        self,
+        row: int,
+        generator: np.random.Generator,
+        options: WarpOptions,
+        zoom: float,
+        size: tuple[int, int],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        matrix = self._data.intrinsics[row]
+        image, seen = self._source(row, generator)
+        warp = random_warp(generator, matrix, self._data.size, options, zoom=zoom, target_size=size)
+        red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
+        image = warp.image(image, (red, green, blue))
+        if self._options.look:
+            image = change_look(image, generator, LookOptions())
+        grid = grid_size(*size)
+        if self._options.surfaces:
+            cells = cell_centers(*grid, FIRST_CELL_PX, STRIDE_PX)
+            xyz = seen.xyz(warp.source_pixels(cells))
+            targets = xyz.astype(np.float32).T.reshape(3, grid[1], grid[0])
+            known = np.ones(targets.shape[1:], bool)
+        else:
+            points = self._data.points(row)
+            targets, known = cell_targets(
+                warp.pixels(points.pixels),
+                points.xyz,
+                grid,
+                first_px=FIRST_CELL_PX,
+                stride_px=STRIDE_PX,
+            )
+        with np.errstate(invalid="ignore"):
+            off = np.linalg.norm(targets - self._center[:, None, None], axis=0)
+            known &= off < _FAR * self._spread
+        return image, np.where(known, targets, np.float32(0)), known
+
+    def _source(self, row: int, generator: np.random.Generator) -> tuple[np.ndarray, Surface]:
+        """A training image, or a view rendered from it, with what it shows."""
+        options = self._options
+        if generator.random() < options.views_share:
+            key = (row, int(generator.integers(options.views_per_image)))
+            if key not in self._views:
+                while len(self._views) >= _VIEWS_KEPT:
+                    del self._views[next(iter(self._views))]
+                self._views[key] = self._view(*key)
+            return self._views[key]
+        return self._image(row), self._surface(row)
+
+    def _image(self, row: int) -> np.ndarray:
+        image, valid = self._data.image(row), self._data.valid(row)
+        if valid is None:
+            return image
+        return np.where(
+            valid[..., None], image, np.random.default_rng(row).integers(0, 256, 3, np.uint8)
+        )
+
+    def _surface(self, row: int) -> Surface:
+        if row not in self._surfaces:
+            data = self._data
+            self._surfaces[row] = surface(
+                data.points(row),
+                data.poses[row : row + 1],
+                data.intrinsics[row],
+                data.size,
+                self._surface_options,
+            )
+        return self._surfaces[row]
+
+    def _view(self, row: int, number: int) -> tuple[np.ndarray, Surface]:
+        seen = self._surface(row)
+        if not np.isfinite(seen.inverse_depth).any():
+            return self._image(row), seen
+        # A view is the same whenever it is made: a batch depends on its arguments alone.
+        generator = np.random.default_rng([row, number])
+        place = random_place(generator, seen, self._view_options)
+        red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
+        return view_from(self._image(row), seen, place, (red, green, blue))
+
+
+def _mean_up(data: TrainingSet) -> tuple[float, float, float]:
+    """Mean of the directions in which the images' upper edges lie, of length 1."""
+    up = -data.poses.rotations[:, 1].mean(axis=0)
+    x, y, z = up / max(float(np.linalg.norm(up)), 1e-9)
+    return float(x), float(y), float(z)
