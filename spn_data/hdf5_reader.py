@@ -96,6 +96,10 @@ class Dataset:
 
         return _guarded(self.path, f"group {name}", read)
 
+    def of_role(self, role: Role) -> list[DatasetGroup]:
+        """Its groups of a role, in the order of their names."""
+        return [group for group in self.groups.values() if group.role is role]
+
     def close(self) -> None:
         self._file.close()
 
