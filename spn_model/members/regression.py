@@ -1,0 +1,312 @@
+"""Pose regressors as a member: the paper's SqueezePoseNet, VGG16 and PoseNet, from images to poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spn_data.errors import InputError
+from spn_data.pose import Poses, rotation_vectors
+from spn_model import weights
+from spn_model.calibration import calibrate
+from spn_model.imagenet import MEAN, STD
+from spn_model.loss import beta_weighted, laplace, reprojection, residuals
+from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.members.options import from_mapping
+from spn_model.members.regression_examples import (
+    FeatureCache,
+    example,
+    input_size,
+    resized,
+    visible_points,
+)
+from spn_model.members.regression_options import RegressionOptions, StageOptions
+from spn_model.networks.normalization import start_as_identity
+from spn_model.networks.pose_network import PoseNetwork
+from spn_model.networks.registry import build, options_of
+from spn_model.precision import bfloat16_is_fast
+from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.training_set import TrainingSet
+
+_MEASURED = (
+    64  # training images, spread evenly, on which batch normalisation starts as the identity
+)
+_AT_ONCE = 8  # images
+_CACHE_BYTES = 4_000_000_000
+
+
+class RegressionMember(Member):
+    """Answers with a pose at once; learns the poses of training images, whose cameras are turned about.
+
+    Fixed options, in `make`: those of RegressionOptions, and network_options, of `networks.registry`. Of a
+    stage: StageOptions.
+    """
+
+    kind: ClassVar[str] = "regression"
+    network: PoseNetwork
+
+    def __init__(self, network: PoseNetwork, options: RegressionOptions):
+        self.network = network
+        self._options = options
+        self._stage = StageOptions()
+        self._cache: FeatureCache | None = None
+
+    @classmethod
+    def make(cls, options: Mapping[str, Any], seed: int = 0) -> RegressionMember:
+        """With weights drawn by the seed. Raises InputError for an option or a value that there isn't."""
+        own = dict(options)
+        of_network = own.pop("network_options", {})
+        if not isinstance(of_network, Mapping):
+            raise InputError(
+                f"network {cls.kind}: network_options is {of_network!r}, needs a table"
+            )
+        chosen = from_mapping(RegressionOptions, own, f"network {cls.kind}")
+        regressor = build(chosen.network, of_network, seed=seed)
+        with torch.random.fork_rng(devices=[]):
+            return cls(PoseNetwork(regressor).eval(), chosen)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return {
+            "network": self._options.network,
+            "network_options": options_of(self.network.regressor),
+            "width": self._options.width,
+        }
+
+    @property
+    def weights_name(self) -> str:
+        return self.network.regressor.weights_name
+
+    def load_pretrained(self, weights_name: str) -> None:
+        path = Path(weights.find(weights_name))
+        load_pretrained(self.network.regressor, read_tensors(path), path)
+
+    def fit(self, data: TrainingSet) -> None:
+        """Centre and spread of the poses; on the first data set of a network's life also how it starts.
+
+        Inserted batch normalisations become the identity, and heads `q` begin at the mean orientation. A
+        network that was trained before keeps what it has learnt, and aims at the poses of this data set.
+        """
+        self._check_size(*input_size(*data.size, self._options.width))
+        network = self.network
+        network.targets.fit(data.poses)
+        if network.is_started:
+            return
+        _, quats = network.targets.encode(data.poses)
+        network.start_heads(torch.from_numpy(quats.mean(axis=0)))
+        start_as_identity(network.regressor, self._measured(data))
+        network.is_started.fill_(True)
+
+    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+        chosen = from_mapping(StageOptions, stage, f"stage of {self.kind}")
+        if chosen.loss == "reprojection" and not data.has_points:
+            raise InputError(
+                "the loss reprojection needs map points, and the data set holds none to learn from; "
+                "choose beta or learned"
+            )
+        if chosen.warp is not None and not np.isfinite(data.intrinsics).all():
+            raise InputError(
+                "the camera of some training images is not known: they cannot be turned about; "
+                "set tilt_deg and roll_deg to 0"
+            )
+        self._stage, self._cache = chosen, None
+        network = self.network
+        network.regressor.freeze_trunk(chosen.freeze_trunk)
+        network.weighting.requires_grad_(chosen.loss == "learned")
+        network.drops, network.normalizes_by_batch = chosen.dropout, chosen.batch_statistics
+        network.train(network.training)
+        if chosen.cached_features:
+            self._cache = self._cached(data, chosen.cached_features)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        of = self.network.regressor.parameter_groups()
+        groups = [
+            ("added", of["added"], 1.0),
+            ("pretrained", of["pretrained"], self._stage.pretrained_rate),
+            ("uncertainty", list(self.network.uncertainty.parameters()), 1.0),
+            ("weighting", list(self.network.weighting.parameters()), 1.0),
+        ]
+        return [
+            {"name": name, "params": params, "rate": rate}
+            for name, params, rate in groups
+            if all(parameter.requires_grad for parameter in params)
+        ]
+
+    def batch(
+        self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
+    ) -> Batch:
+        """images (B, h, w, 3) uint8, or features0 and so on (B, ...) where cached; x (B, 3), q (B, 4).
+
+        For the reprojection error also points (B, P, 3) relative to the targets' centre, seen (B, P) and
+        matrices (B, 3, 3), K of the data set's images.
+        """
+        batch: Batch = {}
+        if self._cache is not None:
+            features, poses = self._cache.draw(rows, generator)
+            batch |= {f"features{k}": torch.from_numpy(f) for k, f in enumerate(features)}
+        else:
+            images, poses = self._examples(data, [(row, generator) for row in rows])
+            batch["images"] = torch.from_numpy(images)
+        x, q = self.network.targets.encode(poses)
+        batch["x"], batch["q"] = torch.from_numpy(x), torch.from_numpy(q)
+        if self._stage.loss == "reprojection":
+            points, seen = visible_points(data, rows, poses, self._stage.points, generator)
+            centered = points - self.network.targets.center.cpu().numpy()
+            batch["points"] = torch.from_numpy(centered.astype(np.float32))
+            batch["seen"] = torch.from_numpy(seen)
+            batch["matrices"] = torch.from_numpy(data.intrinsics[rows].astype(np.float32))
+        return batch
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """That of the stage, and the likelihood of its errors, whose gradient stays with `uncertainty`.
+
+        Figures: medians of the distance in the world's unit and of the angle in degrees; the likelihood.
+        """
+        outputs = self.network.outputs(self._features(batch))
+        weights_ = self.network.regressor.estimate_weights
+        pose_loss = torch.stack(
+            [
+                weight * self._pose_loss(x, q, batch).mean()
+                for weight, (x, q) in zip(weights_, outputs.estimates, strict=False)
+            ]
+        ).sum()
+        x, q = outputs.estimates[0]
+        errors = residuals(x.detach(), q.detach(), batch["x"], batch["q"])
+        likelihood = laplace(errors, outputs.log_std).mean()
+        figures = {
+            "distance": errors[:, :3].norm(dim=1).median(),
+            "angle_deg": torch.rad2deg(errors[:, 3:].norm(dim=1).median()),
+            "likelihood": likelihood.detach(),
+        }
+        return pose_loss + likelihood, figures
+
+    @torch.inference_mode()
+    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+        """As `Member.estimate`. K is not used: images must be of the training images' camera."""
+        return self.read_out(*self._answers(images))
+
+    def read_out(self, x: np.ndarray, q: np.ndarray, log_std: np.ndarray) -> PoseEstimates:
+        """Poses from what the network gives of N images: x (N, 3), q (N, 4), log_std (N, 6)."""
+        poses = self.network.targets.decode(x, q)
+        covariance = np.full((len(x), 6, 6), np.nan)
+        found = np.isfinite(poses.centers[:, 0])
+        variance = np.exp(2 * log_std[found].astype(np.float64))
+        covariance[found] = variance[:, :, None] * np.eye(6)
+        reasons = np.where(found, "", "the network's answer is no pose")
+        return PoseEstimates(poses, covariance, reasons)
+
+    def calibrate(self, estimates: PoseEstimates, truth: Poses) -> None:
+        """Make later covariances as large as the errors of these estimates, of images not trained on, are.
+
+        One factor for positions and one for rotations: stated standard deviations are multiplied by the
+        root of the median squared Mahalanobis distance over that of chi-squared (`spn_model.calibration`).
+        A half that no frame tells anything of stays as it is.
+        """
+        away = truth.centers - estimates.poses.centers
+        turn = truth.rotations @ estimates.poses.rotations.transpose(0, 2, 1)
+        errors = np.full((len(away), 6), np.nan)
+        found = np.isfinite(away).all(axis=1)
+        errors[found] = np.concatenate([away[found], rotation_vectors(turn[found])], axis=1)
+        fit = calibrate(errors[found], estimates.covariance[found])
+        for k, ratio in enumerate((fit.position_ratio, fit.rotation_ratio)):
+            if np.isfinite(ratio) and ratio > 0:
+                self.network.factors[k] *= float(np.sqrt(ratio))
+
+    def normalised(self, images: Tensor) -> Tensor:
+        """(B, 3, h, w) of images (B, h, w, 3) uint8, as ImageNet's."""
+        rgb = images.permute(0, 3, 1, 2).float() / 255
+        mean, std = (torch.tensor(v, device=rgb.device)[:, None, None] for v in (MEAN, STD))
+        return (rgb - mean) / std
+
+    def _pose_loss(self, x: Tensor, q: Tensor, batch: Batch) -> Tensor:
+        stage, true = self._stage, (batch["x"], batch["q"])
+        if stage.loss == "beta":
+            return beta_weighted(x, q, *true, stage.beta)
+        if stage.loss == "learned":
+            weighted: Tensor = self.network.weighting(x, q, *true)
+            return weighted
+        return reprojection(x, q, *true, batch["points"], batch["seen"], batch["matrices"])
+
+    def _features(self, batch: Batch) -> tuple[Tensor, ...]:
+        if "images" in batch:
+            return self._trunk(batch["images"])
+        return tuple(batch[name] for name in batch if name.startswith("features"))
+
+    def _trunk(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Features, float32, of images (B, h, w, 3) uint8, computed as training does."""
+        kind = images.device.type
+        with torch.autocast(kind, torch.bfloat16, enabled=bfloat16_is_fast(kind)):
+            features = self.network.regressor.trunk(self.normalised(images))
+        return tuple(part.float() for part in features)
+
+    def _answers(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the network gives in eval mode, in float32: x (N, 3), q (N, 4), log_std (N, 6)."""
+        network = self.network
+        parts = [np.zeros((0, 13), np.float32)]
+        for start in range(0, len(images), _AT_ONCE):
+            sized = [
+                resized(image, self._options.width) for image in images[start : start + _AT_ONCE]
+            ]
+            self._check_size(sized[0].shape[1], sized[0].shape[0])
+            answer = network(self.normalised(torch.from_numpy(np.stack(sized)).to(self._device)))
+            parts.append(torch.cat(answer, 1).cpu().numpy())
+        x, q, log_std = np.split(np.concatenate(parts), [3, 7], axis=1)
+        return x, q, log_std
+
+    def _examples(
+        self, data: TrainingSet, wanted: Iterable[tuple[int, np.random.Generator]]
+    ) -> tuple[np.ndarray, Poses]:
+        """Images (B, h, w, 3) uint8 and poses of rows of the training set, varied as the stage says."""
+        made = [
+            example(data, int(row), self._options.width, self._stage, generator)
+            for row, generator in wanted
+        ]
+        return np.stack([image for image, _ in made]), Poses.concatenate(pose for _, pose in made)
+
+    @torch.no_grad()
+    def _cached(self, data: TrainingSet, variants: int) -> FeatureCache:
+        """Features of variants of every image, the same in every run: drawn by row and variant alone."""
+        network, was_training = self.network, self.network.training
+        network.train()  # the auxiliary estimates exist in training mode alone; the trunk is frozen
+        try:
+            features, poses = [], []
+            for row in range(len(data)):
+                seeds = [np.random.default_rng((row, variant)) for variant in range(variants)]
+                images, of_row = self._examples(data, [(row, seed) for seed in seeds])
+                found = self._trunk(torch.from_numpy(images).to(self._device))
+                size = sum(part.nbytes for part in found) * len(data)
+                if size > _CACHE_BYTES:
+                    raise InputError(
+                        f"cached_features is {variants}: that takes {size / 1e9:.1f} GB of memory, "
+                        f"{_CACHE_BYTES / 1e9:.0f} GB are allowed"
+                    )
+                features.append([part.cpu().numpy() for part in found])
+                poses.append(of_row)
+        finally:
+            network.train(was_training)
+        stacked = tuple(np.stack(parts) for parts in zip(*features, strict=True))
+        return FeatureCache(stacked, Poses.concatenate(poses))
+
+    def _measured(self, data: TrainingSet) -> Iterator[Tensor]:
+        chosen = np.unique(np.linspace(0, len(data) - 1, _MEASURED).astype(int))
+        for start in range(0, len(chosen), _AT_ONCE):
+            rows = chosen[start : start + _AT_ONCE]
+            images = np.stack([resized(data.image(row), self._options.width) for row in rows])
+            yield self.normalised(torch.from_numpy(images).to(self._device))
+
+    @property
+    def _device(self) -> torch.device:
+        return self.network.targets.center.device
+
+    def _check_size(self, width: int, height: int) -> None:
+        smallest = self.network.regressor.min_side_px
+        if min(width, height) < smallest:
+            raise InputError(
+                f"images of {width} x {height} are too small: {self._options.network} needs {smallest} px "
+                "a side"
+            )
