@@ -39,6 +39,7 @@ class SceneCoordinatesMember(Member):
     """
 
     kind: ClassVar[str] = "scene-coordinates"
+    any_camera: ClassVar[bool] = True
     network: SceneCoordinates
 
     def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):

@@ -20,7 +20,7 @@ from spn_model.virtual_views import ViewOptions, random_place, view_from
 
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
-_VIEWS_KEPT = 1500  # rendered images that are kept: 0.5 MB each
+_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 30 ms
 _COARSE_ZOOM = (0.42, 0.6)  # of a stage's beginning
 _WARP_AT_START = 0.3  # of tilt and roll there
 
@@ -39,7 +39,9 @@ class StageOptions:
     coarse_share: float = 0.35  # first share of the stage, at about half the resolution
     look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
     views_share: float = 0.0  # share of images rendered from another place
-    views_per_image: int = 4  # places, for each training image
+    views_per_image: int = (
+        4  # of these there are, for each training image, as far as memory reaches
+    )
     views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
     views_side: float = 0.2  # how far aside
 
@@ -60,6 +62,8 @@ class StageOptions:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"{name} is {value}, needs to lie from {low} to {high}")
+        if self.views_share and not self.surfaces:
+            raise InputError("views_share needs surfaces: views are rendered from them")
 
 
 class Examples:
@@ -79,7 +83,11 @@ class Examples:
             up=(0.0, 0.0, 1.0) if data.up_is_known else _mean_up(data),
         )
         self._surfaces: dict[int, Surface] = {}
-        self._views: dict[tuple[int, int], tuple[np.ndarray, Surface]] = {}
+        width, height = data.size
+        self._view_count = min(
+            len(data) * options.views_per_image, max(1, _VIEW_BYTES // (width * height * 4))
+        )
+        self._views: dict[int, tuple[np.ndarray, Surface]] = {}
 
     def batch(
         self, rows: np.ndarray, generator: np.random.Generator, progress: float
@@ -122,15 +130,15 @@ class Examples:
         zoom: float,
         size: tuple[int, int],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        matrix = self._data.intrinsics[row]
         image, seen = self._source(row, generator)
+        matrix = self._data.intrinsics[row] if seen is None else seen.matrix
         warp = random_warp(generator, matrix, self._data.size, options, zoom=zoom, target_size=size)
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
         image = warp.image(image, (red, green, blue))
         if self._options.look:
             image = change_look(image, generator, LookOptions())
         grid = grid_size(*size)
-        if self._options.surfaces:
+        if seen is not None:
             cells = cell_centers(*grid, FIRST_CELL_PX, STRIDE_PX)
             xyz = seen.xyz(warp.source_pixels(cells))
             targets = xyz.astype(np.float32).T.reshape(3, grid[1], grid[0])
@@ -149,17 +157,16 @@ class Examples:
             known &= off < _FAR * self._spread
         return image, np.where(known, targets, np.float32(0)), known
 
-    def _source(self, row: int, generator: np.random.Generator) -> tuple[np.ndarray, Surface]:
-        """A training image, or a view rendered from it, with what it shows."""
-        options = self._options
-        if generator.random() < options.views_share:
-            key = (row, int(generator.integers(options.views_per_image)))
-            if key not in self._views:
-                while len(self._views) >= _VIEWS_KEPT:
-                    del self._views[next(iter(self._views))]
-                self._views[key] = self._view(*key)
-            return self._views[key]
-        return self._image(row), self._surface(row)
+    def _source(
+        self, row: int, generator: np.random.Generator
+    ) -> tuple[np.ndarray, Surface | None]:
+        """A training image, or a view rendered from any of them, with the surface that it shows."""
+        if generator.random() < self._options.views_share:
+            number = int(generator.integers(self._view_count))
+            if number not in self._views:
+                self._views[number] = self._view(number)
+            return self._views[number]
+        return self._image(row), self._surface(row) if self._options.surfaces else None
 
     def _image(self, row: int) -> np.ndarray:
         image, valid = self._data.image(row), self._data.valid(row)
@@ -181,12 +188,13 @@ class Examples:
             )
         return self._surfaces[row]
 
-    def _view(self, row: int, number: int) -> tuple[np.ndarray, Surface]:
+    def _view(self, number: int) -> tuple[np.ndarray, Surface]:
+        row = number * len(self._data) // self._view_count
         seen = self._surface(row)
         if not np.isfinite(seen.inverse_depth).any():
             return self._image(row), seen
         # A view is the same whenever it is made: a batch depends on its arguments alone.
-        generator = np.random.default_rng([row, number])
+        generator = np.random.default_rng(number)
         place = random_place(generator, seen, self._view_options)
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
         return view_from(self._image(row), seen, place, (red, green, blue))
