@@ -15,7 +15,7 @@ _WIDEST_TAN = np.tan(np.deg2rad(85.0))  # a pinhole image of more than 170 degre
 _BORDER_POINTS = 512  # a side
 _BORDER_TOLERANCE_PX = 1e-3  # of the source image; the size of the view is known to far better
 _ROUND_TRIP_PX = 1e-3  # a point whose ray does not lead back to it has no ray
-_SAMPLE_STEP_PX = 1.25  # of the source, at most, from one sample to the next
+SAMPLE_STEP_PX = 1.25
 _MOST_SAMPLES = 16  # a side of a pixel
 
 
@@ -112,10 +112,11 @@ class Renderer:
     reduction of a whole image does (0.74 of a wave of 2.5 output pixels, 0.1 of one of 1 pixel; bicubic
     samples 0.80 and 0.14 for three times the time); bicubic where nothing is reduced, for sharpness.
 
-    valid : (H, W) bool, output pixels that lie wholly inside the source image.
+    valid : (H, W) bool, output pixels that lie wholly inside the source image. sample_step_px : of the
+    source, at most, from one sample to the next.
     """
 
-    def __init__(self, camera: Camera, target: Camera):
+    def __init__(self, camera: Camera, target: Camera, *, sample_step_px: float = SAMPLE_STEP_PX):
         if not np.isfinite(camera.params).all():
             raise ValueError("a camera with unknown parameters")
         if target.opencv_distortion.any():
@@ -125,7 +126,7 @@ class Renderer:
         shape = (target.height + 1, target.width + 1)
         seen = _is_seen(camera, corners, tolerance_px=_BORDER_TOLERANCE_PX).reshape(shape)
         self.valid = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
-        self._samples = self._samples_a_side(corners, shape)
+        self._samples = self._samples_a_side(corners, shape, sample_step_px)
         fine = target.scaled(target.width * self._samples, target.height * self._samples)
         source = _project(camera, _grid(fine, fine.width, fine.height, first=0.5))
         source = (source - 0.5).reshape(fine.height, fine.width, 2).astype(np.float32)
@@ -135,12 +136,14 @@ class Renderer:
     def all_valid(self) -> bool:
         return bool(self.valid.all())
 
-    def _samples_a_side(self, corners: np.ndarray, shape: tuple[int, int]) -> int:
+    def _samples_a_side(
+        self, corners: np.ndarray, shape: tuple[int, int], sample_step_px: float
+    ) -> int:
         source = _project(self.camera, corners).reshape(*shape, 2)
         across = np.linalg.norm(np.diff(source, axis=1), axis=-1)[:-1][self.valid]
         down = np.linalg.norm(np.diff(source, axis=0), axis=-1)[:, :-1][self.valid]
         step_px = float(max(across.max(initial=1.0), down.max(initial=1.0)))
-        return int(np.clip(np.ceil(step_px / _SAMPLE_STEP_PX), 1, _MOST_SAMPLES))
+        return int(np.clip(np.ceil(step_px / sample_step_px), 1, _MOST_SAMPLES))
 
     def render(self, image: np.ndarray) -> np.ndarray:
         """The pinhole's image (H, W, ...) uint8 of the lens's full-size image; invalid pixels are 0."""

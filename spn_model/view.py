@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json, camera_to_json
 from spn_data.geodesy import GeoOrigin, HeightReference
-from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
 from spn_data.record import content_fingerprint
+
+if TYPE_CHECKING:
+    from spn_data.hdf5_reader import Dataset  # not on board: it needs h5py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
