@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from cli.console import Group
+from cli.evaluate import evaluate
 from cli.weights import weights
 
 
@@ -15,4 +16,5 @@ def main(verbose: bool) -> None:
     """Networks that tell a pose from an image, in an area that `spn-data` has prepared."""
 
 
+main.add_command(evaluate)
 main.add_command(weights)

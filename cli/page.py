@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cli import console
-from spn_data.area import Area
+from spn_data.area import FRAMES, Area, InUseError
 from spn_data.errors import SpnError
 
 if TYPE_CHECKING:
@@ -23,6 +23,19 @@ def refresh(area: Area) -> None:
         console.note(f"report.html could not be written: {error}")
         return
     tell(path, verdict)
+
+
+def refresh_if_free(area: Area) -> None:
+    """As `refresh`, of an area that may be in use by another command, or hold nothing but networks."""
+    if not area.has(FRAMES):
+        return
+    try:
+        with area.locked():
+            refresh(area)
+    except InUseError:
+        console.note(
+            "report.html is as before: the area is in use; spn-data report writes it anew."
+        )
 
 
 def tell(path: Path, verdict: Verdict) -> None:

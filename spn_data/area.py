@@ -36,6 +36,7 @@ _GROUPS = (EVALUATION, DENSE)
 RUNS = "runs"  # trained networks, a folder each; made by spn-model
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIGURES = "errors.csv", "figures"
+COMPARED = "compared"  # beside them: several runs evaluated together
 
 # What only unfinished work holds: it is removed once the stage's record stands.
 SCRATCH: dict[str, tuple[str, ...]] = {
@@ -140,9 +141,10 @@ class Area:
 
     def run(self, name: str) -> Path:
         """Folder of a trained network, which need not exist. Raises InputError for what names no folder."""
-        if safe_name(name) != name:
+        if safe_name(name) != name or name == COMPARED:
             raise InputError(
-                f"{name!r} cannot name a run; use letters, digits, dot, dash and underscore"
+                f"{name!r} cannot name a run; use letters, digits, dot, dash and underscore, and not "
+                f"{COMPARED!r}"
             )
         return self.root / RUNS / name
 

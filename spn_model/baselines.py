@@ -115,11 +115,23 @@ def look_up(method: str, training: Poses, described: np.ndarray, queries: np.nda
     """
     if len(training) != len(described):
         raise ValueError(f"{len(training)} training poses of {len(described)} images")
-    centers, quats = np.full((len(queries), 3), np.nan), np.full((len(queries), 4), np.nan)
+    return posed(method, training, most_similar(described, queries))
+
+
+def most_similar(described: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """(N,) row of the most similar of M images (M, D) for each of N (N, D), unit vectors; -1 for zero."""
+    rows = np.full(len(queries), -1)
     shows = np.flatnonzero(np.any(queries != 0, axis=1))
     if len(shows):
-        rows = np.argmax(queries[shows] @ described.T, axis=1)
-        centers[shows], quats[shows] = training.centers[rows], training.quats_wxyz[rows]
+        rows[shows] = np.argmax(queries[shows] @ described.T, axis=1)
+    return rows
+
+
+def posed(method: str, training: Poses, rows: np.ndarray) -> Estimates:
+    """The training poses at rows (N,); NaN at -1."""
+    centers, quats = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
+    found = rows >= 0
+    centers[found], quats[found] = training.centers[rows[found]], training.quats_wxyz[rows[found]]
     return Estimates(method, Poses(centers, quats))
 
 

@@ -32,10 +32,12 @@ class Member(ABC):
 
     kind : as recipes and checkpoints have it. network : everything learnt or measured on training images is
     in its parameters and buffers, so that its state is the whole member. options : JSON-able, what `make`
-    needs to build the member anew.
+    needs to build the member anew. any_camera : poses are right for images of any K; else only for those of
+    the camera that it was trained on.
     """
 
     kind: ClassVar[str]
+    any_camera: ClassVar[bool] = False
     network: nn.Module
 
     @property

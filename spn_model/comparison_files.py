@@ -1,0 +1,132 @@
+"""What an evaluation leaves in a folder: metrics.json, errors.csv and figures, exchanged together."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from spn_data.files import write_whole
+from spn_data.hdf5_schema import Role
+from spn_data.sources import safe_name
+from spn_model import figures
+from spn_model.baselines import MEAN
+from spn_model.checkpoint import Checkpoint
+from spn_model.evaluate import Comparison, Cost, Judged
+from spn_model.tables import write_errors, write_metrics
+
+
+def of_network(comparison: Comparison, name: str) -> Comparison:
+    """The same with one network alone (and its dropout), beside all baselines."""
+    others = {n for n in comparison.networks if n != name and not n.startswith(f"{name}, ")}
+    return replace(
+        comparison,
+        groups=tuple(
+            replace(
+                group,
+                estimates=tuple(e for e in group.estimates if e.method not in others),
+                evaluations=tuple(e for e in group.evaluations if e.method not in others),
+            )
+            for group in comparison.groups
+        ),
+        networks=tuple(n for n in comparison.networks if n not in others),
+        costs={n: cost for n, cost in comparison.costs.items() if n not in others},
+    )
+
+
+def write_comparison(
+    comparison: Comparison,
+    facts: Mapping[str, Any],
+    *,
+    metrics: Path,
+    errors: Path,
+    drawings: Path,
+    more_drawings: Mapping[str, str] | None = None,
+) -> None:
+    """metrics.json, errors.csv and a folder of SVG. facts : what is told besides, plain values.
+
+    Old figures go before anything is written and metrics.json comes last, so that figures never belong to
+    other numbers. Raises StageError where the disk does not take them.
+    """
+    metrics.unlink(missing_ok=True)
+    shutil.rmtree(drawings, ignore_errors=True)
+    drawings.mkdir(parents=True)
+    for name, group in zip(_file_names(comparison.groups), comparison.groups, strict=True):
+        for what, drawing in drawn(group, comparison).items():
+            write_whole(drawings / f"{name}-{what}.svg", drawing)
+    for what, drawing in (more_drawings or {}).items():
+        write_whole(drawings / f"{what}.svg", drawing)
+    evaluations = [one for group in comparison.groups for one in group.evaluations]
+    write_errors(errors, evaluations)
+    write_metrics(
+        metrics,
+        evaluations,
+        units=comparison.units,
+        retrieval={g.frames.group: g.retrieval for g in comparison.groups if g.retrieval},
+        facts={
+            "roles": {group.frames.group: group.role.value for group in comparison.groups},
+            "networks": list(comparison.networks),
+            "costs": {name: cost_facts(cost) for name, cost in comparison.costs.items()},
+            "dataset": comparison.fingerprint,
+            "notes": list(comparison.notes),
+            **facts,
+        },
+    )
+
+
+def network_facts(network: Checkpoint) -> dict[str, Any]:
+    """What a network is and how it was trained, for `facts`."""
+    state = network.member.network.state_dict().values()
+    return {
+        "kind": network.member.kind,
+        "options": network.member.options,
+        "parameters": sum(p.numel() for p in network.member.network.parameters()),
+        "bytes": sum(t.numel() * t.element_size() for t in state),
+        "trained_on": network.view.dataset,
+        "training": network.facts,
+    }
+
+
+def cost_facts(cost: Cost) -> dict[str, Any]:
+    """As metrics.json has it."""
+    return {**asdict(cost), "ms_an_image": round(1000 * cost.seconds / cost.images, 3)}
+
+
+def drawn(group: Judged, comparison: Comparison) -> dict[str, str]:
+    """Figures of a group by what they show; none of training images, whose nearest frame is themselves."""
+    if group.role is Role.TRAIN:
+        return {}
+    unit = "m" if comparison.units == "m" else "model units"
+    beside = [group.retrieval] if group.retrieval else []
+    shown = [*comparison.networks, *beside]
+    compared = [e for e in group.evaluations if e.method != MEAN]
+    found = {
+        "trajectories": figures.trajectories(
+            comparison.training, group.frames, _of(group.estimates, shown), unit=unit
+        ),
+        "histograms": figures.histograms(_of(group.evaluations, shown), unit=unit),
+        "distance": figures.error_curves(compared, unit=unit),
+    }
+    if any(e.calibration is not None and e.calibration.frames for e in group.evaluations):
+        found["calibration"] = figures.calibration(group.evaluations)
+    return found
+
+
+def _of(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
+    """Those of some methods, in the order of these."""
+    by_method = {one.method: one for one in found}
+    return [by_method[method] for method in methods]
+
+
+def _file_names(groups: Sequence[Judged]) -> list[str]:
+    """Names that any file system takes, each another one whatever groups are called."""
+    names: list[str] = []
+    for group in groups:
+        base = name = safe_name(group.frames.group, "group").lower()
+        number = 2
+        while name in names:
+            name, number = f"{base}-{number}", number + 1
+        names.append(name)
+    return names

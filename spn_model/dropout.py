@@ -1,0 +1,75 @@
+"""Uncertainty by Monte-Carlo dropout, to compare stated covariances with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import nn
+
+from spn_data.pose import Poses, rotation_vectors
+from spn_model.baselines import mean_pose
+from spn_model.members.member import Member, PoseEstimates
+
+_DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout)
+_FEWEST = 7  # samples with which a covariance over six numbers can have full rank
+
+
+def has_dropout(member: Member) -> bool:
+    """Whether any layer drops something."""
+    return any(True for _ in _layers(member))
+
+
+def dropout_estimates(
+    member: Member, images: np.ndarray, intrinsics: np.ndarray, samples: int, *, seed: int = 0
+) -> PoseEstimates:
+    """Mean and scatter of poses of images (B, H, W, 3) under dropout that stays on.
+
+    Kendall & Cipolla 2016, "Modelling uncertainty in deep learning for camera relocalization", sections 3.2
+    and 3.3: the samples' covariance alone, without what the network itself states. NaN where fewer than 7
+    samples have a pose. Raises ValueError for fewer than 7 samples and for a network without dropout.
+    """
+    if samples < _FEWEST:
+        raise ValueError(f"{samples} samples leave a covariance without full rank")
+    if not has_dropout(member):
+        raise ValueError("a network without dropout has nothing to sample")
+    drawn = []
+    devices = [next(member.network.parameters()).device]
+    with torch.random.fork_rng([d for d in devices if d.type == "cuda"]), _dropping(member):
+        torch.manual_seed(seed)
+        for _ in range(samples):
+            drawn.append(member.estimate(images, intrinsics).poses)
+    poses = Poses.unknown(len(images))
+    covariance = np.full((len(images), 6, 6), np.nan)
+    reasons = np.full(len(images), "", dtype=object)
+    for k in range(len(images)):
+        of = Poses.concatenate(sample[k : k + 1] for sample in drawn)
+        of = of[np.isfinite(of.centers).all(axis=1) & np.isfinite(of.quats_wxyz).all(axis=1)]
+        if len(of) < _FEWEST:
+            reasons[k] = f"only {len(of)} of {samples} dropout samples give a pose"
+            continue
+        poses.centers[k], poses.quats_wxyz[k] = mean_pose(of)
+        turned = of.rotations @ poses.rotations[k].T
+        apart = np.hstack([of.centers - poses.centers[k], rotation_vectors(turned)])
+        covariance[k] = np.cov(apart, rowvar=False)
+    return PoseEstimates(poses, covariance, reasons.astype(np.str_))
+
+
+@contextmanager
+def _dropping(member: Member) -> Iterator[None]:
+    layers = list(_layers(member))
+    for layer in layers:
+        layer.train()
+    try:
+        yield
+    finally:
+        for layer in layers:
+            layer.eval()
+
+
+def _layers(member: Member) -> Iterator[nn.Module]:
+    for layer in member.network.modules():
+        if isinstance(layer, _DROPOUT) and layer.p > 0:
+            yield layer

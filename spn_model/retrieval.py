@@ -1,0 +1,121 @@
+"""Which training image looks most like each frame of a data set, found once and kept beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from spn_data.files import writing_whole
+from spn_data.hdf5_reader import Dataset, DatasetGroup
+from spn_data.record import content_fingerprint, versions
+from spn_data.timing import Progress
+from spn_model.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
+from spn_model.feature_maps import squeezenet_maps
+
+VERSION = 1  # of what is kept; another one whenever a way of describing images changes
+_METHODS = (VLAD, GEM)
+_MAX_BYTES = 100_000_000
+_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
+
+
+def most_alike(
+    dataset: Dataset,
+    training: DatasetGroup,
+    groups: Sequence[DatasetGroup],
+    progress: Progress,
+    kept: Path | None = None,
+) -> dict[str, list[np.ndarray]]:
+    """By method, for each group, (N,) row of the training image that looks most alike, -1 where none does.
+
+    kept : file that the rows are read from where they were found for this very data set before, and written
+    to else. Only rows are kept, never poses: labels that are made anew are never mixed with old ones.
+    """
+    key = _key(dataset, training, groups)
+    if kept is not None:
+        found = _read(kept, key, training, groups)
+        if found is not None:
+            return found
+    total = len(training) + sum(len(group) for group in groups)
+    rows: dict[str, list[np.ndarray]] = {}
+    for method in _METHODS:
+        counted = [_Counted(g, progress, f"{method}", total) for g in (training, *groups)]
+        done = 0
+        for images in counted:
+            images.before = done
+            done += len(images)
+        describe: Describe = vlad(training) if method == VLAD else gem(squeezenet_maps())
+        known = describe(counted[0])
+        rows[method] = [most_similar(known, describe(images)) for images in counted[1:]]
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        columns = {
+            f"{m}_{k}": rows[name][k] for m, name in enumerate(_METHODS) for k in range(len(groups))
+        }
+        with writing_whole(kept) as file:
+            np.savez(file, key=np.array(key), **columns)  # type: ignore[arg-type]
+    return rows
+
+
+class _Counted:
+    """Images that tell how far they have been read; row by row, in their order."""
+
+    def __init__(self, images: Images, progress: Progress, step: str, total: int):
+        self._images, self._progress, self._step, self._total = images, progress, step, total
+        self.before = 0
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def image(self, row: int) -> np.ndarray:
+        self._progress(self._step, self.before + row + 1, self._total)
+        return self._images.image(row)
+
+    def valid(self, row: int) -> np.ndarray | None:
+        return self._images.valid(row)
+
+
+def _key(dataset: Dataset, training: DatasetGroup, groups: Sequence[DatasetGroup]) -> str:
+    """Changes with anything that decides which images are compared and how."""
+    digest = hashlib.sha256()
+    stated = {
+        "version": VERSION,
+        "versions": versions(),
+        "file": content_fingerprint(dataset.path),
+        "made_from": dict(dataset.info.fingerprints),
+        "groups": [[group.name, group.image_size] for group in (training, *groups)],
+    }
+    digest.update(json.dumps(stated, sort_keys=True).encode())
+    for group in (training, *groups):
+        digest.update("\n".join(group.names.tolist()).encode("utf-8", "backslashreplace"))
+    return digest.hexdigest()
+
+
+def _read(
+    path: Path, key: str, training: DatasetGroup, groups: Sequence[DatasetGroup]
+) -> dict[str, list[np.ndarray]] | None:
+    """What is kept, or None where it is of something else, or damaged: it is then found anew."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            return None
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["key"]) != key:
+                return None
+            found = {
+                name: [np.asarray(file[f"{m}_{k}"]) for k in range(len(groups))]
+                for m, name in enumerate(_METHODS)
+            }
+    except _DAMAGED:
+        return None
+    for rows in found.values():
+        for one, group in zip(rows, groups, strict=True):
+            if one.shape != (len(group),) or one.dtype.kind != "i":
+                return None
+            if len(one) and not (one.min() >= -1 and one.max() < len(training)):
+                return None
+    return found
