@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from spn_data.errors import InputError
-from spn_data.pose import Poses, rotation_vectors
+from spn_data.pose import Poses
 from spn_model import weights
-from spn_model.calibration import calibrate
 from spn_model.imagenet import MEAN, STD
 from spn_model.loss import beta_weighted, laplace, reprojection, residuals
 from spn_model.members.member import Batch, Member, PoseEstimates
@@ -200,22 +199,14 @@ class RegressionMember(Member):
         reasons = np.where(found, "", "the network's answer is no pose")
         return PoseEstimates(poses, covariance, reasons)
 
-    def calibrate(self, estimates: PoseEstimates, truth: Poses) -> None:
-        """Make later covariances as large as the errors of these estimates, of images not trained on, are.
+    @property
+    def covariance_scale(self) -> float:
+        """Factor of all covariances; see `spn_model.covariance_scale`."""
+        return float(self.network.covariance_scale)
 
-        One factor for positions and one for rotations: stated standard deviations are multiplied by the
-        root of the median squared Mahalanobis distance over that of chi-squared (`spn_model.calibration`).
-        A half that no frame tells anything of stays as it is.
-        """
-        away = truth.centers - estimates.poses.centers
-        turn = truth.rotations @ estimates.poses.rotations.transpose(0, 2, 1)
-        errors = np.full((len(away), 6), np.nan)
-        found = np.isfinite(away).all(axis=1)
-        errors[found] = np.concatenate([away[found], rotation_vectors(turn[found])], axis=1)
-        fit = calibrate(errors[found], estimates.covariance[found])
-        for k, ratio in enumerate((fit.position_ratio, fit.rotation_ratio)):
-            if np.isfinite(ratio) and ratio > 0:
-                self.network.factors[k] *= float(np.sqrt(ratio))
+    def set_covariance_scale(self, factor: float) -> None:
+        """Multiply it: covariances of later estimates are larger by the factor."""
+        self.network.covariance_scale.mul_(factor)
 
     def normalised(self, images: Tensor) -> Tensor:
         """(B, 3, h, w) of images (B, h, w, 3) uint8, as ImageNet's."""

@@ -28,11 +28,11 @@ class PoseNetwork(nn.Module):
     x is relative to `targets.center`, in the world's unit; q (w, x, y, z) isn't normalised. The standard
     deviations are read from the descriptor that the heads read, by a layer of their own whose gradient goes
     no further: it changes nothing about the poses. They start at the spread of the training poses and at
-    one radian. factors : (2,), of position and rotation, by which errors on images that were not trained on
-    are larger.
+    one radian. covariance_scale : (), by which covariances of images that were not trained on are larger, as
+    measured on validation images.
     """
 
-    factors: Tensor
+    covariance_scale: Tensor
     is_started: Tensor
 
     def __init__(self, regressor: Regressor) -> None:
@@ -43,7 +43,7 @@ class PoseNetwork(nn.Module):
         self.uncertainty = nn.Linear(regressor.x.in_features, 6)
         nn.init.zeros_(self.uncertainty.weight)
         nn.init.zeros_(self.uncertainty.bias)
-        self.register_buffer("factors", torch.ones(2))
+        self.register_buffer("covariance_scale", torch.ones(()))
         self.register_buffer("is_started", torch.tensor(False))
         self.drops = True
         self.normalizes_by_batch = False
@@ -54,11 +54,10 @@ class PoseNetwork(nn.Module):
         main = self.regressor.x(descriptor), self.regressor.q(descriptor)
         scale = self.targets.scale.to(descriptor.dtype)
         log_std = self.uncertainty(descriptor.detach()).clamp(*_LOG_STD)
-        size = torch.cat(
-            [(self.factors[:1] * scale).log().expand(3), self.factors[1:].log().expand(3)]
-        )
+        larger = 0.5 * self.covariance_scale.log().expand(6)
+        spread = torch.cat([scale.log().expand(3), larger.new_zeros(3)])
         estimates = main, *self.regressor.auxiliary(features)
-        return PoseOutputs(tuple((x * scale, q) for x, q in estimates), log_std + size)
+        return PoseOutputs(tuple((x * scale, q) for x, q in estimates), log_std + spread + larger)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         outputs = self.outputs(self.regressor.trunk(images))
