@@ -28,6 +28,9 @@ class DecodingOptions:
     robust: float = 3.0  # residual, in standard deviations, at which a cell counts a quarter
     # Errors of neighbouring cells are alike: as many of them tell as much as one by itself.
     cells_per_observation: float = 16.0
+    largest_scale: float = (
+        0.0  # in the world's unit; a cell that is less sure is not used; 0: any is
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +69,13 @@ def decode(
     sigma_m = 2 * np.exp(log_scale.ravel()[surest].astype(np.float64))
     at = np.stack([surest % columns, surest // columns], axis=1) * stride_px + first_px
     finite = np.isfinite(xyz).all(axis=1) & np.isfinite(sigma_m)
+    if options.largest_scale:
+        finite &= sigma_m <= 2 * options.largest_scale
     xyz, sigma_m, at = xyz[finite], sigma_m[finite], at[finite]
     if len(xyz) < options.min_inliers:
-        raise GeometryError(f"{len(xyz)} cells have a scene coordinate, need {options.min_inliers}")
+        raise GeometryError(
+            f"{len(xyz)} cells are sure of what they show, need {options.min_inliers}"
+        )
     center, rotation = _first_pose(xyz, at, matrix, options)
     focal_px = np.sqrt(matrix[0, 0] * matrix[1, 1])
     for reach in options.robust * np.array(_REACH):

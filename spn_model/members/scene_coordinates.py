@@ -31,6 +31,8 @@ from spn_model.weights import find
 
 _MEASURED = 16  # training images, spread evenly, by which features are normalised
 
+_UNSURE = 0.25  # spreads of the scene; a cell of a larger scale does not know where it is
+
 
 class SceneCoordinatesMember(Member):
     """Learns, for each cell of an image, the point of the map that it shows; PnP makes a pose of them.
@@ -140,18 +142,26 @@ class SceneCoordinatesMember(Member):
         """Scale all covariances by a factor more; kept in the network's state."""
         self.network.covariance_scale.mul_(factor)
 
+    @property
+    def decoding_options(self) -> DecodingOptions:
+        """What `spn_model.decoding.decode` needs, with what was measured: all that differs on board."""
+        return replace(
+            self.decoding,
+            cells_per_observation=self.decoding.cells_per_observation * self.covariance_scale,
+            largest_scale=self.decoding.largest_scale or _UNSURE * float(self.network.spread),
+        )
+
     def decode(
         self, coordinates: np.ndarray, log_scale: np.ndarray, matrix: np.ndarray
     ) -> PoseEstimate:
         """A pose from the network's output (3, h, w), (h, w) for one image of K (3, 3)."""
-        cells = self.decoding.cells_per_observation * self.covariance_scale
         return decode(
             coordinates,
             log_scale,
             matrix,
             first_px=FIRST_CELL_PX,
             stride_px=STRIDE_PX,
-            options=replace(self.decoding, cells_per_observation=cells),
+            options=self.decoding_options,
         )
 
     @torch.inference_mode()

@@ -1,0 +1,39 @@
+"""One factor that makes stated covariances as large as the errors on images that a network has not seen."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtri
+
+from spn_data.errors import GeometryError
+from spn_data.pose import Poses, rotation_vectors
+from spn_model.calibration import DOF, squared_distances
+from spn_model.members.member import PoseEstimates
+
+LEAST_FRAMES = 10
+
+
+def measured_scale(estimates: PoseEstimates, truth: Poses) -> float:
+    """Factor by which the covariances of these estimates have to grow, from the true poses (N).
+
+    The median of the errors' squared Mahalanobis distances becomes that of chi-squared with 6 degrees of
+    freedom: half of the frames lie within the ellipsoid that should hold half of them. The median, because a
+    few wrong poses have distances without bound. After training, `Member.set_covariance_scale` takes the
+    factor from the validation images: of training images a network knows too much. Raises GeometryError
+    where fewer than 10 frames have a pose and a covariance.
+    """
+    known = np.isfinite(estimates.poses.centers).all(axis=1)
+    errors = np.full((len(known), DOF), np.nan)
+    errors[known, :3] = truth.centers[known] - estimates.poses.centers[known]
+    turns = truth.rotations[known] @ estimates.poses.rotations[known].swapaxes(1, 2)
+    errors[known, 3:] = rotation_vectors(turns)
+    squared = squared_distances(
+        errors, np.where(known[:, None, None], estimates.covariance, np.nan)
+    )
+    squared = squared[np.isfinite(squared)]
+    if len(squared) < LEAST_FRAMES:
+        raise GeometryError(
+            f"{len(squared)} validation images have a pose with a covariance, need {LEAST_FRAMES} to "
+            "measure how large covariances are"
+        )
+    return float(np.median(squared) / chdtri(DOF, 0.5))
