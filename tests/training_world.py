@@ -162,7 +162,10 @@ class TinyMember(Member):
         }
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        out = self.network(batch["images"]).float()
+        images = batch["images"]
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.bfloat16):
+            out = self.network(images)
+        out = out.float()
         where = (batch["centers"] - self.network.center) / self.network.scale
         position = (out[:, :3] - where).norm(dim=1).mean()
         turn = (out[:, 3:] - batch["quats"]).norm(dim=1).mean()

@@ -33,12 +33,13 @@ class Member(ABC):
     kind : as recipes and checkpoints have it. network : everything learnt or measured on training images is
     in its parameters and buffers, so that its state is the whole member. options : JSON-able, what `make`
     needs to build the member anew. any_camera : poses are right for images of any K; else only for those of
-    the camera that it was trained on.
+    the camera that it was trained on. bfloat16 : `loss` runs the network in it; set by who trains.
     """
 
     kind: ClassVar[str]
     any_camera: ClassVar[bool] = False
     network: nn.Module
+    bfloat16: bool = False
 
     @property
     @abstractmethod
@@ -56,7 +57,10 @@ class Member(ABC):
 
     @abstractmethod
     def fit(self, data: TrainingSet) -> None:
-        """Once, before the first step: what is measured on training images, as the centre of targets."""
+        """Before the first step: what is measured on training images, as the centre of targets.
+
+        Once more before a stage that has another data set; what was learnt on the first is kept.
+        """
 
     @abstractmethod
     def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:

@@ -1,0 +1,195 @@
+"""What a training does, as a small TOML file says it: the kind of network, and stages one after another."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from spn_data.errors import InputError
+
+SHIPPED = Path(__file__).parent / "recipes"
+AREA, PRETRAINING = "area", "pretraining"  # data sets that a stage names without a path
+_MAX_BYTES = 100_000
+_MAX_STAGES = 50
+_RANGES: dict[str, tuple[float, float]] = {
+    "images": (0, 10**10),
+    "minutes": (0, 10**6),
+    "batch": (1, 100_000),
+    "rate": (0, 100),
+    "warmup_steps": (0, 10**7),
+    "weight_decay": (0, 10),
+    "clip": (0, 10**9),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One stage; it ends when its images or its minutes are reached, whichever is first."""
+
+    name: str
+    data: str = AREA  # area, pretraining (--pretrain, else as area), or the path of a data set
+    images: int = 0  # budget: training images drawn; 0: no limit
+    minutes: float = 0.0  # budget: of training, validation aside; 0: no limit
+    batch: int = 8  # training images drawn for one step, of each process
+    rate: float = 1e-3  # of learning, at its highest
+    schedule: str = "cosine"  # falls to 0 along a cosine; or constant
+    warmup_steps: int = 50  # over which the rate rises
+    weight_decay: float = 1e-4
+    clip: float = 0.0  # longest gradient; 0: no limit
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the kind of network
+
+    def progress(self, drawn: int, seconds: float) -> float:
+        """Share of the budget that is spent; 1 or more: the stage is done."""
+        by_images = drawn / self.images if self.images else 0.0
+        return max(by_images, seconds / 60 / self.minutes if self.minutes else 0.0)
+
+    def rate_at(self, step: int, progress: float) -> float:
+        """The rate of learning of a step (from 0), after `progress` of the budget."""
+        rate = self.rate * min(1.0, (step + 1) / max(self.warmup_steps, 1))
+        if self.schedule == "cosine":
+            rate *= 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+        return rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """A kind of network with its options, the weights it starts from, and its stages.
+
+    weights : "published" for those that the kind is known with, "none", a name of `spn_model.weights` or a
+    file.
+    """
+
+    kind: str
+    stages: tuple[Stage, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    weights: str = "published"
+    optimizer: str = "adamw"  # or sgd
+    momentum: float = 0.9  # of sgd
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values for JSON, with all defaults."""
+        return {**asdict(self), "stages": [asdict(stage) for stage in self.stages]}
+
+    @property
+    def shares(self) -> list[float]:
+        """Of the stages in the whole budget."""
+        by = [float(stage.images) for stage in self.stages]
+        if not all(by):
+            by = [stage.minutes for stage in self.stages]
+        return [part / sum(by) for part in by]
+
+    def with_budget(self, images: int | None, minutes: float | None) -> Recipe:
+        """The same with another budget in all, divided among the stages as theirs were."""
+        if images is None and minutes is None:
+            return self
+        return replace(
+            self,
+            stages=tuple(
+                replace(
+                    stage,
+                    images=0 if images is None else max(stage.batch, round(images * share)),
+                    minutes=0.0 if minutes is None else minutes * share,
+                )
+                for stage, share in zip(self.stages, self.shares, strict=True)
+            ),
+        )
+
+
+def names() -> tuple[str, ...]:
+    """Recipes that come with the package."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
+
+
+def read_recipe(name_or_file: str) -> Recipe:
+    """Of the package by its name, or a TOML file. Raises InputError, with the line, for a wrong one."""
+    path = SHIPPED / f"{name_or_file}.toml" if name_or_file in names() else Path(name_or_file)
+    if not path.is_file():
+        raise InputError(
+            f"there is no recipe {name_or_file!r}: it is no file, nor one of {', '.join(names())}"
+        )
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError("is too large to be a recipe", path=path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = tomllib.loads(text)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"is no recipe that can be read: {error}", path=path) from error
+    return _Reader(path, text).recipe(table)
+
+
+class _Reader:
+    """Checks values of one file; knows in which line a key stands."""
+
+    def __init__(self, path: Path, text: str):
+        self._path, self._lines = path, text.splitlines()
+
+    def recipe(self, table: dict[str, Any]) -> Recipe:
+        stages = table.pop("stages", [])
+        if not isinstance(stages, list) or not 0 < len(stages) <= _MAX_STAGES:
+            raise self._wrong("stages", f"[[stages]] is needed, 1 to {_MAX_STAGES} times")
+        if "kind" not in table:
+            raise self._wrong("kind", 'kind is missing, as in kind = "regression"')
+        defaults = {"kind": "", "options": {}, "weights": "", "optimizer": "", "momentum": 0.0}
+        values = self._values(table, defaults, "a recipe")
+        if values.get("optimizer", "adamw") not in ("adamw", "sgd"):
+            raise self._wrong(
+                "optimizer", f"optimizer is {values['optimizer']!r}, needs to be adamw or sgd"
+            )
+        if not 0 <= values.get("momentum", 0.9) < 1:
+            raise self._wrong(
+                "momentum", f"momentum is {values['momentum']}, needs to lie in [0, 1)"
+            )
+        made = tuple(self._stage(stage, k) for k, stage in enumerate(stages))
+        if not (all(s.images for s in made) or all(s.minutes for s in made)):
+            raise self._wrong("stages", "all stages need a budget: all images, or all minutes")
+        return Recipe(stages=made, **values)
+
+    def _stage(self, table: Any, k: int) -> Stage:
+        if not isinstance(table, dict):
+            raise self._wrong("stages", "stages are tables: [[stages]]")
+        defaults = {f.name: f.default for f in Stage.__dataclass_fields__.values()}
+        defaults |= {"name": "", "options": {}}
+        values = self._values({"name": f"stage {k + 1}", **table}, defaults, "a stage", k)
+        if values.get("schedule", "cosine") not in ("cosine", "constant"):
+            told = f"schedule is {values['schedule']!r}, needs to be cosine or constant"
+            raise self._wrong("schedule", told, k)
+        for name, (low, high) in _RANGES.items():
+            if name in values and not low <= values[name] <= high:
+                told = f"{name} is {values[name]}, needs to lie from {low:g} to {high:g}"
+                raise self._wrong(name, told, k)
+        data = values.get("data", AREA)
+        if data not in (AREA, PRETRAINING) and not Path(data).is_absolute():
+            values["data"] = str(self._path.parent / data)
+        return Stage(**values)
+
+    def _values(
+        self, table: dict[str, Any], defaults: dict[str, Any], of: str, stage: int = -1
+    ) -> dict[str, Any]:
+        values = {}
+        for name, value in table.items():
+            if name not in defaults:
+                told = f"{name!r} is no key of {of}; there are {', '.join(defaults)}"
+                raise self._wrong(name, told, stage)
+            wanted = type(defaults[name])
+            if wanted is float and type(value) is int:
+                value = float(value)
+            if type(value) is not wanted:
+                needed = {dict: "a table", str: "a text", int: "a whole number"}
+                told = f"{name} is {value!r}, needs {needed.get(wanted, 'a number')}"
+                raise self._wrong(name, told, stage)
+            values[name] = value
+        return values
+
+    def _wrong(self, key: str, message: str, stage: int = -1) -> InputError:
+        """The error with the line of a key: the first one after the stage's beginning."""
+        begins = [n for n, text in enumerate(self._lines) if re.match(r"\s*\[\[\s*stages", text)]
+        first = begins[stage] if 0 <= stage < len(begins) else 0
+        for n, text in enumerate(self._lines[first:], first + 1):
+            if re.match(rf"""\s*\[*\s*(\w+\.)?["']?{re.escape(key)}["']?\s*(=|\.|\])""", text):
+                return InputError(message, path=self._path, line=n)
+        return InputError(message, path=self._path)

@@ -1,0 +1,265 @@
+"""Training: the loop, top to bottom. Stopped at any moment, the same call goes on from where it was.
+
+Batch k of a stage is a function of (seed, stage, k) alone, and so is what dropout drops: with one thread and
+a budget in images, a training that was killed ends with the weights of one that never was.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from spn_data.errors import InputError, StageError
+from spn_data.hdf5_reader import Dataset, DatasetGroup
+from spn_data.hdf5_schema import Role
+from spn_model.batches import batches_ahead, generator_of_step, rows_of_step, torch_seed_of_step
+from spn_model.machine import Machine, Ranks, choose, joined, prepared
+from spn_model.members.member import Batch, Member
+from spn_model.members.registry import make
+from spn_model.recipe import AREA, PRETRAINING, Recipe, Stage
+from spn_model.training_loss import Diverged, Losses
+from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
+from spn_model.training_set import TrainingSet
+from spn_model.training_state import Position, read_state
+from spn_model.view import View
+
+_LOG_EVERY_S = 10.0
+_SAVE_EVERY_S = 30.0
+_SAVING_SHARE = 0.05  # of the time, at most, goes into saving the state
+_STEPS_UNSEEN = 20  # losses on a graphics card are looked at together: each look waits for it
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """How a recipe is carried out."""
+
+    seed: int = 0
+    device: str = "auto"  # auto, cpu, cuda, cuda:N
+    threads: int = 0  # of the processor; 0: all
+    precision: str = (
+        "auto"  # auto: bfloat16 where the device multiplies it by itself; float32, bfloat16
+    )
+    validations: int = 10  # over the whole training, at least one a stage
+    validation_frames: int = 64  # at most, evenly spread
+    sample: int = 16  # training images, evenly spread, that are judged beside them
+
+
+@dataclass(frozen=True)
+class Data:
+    """Data sets: of the area, and another one for stages of pretraining."""
+
+    area: Path
+    pretraining: Path | None = None
+
+    def of(self, stage: Stage) -> Path:
+        """The file that a stage trains on."""
+        named = {AREA: self.area, PRETRAINING: self.pretraining or self.area}
+        return named.get(stage.data, Path(stage.data))
+
+
+class Stopped(Exception):
+    """Raised when the watcher wanted a stop; the state is saved."""
+
+
+def train(
+    recipe: Recipe, files: Files, data: Data, options: TrainOptions, watch: Watch
+) -> dict[str, Any]:
+    """Facts of the finished training, which its checkpoints hold too.
+
+    Starts anew, or goes on from files.state. Raises InputError and FormatError for a recipe, weights or data
+    that nothing can be trained with or on, StageError where the loss diverges or the disk is full.
+    """
+    with joined(options.device) as ranks, ExitStack() as stack:
+        machine = choose(options.device, options.threads, options.precision, ranks.local_rank)
+        stack.enter_context(prepared(machine))
+        state = read_state(files.state)
+        position = Position() if state is None else state.position
+        member = make(recipe.kind, recipe.options, seed=options.seed)
+        member.bfloat16 = machine.bfloat16
+        if state is not None:
+            state.restore_network(member.network)
+        elif recipe.weights != "none":
+            published = recipe.weights == "published"
+            member.load_pretrained(member.weights_name if published else recipe.weights)
+        area = stack.enter_context(Dataset(data.area))
+        training = _training_group(area)
+        record = None
+        if ranks.leads:
+            judged = judged_frames(area, training, options.validation_frames, options.sample)
+            facts = {"recipe": recipe.plain(), "seed": options.seed, **machine.plain()}
+            facts["processes"] = ranks.world
+            record = Record(files, watch, member, View.of(area), judged, position, facts)
+            stack.enter_context(closing(record))
+        path, images = data.area, None
+        for index in range(position.stage, len(recipe.stages)):
+            stage = recipe.stages[index]
+            if images is None or data.of(stage) != path:
+                path = data.of(stage)
+                dataset = area if path == data.area else stack.enter_context(Dataset(path))
+                images = TrainingSet(_training_group(dataset))
+                if state is None:
+                    member.fit(images)
+            member.network.to(machine.device)
+            member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+            member.begin_stage(stage.options, images)
+            ranks.start_alike(list(member.network.state_dict().values()))
+            optimizer = _optimizer(recipe, stage, member)
+            if state is not None:
+                state.restore_optimizer(optimizer)
+                state = None
+            validations = max(1, round(options.validations * recipe.shares[index]))
+            run_stage(
+                *(stage, index, images, member, optimizer, position),
+                *(machine, ranks, record, watch, options.seed, validations),
+            )
+            position.stage, position.step = index + 1, 0
+            position.stage_s, position.validated = 0.0, 0
+        return {} if record is None else record.finish()
+
+
+def run_stage(
+    stage: Stage,
+    index: int,
+    images: TrainingSet,
+    member: Member,
+    optimizer: torch.optim.Optimizer,
+    at: Position,
+    machine: Machine,
+    ranks: Ranks,
+    record: Record | None,
+    watch: Watch,
+    seed: int,
+    validations: int,
+) -> None:
+    """Steps of a stage, the `index`-th, from at.step on until the budget is spent; `at` moves on.
+
+    record : of the first process, None in the others. Raises StageError where the loss diverges, Stopped
+    where the watcher wants it.
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    step_images = stage.batch * ranks.world
+    losses = Losses(1 if machine.device.type == "cpu" else _STEPS_UNSEEN)
+    before_s = at.train_s - at.stage_s
+    clock = Clock(at.stage_s)
+    progress = stage.progress(at.step * step_images, at.stage_s)
+
+    def batch_of(step: int) -> Batch:
+        part = {"rank": ranks.rank, "world": ranks.world}
+        rows = rows_of_step(len(images), stage.batch, step, seed, index, **part)
+        # A budget in minutes is as far as it was when the batch was begun.
+        spent = max(stage.progress(step * step_images, 0.0), progress if stage.minutes else 0.0)
+        generator = generator_of_step(seed, index, step, ranks.rank)
+        return _pinned(member.batch(images, rows, generator, min(spent, 1.0)), machine)
+
+    logged = saved = time.perf_counter()
+    shown, save_s = at.shown, 0.0
+    with batches_ahead(batch_of, at.step, machine.workers) as ahead:
+        waited_s = at.wait_s
+        member.network.train()
+        while progress < 1:
+            rate = stage.rate_at(at.step, progress)
+            for group in optimizer.param_groups:
+                group["lr"] = rate * group["rate"]
+            batch = _on_device(ahead.next(), machine)
+            torch.manual_seed(torch_seed_of_step(seed, index, at.step, ranks.rank))
+            loss, figures = member.loss(batch)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            seconds, stop = ranks.average(parameters, clock.seconds, watch.wants_stop())
+            norm = nn.utils.clip_grad_norm_(parameters, stage.clip or math.inf)
+            with _telling_what_is_kept(at):
+                losses.add(loss, norm, figures)
+            optimizer.step()
+            at.step, at.steps = at.step + 1, at.steps + 1
+            at.drawn += step_images
+            at.shown += len(next(iter(batch.values()))) * ranks.world
+            progress = stage.progress(at.step * step_images, seconds)
+            at.stage_s, at.train_s = seconds, before_s + seconds
+
+            now = time.perf_counter()
+            is_judged = progress >= (at.validated + 1) / validations
+            is_saved = is_judged or stop or now - saved > max(_SAVE_EVERY_S, save_s / _SAVING_SHARE)
+            if not (is_saved or now - logged > _LOG_EVERY_S):
+                continue
+            at.wait_s = waited_s + ahead.waited_s
+            at.validated = min(int(progress * validations + 1e-9), validations)
+            with clock.paused(), _telling_what_is_kept(at):
+                means = losses.means()
+                if record is not None:
+                    means["images_per_s"] = (at.shown - shown) / max(now - logged, 1e-9)
+                    record.steps(stage.name, progress, rate, means)
+                    if is_judged:
+                        record.validate(stage.name, progress)
+                        member.network.train()
+                    if is_saved:
+                        began = time.perf_counter()
+                        record.save(optimizer)
+                        save_s = time.perf_counter() - began
+                if stop:
+                    raise Stopped
+            logged, shown = time.perf_counter(), at.shown
+            saved = logged if is_saved else saved
+
+
+@contextmanager
+def _telling_what_is_kept(at: Position) -> Iterator[None]:
+    """Raises StageError where the loss diverges."""
+    try:
+        yield
+    except Diverged as error:
+        kept = "no checkpoint was made yet"
+        if at.kept is not None:
+            kept = f"the checkpoint after {at.kept['steps']} steps is kept"
+        raise StageError(
+            f"the training diverges after {at.steps} steps: {error}; {kept}. "
+            "Lower the rate in the recipe, or clip the gradient"
+        ) from error
+
+
+def _training_group(dataset: Dataset) -> DatasetGroup:
+    """Raises InputError where there is not one group of training frames."""
+    groups = dataset.of_role(Role.TRAIN)
+    filled = [group for group in groups if len(group)] or groups
+    if len(filled) != 1:
+        raise InputError(
+            f"holds {len(filled)} groups of training frames, one is needed", path=dataset.path
+        )
+    if filled[0].image_size is None:
+        raise InputError(
+            "holds no training images: there is nothing to train on", path=dataset.path
+        )
+    return filled[0]
+
+
+def _optimizer(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Optimizer:
+    """Raises InputError where the stage trains nothing."""
+    groups = [group for group in member.parameter_groups() if group["params"]]
+    if not groups:
+        raise InputError(f"stage {stage.name} trains nothing: all layers are frozen")
+    rate, decay = stage.rate, stage.weight_decay
+    if recipe.optimizer == "sgd":
+        return torch.optim.SGD(
+            groups, rate, momentum=recipe.momentum, weight_decay=decay, fused=True
+        )
+    return torch.optim.AdamW(groups, rate, weight_decay=decay, fused=True)
+
+
+def _pinned(batch: Batch, machine: Machine) -> Batch:
+    """In the thread that makes batches: where a graphics card can fetch it."""
+    if machine.device.type == "cpu":
+        return batch
+    return {name: tensor.pin_memory() for name, tensor in batch.items()}
+
+
+def _on_device(batch: Batch, machine: Machine) -> Batch:
+    if machine.device.type == "cpu":
+        return batch
+    return {name: t.to(machine.device, non_blocking=True) for name, t in batch.items()}

@@ -1,0 +1,177 @@
+"""What a training leaves on disk while it runs: log, checkpoints, the state to go on from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from spn_data.hdf5_reader import Dataset, DatasetGroup
+from spn_data.hdf5_schema import Role
+from spn_model import checkpoint
+from spn_model.members.member import Member
+from spn_model.training_state import Log, Position, save_state
+from spn_model.validation import Errors, judge, spread_rows
+from spn_model.view import View
+
+_WORSE = 1.05  # a later network is kept where its score is at most this times the best one
+
+
+@dataclass(frozen=True)
+class Files:
+    """checkpoint : the best by validation; last : as training left it; state : to go on from; log : CSV."""
+
+    checkpoint: Path
+    last: Path
+    state: Path
+    log: Path
+
+
+class Watch(Protocol):
+    """Who follows a training."""
+
+    def row(self, values: Mapping[str, Any]) -> None:
+        """A row of the log, by column: event "steps" (figures of the steps since the last one),
+        "validation" or "training" (errors on validation frames, and on images that are trained on)."""
+
+    def wants_stop(self) -> bool:
+        """Asked at each step: True saves the state and ends the training."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Frames that a member is judged by: some rows of a group."""
+
+    event: str
+    group: DatasetGroup
+    rows: np.ndarray
+
+    def errors(self, member: Member) -> Errors:
+        return judge(member, self.group.image, self.group.intrinsics, self.group.poses, self.rows)
+
+
+def judged_frames(
+    dataset: Dataset, training: DatasetGroup, frames: int, sample: int
+) -> list[Judged]:
+    """Validation frames, where there are any, and a sample of those that are trained on."""
+    found = [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size]
+    judged = [Judged("validation", g, spread_rows(len(g), frames)) for g in found[:1]]
+    return [*judged, Judged("training", training, spread_rows(len(training), sample))]
+
+
+@dataclass(eq=False)
+class Record:
+    """Written by the first process alone.
+
+    position : moves on with the training. facts : what the checkpoints say of it.
+    """
+
+    files: Files
+    watch: Watch
+    member: Member
+    view: View
+    judged: list[Judged]
+    position: Position
+    facts: dict[str, Any]
+    _log: Log = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._log = Log(self.files.log, self.position.log_bytes)
+
+    def steps(self, stage: str, progress: float, rate: float, figures: Mapping[str, float]) -> None:
+        """Figures of the steps since the last row."""
+        own = {"loss", "images_per_s"}
+        others = " ".join(f"{k}={v:.5g}" for k, v in figures.items() if k not in own)
+        self._row(
+            "steps",
+            stage,
+            progress,
+            {**{k: figures[k] for k in own}, "rate": rate, "figures": others},
+        )
+
+    def validate(self, stage: str, progress: float) -> None:
+        """Judge, and keep the network where it is among the best so far."""
+        at = self.position
+        began = time.perf_counter()
+        found = {one.event: one.errors(self.member) for one in self.judged}
+        at.validate_s += time.perf_counter() - began
+        for event, errors in found.items():
+            plain = errors.plain()
+            self._row(event, stage, progress, plain)
+            at.latest[event] = plain
+        if "validation" in found:
+            score = found["validation"].score
+            if at.best is not None and score > _WORSE * at.best:
+                return
+            at.best = score if at.best is None else min(at.best, score)
+        at.kept = {"stage": stage, "steps": at.steps, "drawn": at.drawn, **at.latest}
+        checkpoint.save(self.files.checkpoint, self.member, self.view, self.told())
+
+    def save(self, optimizer: torch.optim.Optimizer | None) -> None:
+        """The state to go on from."""
+        save_state(self.files.state, self.member.network, optimizer, self.position)
+
+    def finish(self) -> dict[str, Any]:
+        """The network as it is at the end; facts of the training."""
+        told = self.told()
+        checkpoint.save(self.files.last, self.member, self.view, told)
+        return told
+
+    def told(self) -> dict[str, Any]:
+        """Facts of the training so far."""
+        at = self.position
+        return {
+            **self.facts,
+            "steps": at.steps,
+            "images_drawn": at.drawn,
+            "images_shown": at.shown,
+            "train_s": at.train_s,
+            "validate_s": at.validate_s,
+            "wait_s": at.wait_s,
+            "kept": at.kept,
+            "latest": at.latest,
+        }
+
+    def _row(self, event: str, stage: str, progress: float, values: Mapping[str, Any]) -> None:
+        at = self.position
+        row = {
+            "event": event,
+            "stage": stage,
+            "step": at.step,
+            "images": at.shown,
+            "progress": min(progress, 1.0),
+            "train_s": at.train_s,
+            "validate_s": at.validate_s,
+            "wait_s": at.wait_s,
+            **values,
+        }
+        at.log_bytes = self._log.write(row)
+        self.watch.row(row)
+
+    def close(self) -> None:
+        self._log.close()
+
+
+class Clock:
+    """Seconds of training; what is done in `paused` does not count."""
+
+    def __init__(self, before_s: float):
+        self._before_s, self._began = before_s, time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        return self._before_s + time.perf_counter() - self._began
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        self._before_s = self.seconds
+        try:
+            yield
+        finally:
+            self._began = time.perf_counter()

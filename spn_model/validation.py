@@ -1,0 +1,75 @@
+"""How far a member is off while it is trained: on validation frames, and on images that it trains on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from spn_data.pose import Poses
+from spn_model.members.member import Member
+from spn_model.metrics import Estimates, frame_errors, quantile
+
+_AT_ONCE = 8  # images given to `estimate`
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of some frames; one without a pose is infinitely wrong. Metres, or the world's unit; degrees."""
+
+    frames: int
+    located: int
+    median_m: float
+    median_deg: float
+    p95_m: float
+    p95_deg: float
+
+    @property
+    def score(self) -> float:
+        """What is compared between moments of a training: the lower the better, of any unit."""
+        return float(np.sqrt(self.median_m * self.median_deg))
+
+    def plain(self) -> dict[str, Any]:
+        """By name, as the log has them."""
+        return asdict(self)
+
+
+def spread_rows(count: int, limit: int) -> np.ndarray:
+    """At most `limit` rows of `count`, evenly spread, always the same."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
+
+
+def judge(
+    member: Member,
+    image: Callable[[int], np.ndarray],
+    intrinsics: np.ndarray,
+    poses: Poses,
+    rows: np.ndarray,
+) -> Errors:
+    """Errors of the member's estimates of these rows; `image` gives the (H, W, 3) RGB of one.
+
+    The network is left in eval mode.
+    """
+    member.network.eval()
+    centers, quats = [], []
+    for first in range(0, len(rows), _AT_ONCE):
+        part = rows[first : first + _AT_ONCE]
+        images = np.stack([image(int(row)) for row in part])
+        found = member.estimate(images, intrinsics[part]).poses
+        centers.append(found.centers)
+        quats.append(found.quats_wxyz)
+    estimates = Estimates("network", Poses(np.concatenate(centers), np.concatenate(quats)))
+    errors = frame_errors(estimates, poses[rows])
+    position, rotation = (
+        np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)
+    )
+    return Errors(
+        frames=len(rows),
+        located=int(errors.located.sum()),
+        median_m=quantile(position, 0.5),
+        median_deg=quantile(rotation, 0.5),
+        p95_m=quantile(position, 0.95),
+        p95_deg=quantile(rotation, 0.95),
+    )

@@ -1,0 +1,153 @@
+"""Recipes: those of the package can be made, and every mistake in one is told with its line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from spn_data.errors import InputError
+from spn_model.members.registry import make
+from spn_model.recipe import Recipe, Stage, names, read_recipe
+
+GOOD = """\
+kind = "regression"
+weights = "none"
+optimizer = "sgd"
+momentum = 0.8
+options = { network = "squeezeposenet" }
+
+[[stages]]
+name = "first"
+images = 300
+batch = 4
+rate = 1
+
+[stages.options]
+freeze_trunk = true
+
+[[stages]]
+data = "other/dataset.h5"
+images = 900
+schedule = "constant"
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "my.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_recipe_is_read_whole(tmp_path):
+    """Every value where it belongs, a path from the file's own folder, defaults for the rest."""
+    recipe = read_recipe(str(written(tmp_path, GOOD)))
+    assert (recipe.kind, recipe.weights, recipe.optimizer) == ("regression", "none", "sgd")
+    assert recipe.momentum == 0.8
+    assert recipe.options == {"network": "squeezeposenet"}
+    first, second = recipe.stages
+    assert (first.name, first.images, first.batch, first.rate) == ("first", 300, 4, 1.0)
+    assert first.options == {"freeze_trunk": True}
+    assert first.data == "area"
+    assert second == Stage(
+        name="stage 2",
+        data=str(tmp_path / "other/dataset.h5"),
+        images=900,
+        schedule="constant",
+    )
+    assert recipe.shares == [0.25, 0.75]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('kind = "regression"', 'kin = "regression"', "kind is missing"),
+        ('momentum = 0.8', "momentun = 0.8", ":4: 'momentun' is no key of a recipe"),
+        ("momentum = 0.8", "momentum = 1.0", ":4: momentum is 1.0, needs to lie in"),
+        ("momentum = 0.8", 'momentum = "0.8"', ":4: momentum is '0.8', needs a number"),
+        ('"sgd"', '"adam"', ":3: optimizer is 'adam', needs to be adamw or sgd"),
+        ("batch = 4", "batch = 4.5", ":10: batch is 4.5, needs a whole number"),
+        ("batch = 4", "batch = true", ":10: batch is True, needs a whole number"),
+        ("batch = 4", "batch = 0", ":10: batch is 0, needs to lie from 1 to"),
+        ("rate = 1", "rate = nan", ":11: rate is nan, needs to lie from 0 to 100"),
+        ("rate = 1", "speed = 1", ":11: 'speed' is no key of a stage"),
+        ('"constant"', '"linear"', ":19: schedule is 'linear'"),
+        ('"none"', "1", ":2: weights is 1, needs a text"),
+        ("[stages.options]", "[stages.option]", ":13: 'option' is no key of a stage"),
+        ("images = 900", "minutes = 900", ":7: all stages need a budget: all images, or all min"),
+        ("images = 900", "images = 0", ":7: all stages need a budget"),
+        ("[[stages]]", "[stages]", "is no recipe that can be read"),
+        ("kind =", "kind", r"is no recipe that can be read: .*line 1"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_told_with_its_line(tmp_path, old, new, told):
+    """Unknown keys, wrong types, values out of range, TOML that is none."""
+    assert old in GOOD
+    path = written(tmp_path, GOOD.replace(old, new))
+    with pytest.raises(InputError, match=told) as caught:
+        read_recipe(str(path))
+    assert str(caught.value).startswith(str(path))
+
+
+def test_what_is_no_recipe_is_refused(tmp_path):
+    """A name that there isn't, a file without stages, one that is large, one that is not text."""
+    with pytest.raises(InputError, match=r"there is no recipe 'none': .* default, paper"):
+        read_recipe("none")
+    with pytest.raises(InputError, match=r"\[\[stages\]\] is needed"):
+        read_recipe(str(written(tmp_path, 'kind = "regression"\n')))
+    with pytest.raises(InputError, match="is too large to be a recipe"):
+        read_recipe(str(written(tmp_path, "#" * 200_000)))
+    (tmp_path / "my.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="is no recipe that can be read"):
+        read_recipe(str(tmp_path / "my.toml"))
+
+
+def test_the_recipes_of_the_package_can_be_made():
+    """Their kinds know their options, and each has a budget in minutes."""
+    assert {"default", "paper", "vgg16", "posenet"} <= set(names())
+    for name in names():
+        recipe = read_recipe(name)
+        if "vgg" not in name:  # 500 MB of random numbers
+            assert make(recipe.kind, recipe.options).weights_name
+        assert sum(stage.minutes for stage in recipe.stages) == pytest.approx(30)
+
+
+def test_the_papers_recipe_is_the_papers():
+    """Added layers first, where pretraining data go; then all; beta 500 on both."""
+    first, second = read_recipe("paper").stages
+    assert (first.data, second.data) == ("pretraining", "area")
+    assert first.options["freeze_trunk"]
+    assert not second.options.get("freeze_trunk", False)
+    assert first.options["beta"] == second.options["beta"] == 500
+    assert first.options["loss"] == second.options["loss"] == "beta"
+
+
+def test_another_budget_keeps_the_shares():
+    """In images, in minutes, or both; nothing given changes nothing."""
+    stages = (Stage(name="a", minutes=6, batch=16), Stage(name="b", minutes=24))
+    recipe = Recipe(kind="regression", stages=stages)
+    assert recipe.with_budget(None, None) == recipe
+    assert [s.minutes for s in recipe.with_budget(None, 10).stages] == [2, 8]
+    by_images = recipe.with_budget(1000, None)
+    assert [(s.images, s.minutes) for s in by_images.stages] == [(200, 0), (800, 0)]
+    both = recipe.with_budget(1000, 10).stages
+    assert [(s.images, s.minutes) for s in both] == [(200, 2), (800, 8)]
+    assert recipe.with_budget(3, None).stages[0].images == 16  # at least one step
+
+
+def test_progress_is_of_whichever_budget_is_spent_first():
+    """Half the images, or three quarters of the time."""
+    stage = Stage(name="a", images=1000, minutes=2)
+    assert stage.progress(500, 10) == 0.5
+    assert stage.progress(500, 90) == 0.75
+    assert replace(stage, minutes=0.0).progress(500, 1e6) == 0.5
+
+
+def test_the_rate_rises_and_falls():
+    """Over the warm-up it rises by equal steps; a cosine is at half when half is done, and ends at 0."""
+    stage = Stage(name="a", images=10_000, rate=0.4, warmup_steps=4)
+    assert [stage.rate_at(k, 0) for k in range(5)] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
+    assert stage.rate_at(100, 0.5) == pytest.approx(0.2)
+    assert stage.rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
+    assert replace(stage, schedule="constant").rate_at(100, 0.9) == 0.4
