@@ -28,7 +28,6 @@ from spn_model.members.regression_options import RegressionOptions, StageOptions
 from spn_model.networks.normalization import start_as_identity
 from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
-from spn_model.precision import bfloat16_is_fast
 from spn_model.tensors import load_pretrained, read_tensors
 from spn_model.training_set import TrainingSet
 
@@ -123,18 +122,24 @@ class RegressionMember(Member):
             self._cache = self._cached(data, chosen.cached_features)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
+        """The weights of the losses do not decay: decay would pull them to weights of one."""
         of = self.network.regressor.parameter_groups()
-        groups = [
-            ("added", of["added"], 1.0),
-            ("pretrained", of["pretrained"], self._stage.pretrained_rate),
-            ("uncertainty", list(self.network.uncertainty.parameters()), 1.0),
-            ("weighting", list(self.network.weighting.parameters()), 1.0),
+        groups: list[dict[str, Any]] = [
+            {"name": "added", "params": of["added"], "rate": 1.0},
+            {"name": "pretrained", "params": of["pretrained"], "rate": self._stage.pretrained_rate},
+            {
+                "name": "uncertainty",
+                "params": [*self.network.uncertainty.parameters()],
+                "rate": 1.0,
+            },
+            {
+                "name": "weighting",
+                "params": [*self.network.weighting.parameters()],
+                "rate": 1.0,
+                "weight_decay": 0.0,
+            },
         ]
-        return [
-            {"name": name, "params": params, "rate": rate}
-            for name, params, rate in groups
-            if all(parameter.requires_grad for parameter in params)
-        ]
+        return [group for group in groups if all(p.requires_grad for p in group["params"])]
 
     def batch(
         self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
@@ -231,7 +236,7 @@ class RegressionMember(Member):
     def _trunk(self, images: Tensor) -> tuple[Tensor, ...]:
         """Features, float32, of images (B, h, w, 3) uint8, computed as training does."""
         kind = images.device.type
-        with torch.autocast(kind, torch.bfloat16, enabled=bfloat16_is_fast(kind)):
+        with torch.autocast(kind, torch.bfloat16, enabled=self.bfloat16):
             features = self.network.regressor.trunk(self.normalised(images))
         return tuple(part.float() for part in features)
 
