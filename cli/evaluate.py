@@ -82,6 +82,7 @@ def run(
     from spn_model.checkpoint import load
     from spn_model.comparison_files import network_facts, of_network, write_comparison
     from spn_model.evaluate import EvaluateOptions, compare
+    from spn_model.training_figure import read_log, training_figure
 
     area = options.open_area(area_folder)
     folders = {name: area.run(name) for name in names}
@@ -120,7 +121,10 @@ def run(
     parts = [(folders[name], of_network(found, name), {name: facts[name]}) for name in files]
     if len(files) > 1:
         parts.append((runs / names_of.COMPARED, found, facts))
+    unit = "m" if found.units == "m" else "model units"
     for folder, part, of in parts:
+        log = folder / names_of.LOG
+        course = {"training": training_figure(read_log(log), unit=unit)} if log.exists() else {}
         folder.mkdir(parents=True, exist_ok=True)
         write_comparison(
             part,
@@ -128,6 +132,7 @@ def run(
             metrics=folder / names_of.METRICS,
             errors=folder / names_of.ERRORS,
             drawings=folder / names_of.FIGURES,
+            more_drawings=course,
         )
         console.out.print(f"{folder}: {names_of.METRICS}, {names_of.ERRORS}, {names_of.FIGURES}/.")
     page.refresh_if_free(area)

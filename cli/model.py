@@ -6,6 +6,7 @@ import click
 
 from cli.console import Group
 from cli.evaluate import evaluate
+from cli.predict import predict
 from cli.weights import weights
 
 
@@ -17,4 +18,5 @@ def main(verbose: bool) -> None:
 
 
 main.add_command(evaluate)
+main.add_command(predict)
 main.add_command(weights)

@@ -45,7 +45,7 @@ def comparison(found: Comparison) -> None:
 
 
 def _errors(group: Judged, unit: str) -> None:
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             one.method + (" (the better)" if one.method == group.retrieval else ""),
             f"{one.summary.located} of {one.summary.frames}",
@@ -73,7 +73,7 @@ def _errors(group: Judged, unit: str) -> None:
     ]
     console.table(
         f"{group.frames.group}: errors of {len(group.frames)} {_WHAT[group.role]}",
-        rows + published,
+        [*rows, *published],
         ("method", "poses", "median", "mean of poses", "p95"),
     )
     if published:

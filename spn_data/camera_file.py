@@ -1,4 +1,4 @@
-"""A camera as a JSON object: model, width, height, params (COLMAP's order, pixels)."""
+"""A camera as a JSON object: model, width, height, params (COLMAP's order, pixels); and for images."""
 
 from __future__ import annotations
 
@@ -50,3 +50,19 @@ def read_camera(path: Path) -> Camera:
             f"is no camera ({error}): expected model, width, height and params in COLMAP's order",
             path=path,
         ) from error
+
+
+def at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
+    """A given camera for images of a size. Raises InputError, for `where`, where their shape is another."""
+    if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
+        raise InputError(
+            f"the given camera is of {camera.width}x{camera.height}, the images are {width}x{height}",
+            path=where,
+        )
+    return camera.scaled(width, height)
+
+
+def of_focal_length(focal_px: float, width: int, height: int) -> Camera:
+    """A lens of which nothing but a focal length is known: centred, with a radial term of 0."""
+    params = np.array([focal_px, width / 2, height / 2, 0.0])
+    return Camera("SIMPLE_RADIAL", width, height, params)

@@ -81,7 +81,7 @@ def frames_of(candidates: Candidates, choice: Choice, *, focal: np.ndarray | Non
         video_frame = measured.index
         keys = _camera_runs(measured, focal)
     else:
-        stems = _photo_stems(source.parts)
+        stems = photo_stems(source.parts)
         video_frame = np.full(n, -1)
         keys = list(candidates.photos.lens)
     nan = np.full(n, np.nan)
@@ -242,7 +242,7 @@ def _camera_names(sequence: str, keys: Sequence[object]) -> list[str]:
     return [sequence if k == 0 else f"{sequence}-{k + 1}" for k in numbers]
 
 
-def _photo_stems(paths: Sequence[Path]) -> list[str]:
+def photo_stems(paths: Sequence[Path]) -> list[str]:
     """A safe name for each photo, unique also where case does not count."""
     taken: set[str] = set()
     stems = []

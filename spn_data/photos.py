@@ -20,6 +20,7 @@ MAX_PHOTO_PIXELS = 500_000_000
 _MAX_ASPECT_ERROR = 0.01  # by which a mask's shape may differ from the image's
 _FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG opens MPO as well
 _ORIENTATION = 0x0112
+_DIAGONAL_35MM = 43.267
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -56,6 +57,16 @@ class PhotoHeaders:
             else (m.make, m.model, m.lens, _zoom(m.focal_mm), _zoom(m.focal_35mm), _upright_size(m))
             for m in self.metadata
         )
+
+    def focal_px(self, row: int) -> float | None:
+        """Of the upright photo, from the 35-mm equivalent, which compares diagonals (CIPA DCG-001).
+
+        None where it says none.
+        """
+        metadata = self.metadata[row]
+        if metadata is None or not metadata.focal_35mm > 0:
+            return None
+        return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(*self.sizes[row]))
 
 
 def read_headers(paths: Sequence[Path]) -> PhotoHeaders:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -144,21 +144,25 @@ def probe(path: Path) -> VideoInfo:
 def decode(
     path: Path,
     *,
-    wanted: Collection[int] | None = None,
+    wanted: Collection[int] | Callable[[VideoFrame], bool] | None = None,
     threads: int = 0,
     report: DecodeReport | None = None,
 ) -> Iterator[VideoFrame]:
     """The frames in the order of time, upright, 8-bit BGR.
 
-    wanted : indices whose image is converted (default all); the others pass with image None, and decoding
-    ends after the last. threads : of the decoder, 0 for one a core. Damaged packets are passed over and
-    counted in `report`. InputError where nothing can be decoded or where frames carry no timestamps.
+    wanted : indices whose image is converted (default all), after the last of which decoding ends; or what
+    tells of a frame without its image whether it is wanted. The others pass with image None. threads : of
+    the decoder, 0 for one a core. Damaged packets are passed over and counted in `report`. InputError where
+    nothing can be decoded or where frames carry no timestamps.
     """
-    last = max(wanted, default=-1) if wanted is not None else None
+    last = max(wanted, default=-1) if isinstance(wanted, Collection) else None
     for item, orientation, frame in _frames(path, threads, report or DecodeReport()):
         if last is not None and item.index > last:
             return
-        if wanted is not None and item.index not in wanted:
+        is_wanted = wanted is None or (
+            item.index in wanted if isinstance(wanted, Collection) else wanted(item)
+        )
+        if not is_wanted:
             yield item
             continue
         # Untagged video of 720 lines and more is BT.709 by custom; swscale would take BT.601.

@@ -29,6 +29,7 @@ from spn_model.metrics import (
     evaluation_frames,
 )
 from spn_model.retrieval import most_alike
+from spn_model.validation import spread_rows
 from spn_model.view import View
 
 _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
@@ -110,7 +111,7 @@ def compare(
         for name, network in networks.items():
             check_world(network, data, name, world_names, fingerprint)
         training, groups, notes = _groups(data)
-        rows = _spread(len(training), options.training_images)
+        rows = spread_rows(len(training), options.training_images)
         chosen = [(group, np.arange(len(group))) for group in groups] + [(training, rows)]
         frames = [
             evaluation_frames(
@@ -240,10 +241,6 @@ def _groups(data: Dataset) -> tuple[DatasetGroup, list[DatasetGroup], list[str]]
         )
     notes = [f"Group {group.name} is empty: left out." for group in found if not len(group)]
     return of_training[0], groups, notes
-
-
-def _spread(count: int, wanted: int) -> np.ndarray:
-    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
 
 
 def _estimated(

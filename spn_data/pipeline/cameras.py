@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 
 from spn_data.camera import Camera
-from spn_data.camera_file import camera_to_json
-from spn_data.errors import InputError
+from spn_data.camera_file import at_size, camera_to_json, of_focal_length
 from spn_data.frames import Frames
 from spn_data.photos import PhotoHeaders
 
 # Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
 _GUESSED_FOCAL_SHARE = 0.7
-_DIAGONAL_35MM = 43.267
 
 
 def start_cameras(
@@ -38,42 +36,20 @@ def start_cameras(
         if key == sequence:
             fov = fov_deg.get(sequence, fov_deg.get("*"))
             camera = given.get(sequence, given.get("*"))
-        focal_px = None if photos is None else _photo_focal_px(photos, row, width, height)
+        focal_px = None if photos is None else photos.focal_px(row)
         if camera is not None:
-            camera, source = _at_size(camera, width, height, sequence), "given"
+            camera, source = at_size(camera, width, height, sequence), "given"
         elif fov is not None:
             camera = Camera.from_horizontal_fov(width, height, fov, (0.0,))
             source = f"horizontal field of view of {fov:g} deg, as given"
         elif focal_px is not None:
-            camera, source = _simple(focal_px, width, height), "photo metadata"
+            camera, source = of_focal_length(focal_px, width, height), "photo metadata"
         else:
             guess = _GUESSED_FOCAL_SHARE * max(width, height)
-            camera, source = _simple(guess, width, height), "guess"
+            camera, source = of_focal_length(guess, width, height), "guess"
         cameras[key] = {
             **camera_to_json(camera),
             "focal_is_known": source != "guess",
             "source": source,
         }
     return cameras
-
-
-def _simple(focal_px: float, width: int, height: int) -> Camera:
-    params = np.array([focal_px, width / 2, height / 2, 0.0])
-    return Camera("SIMPLE_RADIAL", width, height, params)
-
-
-def _at_size(camera: Camera, width: int, height: int, sequence: str) -> Camera:
-    if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
-        raise InputError(
-            f"the given camera is of {camera.width}x{camera.height}, the images are {width}x{height}",
-            path=sequence,
-        )
-    return camera.scaled(width, height)
-
-
-def _photo_focal_px(photos: PhotoHeaders, row: int, width: int, height: int) -> float | None:
-    """From the 35-mm equivalent, which compares diagonals (CIPA DCG-001)."""
-    metadata = photos.metadata[row]
-    if metadata is None or not metadata.focal_35mm > 0:
-        return None
-    return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(width, height))

@@ -1,0 +1,205 @@
+"""Predicted poses as files: CSV row by row, TUM, positions on the globe."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from spn_data.errors import StageError
+from spn_data.exports.frames import timestamps_us
+from spn_data.files import write_csv
+from spn_data.geodesy import GeoOrigin
+from spn_data.pose import Poses, angles_from_rotations, canonical_quats
+from spn_model.flown import FlownFrame
+from spn_model.members.member import PoseEstimates
+
+ESTIMATED, FAILED, UNREADABLE = "estimated", "failed", "unreadable"
+_UPPER = np.triu_indices(6)
+COLUMNS = (
+    *("name", "time_s", "status", "reason", "x", "y", "z", "qw", "qx", "qy", "qz"),
+    *("source", "video_frame"),
+    *(f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True)),
+)
+
+
+@dataclass(eq=False)
+class Rows:
+    """N frames with what became of them. status : ESTIMATED, FAILED (no pose in it) or UNREADABLE.
+
+    poses, covariance (N, 6, 6) : NaN where there is none, or it is not known.
+    """
+
+    names: np.ndarray
+    sequences: np.ndarray
+    sources: np.ndarray
+    video_frame: np.ndarray
+    time_s: np.ndarray
+    status: np.ndarray
+    reason: np.ndarray
+    poses: Poses
+    covariance: np.ndarray
+
+    @classmethod
+    def unknown(cls, frames: Sequence[FlownFrame]) -> Rows:
+        """Without poses yet."""
+        n = len(frames)
+        return cls(
+            np.array([frame.name for frame in frames], dtype=object),
+            np.array([frame.sequence for frame in frames], dtype=object),
+            np.array([frame.source for frame in frames], dtype=object),
+            np.array([frame.video_frame for frame in frames], dtype=np.int64),
+            np.array([frame.time_s for frame in frames], dtype=np.float64),
+            np.array([UNREADABLE if f.image is None else FAILED for f in frames], dtype=object),
+            np.array([frame.problem for frame in frames], dtype=object),
+            Poses.unknown(n),
+            np.full((n, 6, 6), np.nan),
+        )
+
+    def put(self, of: np.ndarray, estimates: PoseEstimates) -> None:
+        """What the network says of some rows."""
+        found = np.isfinite(estimates.poses.centers).all(axis=1)
+        found &= np.isfinite(estimates.poses.quats_wxyz).all(axis=1)
+        self.status[of] = np.where(found, ESTIMATED, FAILED)
+        reasons = [str(reason) or "no pose was found" for reason in estimates.reasons]
+        self.reason[of] = np.where(found, "", np.array(reasons, dtype=object))
+        rows = of[found]
+        self.poses.centers[rows] = estimates.poses.centers[found]
+        self.poses.quats_wxyz[rows] = canonical_quats(estimates.poses.quats_wxyz[found])
+        self.covariance[rows] = estimates.covariance[found]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Rows]) -> Rows:
+        """One after the other."""
+        if not parts:
+            return cls.unknown([])
+        columns = {
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            for f in fields(cls)
+            if f.name != "poses"
+        }
+        return cls(**columns, poses=Poses.concatenate(part.poses for part in parts))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def counts(self) -> dict[str, int]:
+        """Frames by status."""
+        return {s: int((self.status == s).sum()) for s in (ESTIMATED, FAILED, UNREADABLE)}
+
+    def reasons(self) -> list[tuple[str, int]]:
+        """Why frames have no pose, most frequent first."""
+        return Counter(self.reason[self.status != ESTIMATED].tolist()).most_common()
+
+
+class PoseTable:
+    """poses.csv, written as far as frames are done; keeps what other formats need."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._parts: list[Rows] = []
+        self._file: TextIO | None = None
+
+    def __enter__(self) -> PoseTable:
+        try:
+            self._file = self._path.open("w", encoding="utf-8", newline="")
+            csv.writer(self._file, lineterminator="\n").writerow(COLUMNS)
+        except OSError as error:
+            raise StageError(f"{self._path} cannot be written: {error.strerror}") from error
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        assert self._file is not None
+        try:
+            self._file.close()
+        except OSError as full:
+            raise StageError(f"{self._path} cannot be written: {full.strerror}") from full
+
+    def add(self, rows: Rows) -> None:
+        """Raises StageError where the disk does not take them."""
+        assert self._file is not None
+        poses = np.hstack([rows.poses.centers, rows.poses.quats_wxyz])
+        covariance = rows.covariance[:, _UPPER[0], _UPPER[1]]
+        writer = csv.writer(self._file, lineterminator="\n")
+        try:
+            for k in range(len(rows)):
+                writer.writerow(
+                    [
+                        *(rows.names[k], _cell(rows.time_s[k]), rows.status[k], rows.reason[k]),
+                        *(_cell(value) for value in poses[k]),
+                        *(rows.sources[k], rows.video_frame[k]),
+                        *(_cell(value) for value in covariance[k]),
+                    ]
+                )
+            self._file.flush()
+        except OSError as error:
+            raise StageError(f"{self._path} cannot be written: {error.strerror}") from error
+        self._parts.append(rows)
+
+    def rows(self) -> Rows:
+        """All of them."""
+        return Rows.concatenate(self._parts)
+
+
+def write_tum(rows: Rows, world: str) -> Iterator[tuple[str, str]]:
+    """(sequence, text) of each flight: `timestamp tx ty tz qx qy qz qw`, camera axes into world axes.
+
+    As `spn_data.exports.tum` writes labels. Frames without a pose have no line, as the format has no way
+    to say so.
+    """
+    for name in dict.fromkeys(rows.sequences.tolist()):
+        mine = np.flatnonzero((rows.sequences == name) & (rows.status == ESTIMATED))
+        lines = [
+            f"# {name}: camera poses, world from camera",
+            f"# {world}",
+            "# timestamp (s since the sequence's first frame) tx ty tz qx qy qz qw",
+        ]
+        poses = rows.poses[mine]
+        quats_xyzw = np.roll(poses.quats_wxyz * [1, -1, -1, -1], -1, axis=1)
+        stamps = timestamps_us(rows.time_s[mine])
+        for stamp, center, quat in zip(stamps, poses.centers, quats_xyzw, strict=True):
+            numbers = " ".join(f"{value:.9f}" for value in (*center, *quat))
+            lines.append(f"{stamp / 1e6:.6f} {numbers}")
+        yield name, "\n".join(lines) + "\n"
+
+
+def write_wgs84(path: Path, rows: Rows, origin: GeoOrigin) -> None:
+    """A row a frame: latitude, longitude, height, angles, standard deviations; empty where unknown."""
+    found = rows.status == ESTIMATED
+    places, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 3), np.nan)
+    poses = rows.poses[np.flatnonzero(found)]
+    places[found] = origin.wgs84_from_enu(poses.centers)
+    angles[found] = angles_from_rotations(poses.rotations)
+    variance = np.einsum("nii->ni", rows.covariance)[:, :3]
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    columns: dict[str, list[str]] = {
+        "name": rows.names.tolist(),
+        "time_s": [_cell(value) for value in rows.time_s],
+        "status": rows.status.tolist(),
+        "reason": rows.reason.tolist(),
+        "lat_deg": [_cell(value, 10) for value in places[:, 0]],
+        "lon_deg": [_cell(value, 10) for value in places[:, 1]],
+        "height_m": [_cell(value, 4) for value in places[:, 2]],
+        "height_reference": [origin.height_reference.value] * len(rows),
+        **{
+            f"{name}_deg": [_cell(value, 4) for value in angles[:, k]]
+            for k, name in enumerate(("heading", "pitch", "roll"))
+        },
+        **{
+            f"sigma_{name}_m": [_cell(value, 4) for value in sigma[:, k]]
+            for k, name in enumerate(("east", "north", "up"))
+        },
+    }
+    write_csv(path, columns)
+
+
+def _cell(value: float, digits: int | None = None) -> str:
+    """Empty where unknown."""
+    if not np.isfinite(value):
+        return ""
+    return repr(float(value)) if digits is None else f"{value:.{digits}f}"
