@@ -74,7 +74,8 @@ class Surface:
         rows, columns = self.inverse_depth.shape
         with np.errstate(invalid="ignore"):
             cell = np.floor(pixels / self.step_px)
-            inside = np.all((cell >= 0) & (cell < [columns, rows]), axis=1)
+            inside = (cell[:, 0] >= 0) & (cell[:, 1] >= 0)
+            inside &= (cell[:, 0] < columns) & (cell[:, 1] < rows)
         x, y = np.where(inside[:, None], cell, 0).astype(np.int64).T
         inverse = np.where(inside, self.inverse_depth[y, x], np.nan)
         rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)

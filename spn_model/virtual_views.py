@@ -30,7 +30,7 @@ def random_place(generator: np.random.Generator, seen: Surface, options: ViewOpt
     Raises ValueError where nothing of the surface is known.
     """
     xyz = seen.xyz(_pixels(seen))
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    xyz = xyz[np.isfinite(xyz[:, 0])]
     if not len(xyz):
         raise ValueError("nothing is known of what the image shows")
     center, rotation = seen.pose.centers[0], seen.pose.rotations[0]
@@ -64,7 +64,7 @@ def view_from(
     source, x = source[ahead], x[ahead]
     projected = x @ seen.matrix.T
     at = projected[:, :2] / projected[:, 2:] / step - 0.5
-    inside = ((at > -1) & (at < [columns, rows])).all(axis=1)
+    inside = _within(at, -1, columns, rows)
     source, at, depth = source[inside], at[inside], x[inside, 2]
     sums = _splat(at, depth, np.column_stack([source, 1 / depth]), columns, rows)
     shown = sums[:, 3] > 0.05
@@ -81,6 +81,12 @@ def _pixels(seen: Surface) -> np.ndarray:
     return cell_centers(columns, rows, seen.step_px / 2, seen.step_px)
 
 
+def _within(at: np.ndarray, low: int, columns: int, rows: int) -> np.ndarray:
+    """(N,) bool: places (N, 2) above `low` and below the grid's size; axis by axis, for it is done often."""
+    x, y = at[:, 0], at[:, 1]
+    return (x > low) & (x < columns) & (y > low) & (y < rows)
+
+
 def _splat(
     at: np.ndarray, depth: np.ndarray, values: np.ndarray, columns: int, rows: int
 ) -> np.ndarray:
@@ -92,9 +98,10 @@ def _splat(
     targets = []
     for offset in ((0, 0), (1, 0), (0, 1), (1, 1)):
         cell = (corner + offset).astype(np.int64)
-        weight = (1 - np.abs(at - cell)).prod(axis=1)
-        use = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1) & (weight > 1e-3)
-        targets.append((cell[use] @ [1, columns], use, weight[use]))
+        near = 1 - np.abs(at - cell)
+        weight = near[:, 0] * near[:, 1]
+        use = _within(cell, -1, columns, rows) & (weight > 1e-3)
+        targets.append((cell[use, 0] + cell[use, 1] * columns, use, weight[use]))
     nearest = np.full(rows * columns, np.inf)
     for index, use, _ in targets:
         np.minimum.at(nearest, index, depth[use])
@@ -118,7 +125,8 @@ def _colours(
     smooth = cv2.resize(source, size, interpolation=cv2.INTER_LINEAR)
     inner = cv2.erode(shown.astype(np.uint8), np.ones((3, 3), np.uint8))
     inner = cv2.resize(inner, size, interpolation=cv2.INTER_NEAREST) != 0
-    inner &= np.abs(smooth - near).max(axis=2) < _SEAM_PX
+    apart = np.abs(smooth - near)
+    inner &= (apart[..., 0] < _SEAM_PX) & (apart[..., 1] < _SEAM_PX)
     # cv2 counts from the centre of the upper-left pixel.
     maps = np.where(inner[..., None], smooth, near) - np.float32(0.5)
     moved = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
