@@ -7,6 +7,7 @@ import click
 from cli.console import Group
 from cli.evaluate import evaluate
 from cli.predict import predict
+from cli.train import train
 from cli.weights import weights
 
 
@@ -17,6 +18,7 @@ def main(verbose: bool) -> None:
     """Networks that tell a pose from an image, in an area that `spn-data` has prepared."""
 
 
+main.add_command(train)
 main.add_command(evaluate)
 main.add_command(predict)
 main.add_command(weights)

@@ -36,6 +36,7 @@ _GROUPS = (EVALUATION, DENSE)
 RUNS = "runs"  # trained networks, a folder each; made by spn-model
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIGURES = "errors.csv", "figures"
+CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
 COMPARED = "compared"  # beside them: several runs evaluated together
 
 # What only unfinished work holds: it is removed once the stage's record stands.

@@ -92,7 +92,7 @@ def write_tensors(
     Numbers of the document that are not finite are written as null.
     """
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    text = json.dumps(_finite(document), sort_keys=True, allow_nan=False)
+    text = json.dumps(finite(document), sort_keys=True, allow_nan=False)
     content = safetensors_bytes(plain, {"format": form, "version": str(VERSION), "document": text})
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing_whole(path) as file:
@@ -139,11 +139,12 @@ def _kind_of(tensor: Tensor) -> str:
     return f"{shape} of {str(tensor.dtype).removeprefix('torch.')}"
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Plain values with null for numbers that are not finite."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     return value

@@ -145,6 +145,8 @@ class _Reader:
                 "momentum", f"momentum is {values['momentum']}, needs to lie in [0, 1)"
             )
         made = tuple(self._stage(stage, k) for k, stage in enumerate(stages))
+        if len({stage.name for stage in made}) != len(made):
+            raise self._wrong("name", "two stages have the same name")
         if not (all(s.images for s in made) or all(s.minutes for s in made)):
             raise self._wrong("stages", "all stages need a budget: all images, or all minutes")
         return Recipe(stages=made, **values)

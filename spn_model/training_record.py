@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,9 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from spn_data.errors import GeometryError
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_model import checkpoint
+from spn_model.covariance_scale import measured_scale
 from spn_model.members.member import Member
 from spn_model.training_state import Log, Position, save_state
 from spn_model.validation import Errors, judge, spread_rows
@@ -53,7 +55,15 @@ class Judged:
     rows: np.ndarray
 
     def errors(self, member: Member) -> Errors:
-        return judge(member, self.group.image, self.group.intrinsics, self.group.poses, self.rows)
+        """Of the member's estimates. Validation frames also tell how large its covariances have to be."""
+        group = self.group
+        errors, found = judge(member, group.image, group.intrinsics, group.poses, self.rows)
+        if self.event == "validation":
+            # Too few frames with a pose: covariances stay as they are.
+            with suppress(GeometryError):
+                factor = measured_scale(found, group.poses[self.rows])
+                member.set_covariance_scale(min(max(factor, 1e-6), 1e6))
+        return errors
 
 
 def judged_frames(

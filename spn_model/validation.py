@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.pose import Poses
-from spn_model.members.member import Member
+from spn_model.members.member import Member, PoseEstimates
 from spn_model.metrics import Estimates, frame_errors, quantile
 
 _AT_ONCE = 8  # images given to `estimate`
@@ -47,25 +47,27 @@ def judge(
     intrinsics: np.ndarray,
     poses: Poses,
     rows: np.ndarray,
-) -> Errors:
-    """Errors of the member's estimates of these rows; `image` gives the (H, W, 3) RGB of one.
+) -> tuple[Errors, PoseEstimates]:
+    """The member's estimates of these rows, and their errors; `image` gives the (H, W, 3) RGB of one.
 
     The network is left in eval mode.
     """
     member.network.eval()
-    centers, quats = [], []
+    found = []
     for first in range(0, len(rows), _AT_ONCE):
         part = rows[first : first + _AT_ONCE]
         images = np.stack([image(int(row)) for row in part])
-        found = member.estimate(images, intrinsics[part]).poses
-        centers.append(found.centers)
-        quats.append(found.quats_wxyz)
-    estimates = Estimates("network", Poses(np.concatenate(centers), np.concatenate(quats)))
-    errors = frame_errors(estimates, poses[rows])
+        found.append(member.estimate(images, intrinsics[part]))
+    estimates = PoseEstimates(
+        Poses.concatenate(one.poses for one in found),
+        np.concatenate([one.covariance for one in found]),
+        np.concatenate([one.reasons for one in found]),
+    )
+    errors = frame_errors(Estimates("network", estimates.poses), poses[rows])
     position, rotation = (
         np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)
     )
-    return Errors(
+    summary = Errors(
         frames=len(rows),
         located=int(errors.located.sum()),
         median_m=quantile(position, 0.5),
@@ -73,3 +75,4 @@ def judge(
         p95_m=quantile(position, 0.95),
         p95_deg=quantile(rotation, 0.95),
     )
+    return summary, estimates

@@ -110,7 +110,7 @@ def test_a_training_learns_where_the_camera_is(field, tmp_path):
     assert found.facts["kept"] == facts["kept"]
     with Dataset(field) as dataset:
         group = dataset.groups["validation"]
-        errors = judge(
+        errors, _ = judge(
             found.member, group.image, group.intrinsics, group.poses, np.arange(len(group))
         )
     assert errors.median_m == pytest.approx(facts["kept"]["validation"]["median_m"], rel=1e-5)

@@ -86,6 +86,7 @@ class TinyNet(nn.Module):
 
     center: Tensor
     scale: Tensor
+    variance: Tensor
 
     def __init__(self, width: int, dropout: float):
         super().__init__()
@@ -95,6 +96,7 @@ class TinyNet(nn.Module):
         self.out = nn.Linear(width, 7)
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("variance", torch.ones(()))
 
     def forward(self, images: Tensor) -> Tensor:
         x = self.normalisation(self.convolution(images)).relu()
@@ -177,8 +179,11 @@ class TinyMember(Member):
         out = self.network(torch.from_numpy(images / 255.0).float().permute(0, 3, 1, 2).to(device))
         centers = (out[:, :3] * self.network.scale + self.network.center).double().cpu().numpy()
         quats = nn.functional.normalize(out[:, 3:].double(), dim=1).cpu().numpy()
-        covariance = np.full((len(images), 6, 6), np.nan)
+        covariance = np.tile(np.eye(6) * float(self.network.variance), (len(images), 1, 1))
         return PoseEstimates(Poses(centers, quats), covariance, np.full(len(images), ""))
+
+    def set_covariance_scale(self, factor: float) -> None:
+        self.network.variance.mul_(factor)
 
 
 def register_tiny() -> None:

@@ -90,3 +90,7 @@ class Member(ABC):
     @abstractmethod
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
         """Poses of images (B, H, W, 3) uint8 RGB without distortion, K (B, 3, 3). In eval mode."""
+
+    @abstractmethod
+    def set_covariance_scale(self, factor: float) -> None:
+        """Multiply the covariances of all later estimates by a factor; kept in the network's state."""

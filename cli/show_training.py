@@ -1,0 +1,137 @@
+"""A training as it goes: a live table on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from cli import console
+
+if TYPE_CHECKING:
+    from spn_model.recipe import Recipe
+
+_PLAIN_EVERY_S = 60.0
+_SHOWN = 12  # rows of the live table
+_NAMES = {"validation": "validation", "training": "training images"}
+
+
+class Following:
+    """Shows rows of the log; knows whether a stop is wanted. Enter it while training runs."""
+
+    def __init__(self, recipe: Recipe, unit: str, *, shows: bool):
+        self._stages = {stage.name: k for k, stage in enumerate(recipe.stages)}
+        self._shares = recipe.shares
+        self._unit, self._shows = unit, shows
+        self._stop = False
+        self._judged: list[tuple[str, ...]] = []
+        self._status = "Preparing the training images."
+        self._printed = -_PLAIN_EVERY_S
+        live = shows and console.out.is_terminal
+        self._live = Live(console=console.out, refresh_per_second=4) if live else None
+
+    def __enter__(self) -> Following:
+        if self._live is not None:
+            self._live.start()
+            self._live.update(self._table())
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._status = ""
+            self._live.update(self._table())
+            self._live.stop()
+
+    def stop(self) -> None:
+        """The step that runs is finished, the state is saved, the training ends."""
+        self._stop = True
+        self.say("Stopping after this step.")
+
+    def wants_stop(self) -> bool:
+        return self._stop
+
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        if self._shows:
+            console.out.print(Text(text), soft_wrap=True)
+
+    def row(self, values: Mapping[str, Any]) -> None:
+        """See `spn_model.training_record.Watch`."""
+        if values["event"] == "steps":
+            self._status = self._steps(values)
+            now = time.monotonic()
+            if self._live is None and self._shows and now - self._printed > _PLAIN_EVERY_S:
+                self._printed = now
+                self.say(self._status)
+        else:
+            cells = (
+                f"{self._done(values):.0%}",
+                _NAMES[values["event"]],
+                *_errors(values),
+            )
+            self._judged.append(cells)
+            if self._live is None and self._shows:
+                done, what, m, deg, m95, deg95, poses = cells
+                self.say(
+                    f"{done} {what}: median {m} {self._unit}, {deg}°; 95 % within {m95} {self._unit}, "
+                    f"{deg95}°; {poses} have a pose"
+                )
+        if self._live is not None:
+            self._live.update(self._table())
+
+    def _steps(self, values: Mapping[str, Any]) -> str:
+        done, train_s = self._done(values), values["train_s"]
+        left_s = train_s / done * (1 - done) if done > 0 else 0.0
+        left = f", about {console.duration(left_s)} left" if left_s > 1 else ""
+        return (
+            f"{done:.0%} {values['stage']}: {values['images']:,} images, "
+            f"{values['images_per_s']:.1f} a second, loss {values['loss']:.4g}"
+            f" {values['figures']}{left}"
+        )
+
+    def _done(self, values: Mapping[str, Any]) -> float:
+        index = self._stages[values["stage"]]
+        return sum(self._shares[:index]) + self._shares[index] * float(values["progress"])
+
+    def _table(self) -> Group:
+        table = Table(box=None)
+        for title in ("", "", f"median {self._unit}", "°", f"95 % {self._unit}", "°", "poses"):
+            table.add_column(title, justify="right")
+        for cells in self._judged[-_SHOWN:]:
+            table.add_row(*(Text(cell) for cell in cells))
+        return Group(table, Text(self._status))
+
+
+def errors_table(facts: Mapping[str, Any], unit: str) -> None:
+    """Errors of the kept checkpoint and of the training's end; what the training took."""
+    rows = []
+    for title, found in (("kept", facts["kept"]), ("at the end", facts["latest"])):
+        for event, name in _NAMES.items():
+            if found and found.get(event):
+                rows.append((f"{name}, {title}", *_errors(found[event])))
+    header = ("", f"median {unit}", "°", f"95 % {unit}", "°", "poses")
+    console.table("Errors", rows, header)
+    console.out.print(
+        f"Trained for {console.duration(facts['train_s'])} "
+        f"({facts['images_shown']:,} images, {facts['precision']}, {facts['threads']} threads, "
+        f"{facts['device']}); judging took {console.duration(facts['validate_s'])} more."
+    )
+
+
+def _errors(values: Mapping[str, Any]) -> tuple[str, ...]:
+    figures = [
+        "-" if values[name] is None else f"{values[name]:.{digits}f}"
+        for name, digits in (("median_m", 2), ("median_deg", 1), ("p95_m", 2), ("p95_deg", 1))
+    ]
+    return (*figures, f"{values['located']} of {values['frames']}")
