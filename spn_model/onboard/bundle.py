@@ -37,15 +37,9 @@ CONVENTIONS = (
 _MAX_DOCUMENT_BYTES = 1_000_000
 _MAX_SIDE_PX = 8192
 _MAX_GRAPH_BYTES = 2 * 10**9  # no ONNX file is larger
-_LIMITS = {
-    "cells": (6, 100_000),
-    "ransac_px": (0.01, 1000),
-    "ransac_iterations": (1, 100_000),
-    "min_inliers": (4, 100_000),
-    "floor_px": (1e-3, 1000),
-    "robust": (1e-3, 1000),
-    "cells_per_observation": (1e-6, 1e9),
-}
+# Of decoding's options: what costs time or memory; a pose needs three points, and a fourth to choose.
+_LIMITS = {"cells": (4, 100_000), "ransac_iterations": (1, 100_000), "min_inliers": (4, 100_000)}
+_SIZES = (0, 1e9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +62,7 @@ class CellDecoding:
         given = value["options"]
         options: dict[str, Any] = {}
         for own in fields(DecodingOptions):
-            low, high = _LIMITS[own.name]
+            low, high = _LIMITS.get(own.name, _SIZES)
             number = _number(given[own.name], low, high)
             options[own.name] = int(number) if isinstance(own.default, int) else number
         return cls(

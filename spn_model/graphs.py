@@ -1,0 +1,162 @@
+"""A member's network as an ONNX graph: bytes of an image in, what makes a pose out."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from spn_data.errors import InputError
+from spn_model.imagenet import MEAN, STD
+from spn_model.members.member import Member
+from spn_model.members.regression import RegressionMember
+from spn_model.members.regression_examples import input_size, resized
+from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX, grid_size
+from spn_model.onboard.bundle import CellDecoding, Decoding, PoseDecoding
+
+_OPSET = 17  # read by onnxruntime from 1.12 on
+INPUT = "image"
+
+
+@dataclass(frozen=True, eq=False)
+class Deployment:
+    """How a member becomes a graph.
+
+    network : images (1, 3, h, w) as ImageNet's -> outputs in the order of decoding.outputs; decoding : what
+    makes poses of them on board; size : (width, height) of the graph's input; last : beginnings of the names
+    of the parameters that give the outputs, which quantization leaves alone.
+    """
+
+    network: nn.Module
+    decoding: Decoding
+    size: tuple[int, int]
+    last: tuple[str, ...]
+
+    def sized(self, image: np.ndarray) -> np.ndarray:
+        """(1, h, w, 3): a data set's image as the graph takes it."""
+        return np.ascontiguousarray(resized(image, self.size[0]))[None]
+
+
+def deployment(member: Member, size: tuple[int, int]) -> Deployment:
+    """For images of size (width, height), as the data set has them.
+
+    Raises InputError for a kind of network that has no graph.
+    """
+    if isinstance(member, SceneCoordinatesMember):
+        grid_size(*size)
+        cells = CellDecoding(
+            first_px=float(FIRST_CELL_PX),
+            stride_px=float(STRIDE_PX),
+            options=member.decoding_options,
+        )
+        return Deployment(member.network, cells, size, ("out.",))
+    if isinstance(member, RegressionMember):
+        pose = PoseDecoding(center=member.network.targets.center.cpu().numpy())
+        last = ("regressor.x.", "regressor.q.", "uncertainty.")
+        width = int(member.options["width"])
+        return Deployment(member.network, pose, input_size(*size, width), last)
+    raise InputError(f"a network of kind {member.kind!r} cannot be exported")
+
+
+def write_graph(path: Path, deployed: Deployment) -> None:
+    """Write the float32 graph: uint8 RGB (1, h, w, 3) in, outputs as `deployed.decoding` names them."""
+    width, height = deployed.size
+    graph = _FromBytes(copy.deepcopy(deployed.network).float().cpu()).eval()
+    example = torch.zeros((1, height, width, 3), dtype=torch.uint8)
+    _fix_pooling(graph, example)
+    with warnings.catch_warnings(), torch.no_grad():
+        # The exporter by tracing is called old; that by torch.export needs three packages more. What it
+        # says of constants that it does not fold, onnxruntime folds.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", UserWarning)
+        torch.onnx.export(
+            graph,
+            (example,),
+            str(path),
+            dynamo=False,
+            opset_version=_OPSET,
+            input_names=[INPUT],
+            output_names=list(deployed.decoding.outputs),
+        )
+
+
+@torch.inference_mode()
+def reference(deployed: Deployment, image: np.ndarray) -> list[np.ndarray]:
+    """What PyTorch itself makes of an image (1, h, w, 3) uint8."""
+    device = next(deployed.network.parameters()).device
+    graph = _FromBytes(deployed.network).to(device).eval()
+    outputs: Sequence[Tensor] = graph(torch.from_numpy(image).to(device))
+    return [output.cpu().numpy() for output in outputs]
+
+
+class _FromBytes(nn.Module):
+    """Images (1, h, w, 3) uint8 for a network that takes (1, 3, h, w), normalised as ImageNet's."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, network: nn.Module):
+        super().__init__()
+        self.network = network
+        for name, values in (("mean", MEAN), ("std", STD)):
+            self.register_buffer(name, 255 * torch.tensor(values)[:, None, None])
+
+    def forward(self, image: Tensor) -> Sequence[Tensor]:
+        outputs: Sequence[Tensor] = self.network(
+            (image.permute(0, 3, 1, 2).float() - self.mean) / self.std
+        )
+        return tuple(outputs)
+
+
+class _CellMeans(nn.Module):
+    """AdaptiveAvgPool2d for one size of maps, as two products: ONNX has no pooling into uneven cells."""
+
+    across: Tensor
+    down: Tensor
+
+    def __init__(self, maps: tuple[int, int], cells: tuple[int, int]):
+        super().__init__()
+        self.register_buffer("down", _shares(maps[0], cells[0]))
+        self.register_buffer("across", _shares(maps[1], cells[1]).T.contiguous())
+
+    def forward(self, maps: Tensor) -> Tensor:
+        return self.down @ maps @ self.across
+
+
+def _shares(pixels: int, cells: int) -> Tensor:
+    """(cells, pixels): each row the mean over pixels floor(k n / m) to ceil((k + 1) n / m), as torch's."""
+    shares = torch.zeros(cells, pixels)
+    for k in range(cells):
+        first, last = k * pixels // cells, -(-(k + 1) * pixels // cells)
+        shares[k, first:last] = 1 / (last - first)
+    return shares
+
+
+def _fix_pooling(graph: nn.Module, example: Tensor) -> None:
+    """Put `_CellMeans` in the place of each adaptive pooling that the example runs through."""
+    sizes: dict[nn.Module, tuple[int, int]] = {}
+
+    def note(module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
+        sizes[module] = (given[0].shape[2], given[0].shape[3])
+
+    pools = {n: m for n, m in graph.named_modules() if isinstance(m, nn.AdaptiveAvgPool2d)}
+    hooks = [module.register_forward_hook(note) for module in pools.values()]
+    with torch.no_grad():
+        graph(example)
+    for hook in hooks:
+        hook.remove()
+    for name, module in pools.items():
+        if module in sizes:
+            with torch.no_grad():
+                cells = module(torch.zeros(1, 1, *sizes[module])).shape[2:]
+            parent, _, child = name.rpartition(".")
+            setattr(
+                graph.get_submodule(parent), child, _CellMeans(sizes[module], (cells[0], cells[1]))
+            )
