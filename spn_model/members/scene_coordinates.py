@@ -24,7 +24,6 @@ from spn_model.networks.scene_coordinates import (
     grid_size,
     laplace_loss,
 )
-from spn_model.precision import bfloat16_is_fast
 from spn_model.tensors import load_pretrained, read_tensors
 from spn_model.training_set import TrainingSet
 from spn_model.weights import find
@@ -121,9 +120,7 @@ class SceneCoordinatesMember(Member):
         Where no cell of the batch has a target the loss is 0.
         """
         images, known = batch["images"], batch["known"]
-        with torch.autocast(
-            images.device.type, torch.bfloat16, enabled=bfloat16_is_fast(images.device.type)
-        ):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.bfloat16):
             coordinates, log_scale = self.network(_normalised(images))
         if not known.any():
             return (coordinates.sum() + log_scale.sum()) * 0, {}
