@@ -269,24 +269,27 @@ class RegressionMember(Member):
         """Features of variants of every image, the same in every run: drawn by row and variant alone."""
         network, was_training = self.network, self.network.training
         network.train()  # the auxiliary estimates exist in training mode alone; the trunk is frozen
-        try:
-            features, poses = [], []
-            for row in range(len(data)):
-                seeds = [np.random.default_rng((row, variant)) for variant in range(variants)]
-                images, of_row = self._examples(data, [(row, seed) for seed in seeds])
-                found = self._trunk(torch.from_numpy(images).to(self._device))
-                size = sum(part.nbytes for part in found) * len(data)
-                if size > _CACHE_BYTES:
-                    raise InputError(
-                        f"cached_features is {variants}: that takes {size / 1e9:.1f} GB of memory, "
-                        f"{_CACHE_BYTES / 1e9:.0f} GB are allowed"
-                    )
-                features.append([part.cpu().numpy() for part in found])
-                poses.append(of_row)
-        finally:
-            network.train(was_training)
-        stacked = tuple(np.stack(parts) for parts in zip(*features, strict=True))
-        return FeatureCache(stacked, Poses.concatenate(poses))
+        found: list[list[np.ndarray]] = []
+        poses = []
+        wanted = [(row, variant) for row in range(len(data)) for variant in range(variants)]
+        for start in range(0, len(wanted), _AT_ONCE):
+            seeded = [
+                (key[0], np.random.default_rng(key)) for key in wanted[start : start + _AT_ONCE]
+            ]
+            images, some = self._examples(data, seeded)
+            features = self._trunk(torch.from_numpy(images).to(self._device))
+            size = sum(part[0].nbytes for part in features) * len(wanted)
+            if size > _CACHE_BYTES:
+                raise InputError(
+                    f"cached_features is {variants}: that takes {size / 1e9:.1f} GB of memory, "
+                    f"{_CACHE_BYTES / 1e9:.0f} GB are allowed"
+                )
+            found.append([part.cpu().numpy() for part in features])
+            poses.append(some)
+        network.train(was_training)
+        joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        by_row = tuple(part.reshape(len(data), variants, *part.shape[1:]) for part in joined)
+        return FeatureCache(by_row, Poses.concatenate(poses))
 
     def _measured(self, data: TrainingSet) -> Iterator[Tensor]:
         chosen = np.unique(np.linspace(0, len(data) - 1, _MEASURED).astype(int))

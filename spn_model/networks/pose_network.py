@@ -11,7 +11,7 @@ from spn_model.loss import LearnedWeighting
 from spn_model.networks.regressor import Estimate, Regressor
 from spn_model.targets import PoseTargets
 
-_LOG_STD = (-9.0, 4.0)  # bounds: from 0.01 % to 55 times the training poses' spread, and radians
+_LOG_STD = 7.0  # bound: from 0.1 % to 1000 times the training poses' spread, and radians
 
 
 class PoseOutputs(NamedTuple):
@@ -53,7 +53,9 @@ class PoseNetwork(nn.Module):
         descriptor = self.regressor.describe(features)
         main = self.regressor.x(descriptor), self.regressor.q(descriptor)
         scale = self.targets.scale.to(descriptor.dtype)
-        log_std = self.uncertainty(descriptor.detach()).clamp(*_LOG_STD)
+        # Of unit length: descriptors have hundreds of large numbers, by which a step would go astray.
+        answer = self.uncertainty(nn.functional.normalize(descriptor.detach(), dim=1))
+        log_std = _LOG_STD * (answer / _LOG_STD).tanh()
         larger = 0.5 * self.covariance_scale.log().expand(6)
         spread = torch.cat([scale.log().expand(3), larger.new_zeros(3)])
         estimates = main, *self.regressor.auxiliary(features)
