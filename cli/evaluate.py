@@ -76,7 +76,7 @@ def run(
 ) -> None:
     from cli import page, show_networks
     from spn_data import area as names_of
-    from spn_data.errors import StageError
+    from spn_data.errors import InputError, StageError
     from spn_data.record import content_fingerprint
     from spn_model import machine
     from spn_model.checkpoint import load
@@ -100,6 +100,8 @@ def run(
         dropout_samples=dropout_samples or 0,
         seed=seed,
     )
+    if dataset is None:
+        area.check_fresh(names_of.SPLIT)
     path = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
     runs = area.root / names_of.RUNS
     with machine.prepared(chosen):
@@ -123,8 +125,11 @@ def run(
         parts.append((runs / names_of.COMPARED, found, facts))
     unit = "m" if found.units == "m" else "model units"
     for folder, part, of in parts:
-        log = folder / names_of.LOG
-        course = {"training": training_figure(read_log(log), unit=unit)} if log.exists() else {}
+        log, course = folder / names_of.LOG, {}
+        try:
+            course = {"training": training_figure(read_log(log), unit=unit)} if log.exists() else {}
+        except InputError as error:
+            console.note(f"the course of the training is not drawn: {error}")
         folder.mkdir(parents=True, exist_ok=True)
         write_comparison(
             part,

@@ -8,7 +8,20 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from cli import console, show_labels
-from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, STAGES, Area
+from spn_data.area import (
+    CHECKPOINT,
+    COMPARED,
+    DENSE,
+    EVALUATION,
+    FRAMES,
+    GEO,
+    METRICS,
+    MODEL,
+    RUNS,
+    STAGES,
+    STATE,
+    Area,
+)
 from spn_data.errors import StageError
 from spn_data.pipeline.frames import Plan
 from spn_data.record import StageRecord
@@ -168,6 +181,18 @@ def georegistration(record: StageRecord) -> None:
     show_labels.notes(record)
 
 
+def _run(area: Area, name: str) -> tuple[str, str, str, str]:
+    """A row of a trained network."""
+    folder = area.root / RUNS / name
+    judged = (folder / METRICS).is_file()
+    if name == COMPARED:
+        return f"{RUNS}/{name}", "complete" if judged else "missing", "networks side by side", ""
+    if (folder / STATE).is_file() or not (folder / CHECKPOINT).is_file():
+        return f"{RUNS}/{name}", "unfinished: the same command goes on", "", ""
+    holds = "evaluated" if judged else f"not evaluated: spn-model evaluate --run {name}"
+    return f"{RUNS}/{name}", "complete", holds, ""
+
+
 def status(area: Area) -> None:
     """Every stage: made when, of what, stale or not. Raises StageError where no stage was begun."""
     if not any(area.has(stage) or area.partial(stage).exists() for stage in STAGES):
@@ -190,6 +215,7 @@ def status(area: Area) -> None:
         if area.partial(stage).exists():
             state += "; making it anew is unfinished"
         rows.append((stage, state, _summary(record), record.finished))
+    rows += [_run(area, name) for name in area.sequences(RUNS)]
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
     if area.has_unfinished_addition():
         console.note("an addition is unfinished: the same command with --add goes on.")

@@ -85,7 +85,7 @@ def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
                 420.0,
                 80.0,
                 (0.0, edge + 1.5 * steps[column]),
-                (0.0, max(1.0, float(bars.max()) * 1.05)),
+                (0.0, max(1.0, float(bars.max()) * 1.3)),  # room for words
             )
             label = f"position error ({unit})" if column == 0 else "rotation error (deg)"
             parts.append(panel.axes(label, "frames", one.method))

@@ -21,6 +21,7 @@ from spn_data.labels import Labels, sigmas
 from spn_data.pipeline import coverage as coverage_stage
 from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
+from spn_data.pipeline.runs import read_runs
 from spn_data.pose import Poses
 from spn_data.record import read_json, versions
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
@@ -94,6 +95,7 @@ def report_data(area: Area) -> ReportData:
     groups = dict(zip(split.names.tolist(), split.group.tolist(), strict=True)) if split else {}
     candidates = read_frames(area.folder(FRAMES) / "frames.csv")
     frames = frame_table(candidates, labelled, residuals, _strata(area), groups)
+    runs, broken_runs = read_runs(area)
     return ReportData(
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
@@ -115,6 +117,8 @@ def report_data(area: Area) -> ReportData:
         evaluation_records={
             name: area.record(f"{EVALUATION}/{name}") for name in fresh.sequences(EVALUATION)
         },
+        runs=runs,
+        broken_runs=broken_runs,
     )
 
 

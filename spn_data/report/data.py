@@ -158,6 +158,70 @@ class CoverageFacts:
     stale: str | None = None
 
 
+@dataclass(frozen=True)
+class MethodErrors:
+    """What a network, or what stands beside it, is worth on one group; None is unknown, or no number.
+
+    position, rotation_deg : median, mean and p95; within : (limit, degrees, share); signed : (axis, median,
+    estimated minus true); ratio : of the stated covariances, 1 is right.
+    """
+
+    frames: int
+    located: int
+    position: tuple[float | None, ...]
+    rotation_deg: tuple[float | None, ...]
+    within: tuple[tuple[float, float, float], ...]
+    signed: tuple[tuple[str, float | None], ...]
+    ratio: float | None
+
+
+@dataclass(frozen=True)
+class NetworkFacts:
+    """A trained network. parameters, size_bytes, images, minutes (of training), ms_an_image : None where
+    nothing tells; checkpoint : fingerprint of what was judged."""
+
+    kind: str
+    checkpoint: str
+    parameters: int | None
+    size_bytes: int | None
+    images: int | None
+    minutes: float | None
+    ms_an_image: float | None
+
+
+@dataclass(frozen=True)
+class Figure:
+    """caption : in words; width_px : that it was drawn for; svg : the file's bytes."""
+
+    caption: str
+    width_px: int
+    svg: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFacts:
+    """What `spn-model evaluate` left in one folder of runs/.
+
+    networks : by name; is_outdated : one was trained on since. groups : role and methods, by name of the
+    group; dataset : fingerprint of what they were judged on; is_current : that is the area's data set of now.
+    published : rows (network, group, position, rotation in degrees) of the paper. left_out : figures not
+    shown.
+    """
+
+    name: str
+    units: str
+    dataset: str
+    is_current: bool
+    is_outdated: bool
+    networks: dict[str, NetworkFacts]
+    groups: dict[str, tuple[str, dict[str, MethodErrors]]]
+    retrieval: dict[str, str]
+    published: tuple[tuple[str, str, float, float], ...]
+    notes: tuple[str, ...]
+    figures: tuple[Figure, ...]
+    left_out: int = 0
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReportData:
     """An area at one moment.
@@ -166,7 +230,7 @@ class ReportData:
     known of metres, north and up. stages : those that stand, in the order of work.
     fov_tan : by camera, tangents of half the horizontal and vertical field of view.
     evaluation_records : of the stages of evaluation sequences, by name. coverage : of these; plan : of
-    planned waypoints.
+    planned waypoints. runs : networks that were judged; broken_runs : why others cannot be shown.
     """
 
     title: str
@@ -186,6 +250,8 @@ class ReportData:
     split: Split | None = None
     audit: tuple[audit.Finding, ...] | None = None
     evaluation_records: dict[str, StageRecord] = field(default_factory=dict)
+    runs: tuple[RunFacts, ...] = ()
+    broken_runs: tuple[str, ...] = ()
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from string import Template
 from spn_data.report import sections
 from spn_data.report.data import ReportData
 from spn_data.report.figures import key_figures
+from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
 from spn_data.report.scene import pack_scene
 from spn_data.report.thinning import thin_frames
@@ -31,6 +32,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),
+        "networks": networks(data),
         "table": sections.table(frames),
         "stages": sections.stages(data),
         "style": _asset("style.css"),

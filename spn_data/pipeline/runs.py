@@ -1,0 +1,201 @@
+"""What the report shows of trained networks: metrics.json and figures of each run, read as hostile files."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from spn_data.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
+from spn_data.errors import FormatError
+from spn_data.record import content_fingerprint
+from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
+from spn_data.sources import safe_name
+
+_VERSION = 1  # of metrics.json
+_MAX_BYTES = 20_000_000
+_MAX_FIGURE_BYTES = 3_000_000
+_MAX_FIGURES_BYTES = 12_000_000  # of all runs together
+_MAX_RUNS, _MAX_FIGURES = 50, 60
+_MAX_TEXT = 200
+_KINDS = ("trajectories", "histograms", "distance", "calibration")
+_SVG = re.compile(rb'<svg [^<>]*?viewBox="0 0 (\d{1,5}) \d{1,5}"')
+
+
+def read_runs(area: Area) -> tuple[tuple[RunFacts, ...], tuple[str, ...]]:
+    """Runs with metrics.json, compared ones first, then by name; and why others cannot be shown."""
+    folder = area.root / RUNS
+    names = [n for n in area.sequences(RUNS) if (folder / n / METRICS).is_file()]
+    names.sort(key=lambda name: (name != COMPARED, name))
+    dataset = area.folder(SPLIT) / "dataset.h5"
+    current = content_fingerprint(dataset) if dataset.is_file() else ""
+    found: list[RunFacts] = []
+    broken: list[str] = []
+    budget = _MAX_FIGURES_BYTES
+    for name in names[:_MAX_RUNS]:
+        try:
+            run = _read(folder / name, current, budget)
+        except FormatError as error:
+            broken.append(str(error))
+            continue
+        budget -= sum(len(figure.svg) for figure in run.figures)
+        found.append(run)
+    if len(names) > _MAX_RUNS:
+        broken.append(f"{len(names) - _MAX_RUNS} more runs are not shown.")
+    return tuple(found), tuple(broken)
+
+
+def _read(folder: Path, current: str, budget: int) -> RunFacts:
+    path = folder / METRICS
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"larger than {_MAX_BYTES // 1_000_000} MB")
+        table = json.loads(path.read_text(encoding="utf-8"))
+        if table["version"] != _VERSION:
+            raise ValueError(f"of format {table['version']!r}, this program reads {_VERSION}")
+        facts = table["facts"]
+        figures, left_out = _figures(folder / FIGURES, budget)
+        dataset = _text(facts["dataset"])
+        networks = {
+            _text(name): _network(of, facts["costs"].get(name, {}))
+            for name, of in facts["runs"].items()
+        }
+        return RunFacts(
+            name=folder.name,
+            units=_text(table["units"]),
+            dataset=dataset,
+            is_current=dataset == current,
+            is_outdated=any(
+                _checkpoint(folder.parent, name) != network.checkpoint
+                for name, network in networks.items()
+            ),
+            networks=networks,
+            groups={
+                _text(name): (
+                    _text(facts["roles"][name]),
+                    {_text(method): _errors(value) for method, value in methods.items()},
+                )
+                for name, methods in table["groups"].items()
+            },
+            retrieval={_text(k): _text(v) for k, v in table["retrieval"].items()},
+            published=tuple(
+                (
+                    _text(row["network"]),
+                    _text(row["sequence"]),
+                    _known(row["position_m"]),
+                    _known(row["rotation_deg"]),
+                )
+                for row in table["paper"]["table_1"][:100]
+            ),
+            notes=tuple(_text(note) for note in facts["notes"][:50]),
+            figures=figures,
+            left_out=left_out,
+        )
+    except (
+        *(OSError, ValueError, KeyError, TypeError, AttributeError),
+        *(OverflowError, RecursionError),
+    ) as error:
+        raise FormatError(
+            f"{path}: cannot be shown ({str(error)[:_MAX_TEXT]!r}); run spn-model evaluate again"
+        ) from error
+
+
+def _checkpoint(runs: Path, name: str) -> str:
+    """Fingerprint of a run's network as it is now; empty without one."""
+    if safe_name(name) != name:
+        raise ValueError("a name that no run has")
+    path = runs / name / CHECKPOINT
+    return content_fingerprint(path) if path.is_file() else ""
+
+
+def _network(of: Mapping[str, Any], cost: Mapping[str, Any]) -> NetworkFacts:
+    training = of["training"]
+    seconds = _number(training.get("train_s"))
+    return NetworkFacts(
+        kind=_text(of["kind"]),
+        checkpoint=_text(of["checkpoint"]),
+        parameters=_count(of["parameters"]),
+        size_bytes=_count(of["bytes"]),
+        images=_count(training.get("images_shown")),
+        minutes=None if seconds is None else seconds / 60,
+        ms_an_image=_number(cost.get("ms_an_image")),
+    )
+
+
+def _errors(value: Mapping[str, Any]) -> MethodErrors:
+    kinds = ("median", "mean", "p95")
+    calibration = value["calibration"]
+    return MethodErrors(
+        frames=int(_known(value["frames"])),
+        located=int(_known(value["located"])),
+        position=tuple(_number(value["position"][kind]) for kind in kinds),
+        rotation_deg=tuple(_number(value["rotation_deg"][kind]) for kind in kinds),
+        within=tuple(
+            (_known(part["limit"]), _known(part["limit_deg"]), _known(part["share"]))
+            for part in value["within"][:10]
+        ),
+        signed=tuple(
+            (_text(part["axis"]), _number(part["signed_median"])) for part in value["axes"][:3]
+        ),
+        ratio=None if calibration is None else _number(calibration["ratio"]),
+    )
+
+
+def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:
+    """The figures of a folder, and how many are left out: too large, or nothing of ours."""
+    if not folder.is_dir() or folder.is_symlink():
+        return (), 0
+    found: list[Figure] = []
+    left_out = 0
+    for path in sorted(folder.glob("*.svg"), key=_place):
+        is_ours = path.is_file() and not path.is_symlink()
+        size = path.stat().st_size if is_ours else 0
+        if not is_ours or size > min(_MAX_FIGURE_BYTES, budget) or len(found) >= _MAX_FIGURES:
+            left_out += 1
+            continue
+        content = path.read_bytes()
+        head = _SVG.match(content)
+        if head is None:
+            left_out += 1
+            continue
+        budget -= size
+        group, _, what = path.stem.rpartition("-")
+        caption = f"{group}: {what}" if group else what
+        found.append(Figure(_text(caption), int(head[1]), content))
+    return tuple(found), left_out
+
+
+def _place(path: Path) -> tuple[bool, str, int, str]:
+    """The course of a training first, then group by group, in the order of reading."""
+    group, _, what = path.stem.rpartition("-")
+    return path.stem != "training", group, _KINDS.index(what) if what in _KINDS else 9, path.stem
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} where text belongs")
+    return value[:_MAX_TEXT]
+
+
+def _number(value: Any) -> float | None:
+    """None for what is unknown."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{type(value).__name__} where a number belongs")
+    return float(value) if math.isfinite(value) else None
+
+
+def _known(value: Any) -> float:
+    found = _number(value)
+    if found is None:
+        raise ValueError("an unknown number where one is needed")
+    return found
+
+
+def _count(value: Any) -> int | None:
+    found = _number(value)
+    return None if found is None else int(found)
