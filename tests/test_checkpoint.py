@@ -71,7 +71,7 @@ def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
     path, member, view = saved
     found = load(path)
     assert isinstance(found, Checkpoint)
-    assert found.member.options == {"width": 5, "dropout": 0.25}
+    assert found.member.options == {"width": 5, "dropout": 0.25, "normalised": True}
     assert found.facts == {"images": 96, "error": None, "table": [1.5, None]}
     assert found.view.to_json() == view.to_json()
     assert found.view.camera is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -191,6 +192,59 @@ def test_a_training_killed_with_signal_9_goes_on_to_the_same_end(field, unbroken
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
     steps = [int(row["step"]) for row in log(tmp_path) if row["event"] == "validation"]
     assert steps == [int(r["step"]) for r in log(unbroken) if r["event"] == "validation"]
+
+
+ALIKE = replace(
+    RECIPE,
+    options={"dropout": 0.0, "normalised": False},
+    stages=(Stage(name="all", images=240, batch=4, rate=0.02, clip=1.0),),
+)
+SHARED = """
+import sys
+from tests.test_train import *
+register_tiny()
+torch.set_num_threads(1)
+follower = Follower()
+train(ALIKE, files(Path(sys.argv[1])), Data(Path(sys.argv[2])), ONE_THREAD, follower)
+print(len(follower.rows))
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_network_of_one_with_batches_twice_as_large(field, tmp_path):
+    """Gradients are averaged over gloo, each process sees its half of a batch, the first one writes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    world = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    command = [sys.executable, "-c", SHARED, str(tmp_path / "two"), str(field)]
+    started = [
+        subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **world, "RANK": rank, "LOCAL_RANK": rank, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    try:
+        said = [process.communicate(timeout=100)[0] for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    assert [process.returncode for process in started] == [0, 0]
+    assert int(said[0]) > 0
+    assert int(said[1]) == 0
+    whole = replace(ALIKE, stages=(replace(ALIKE.stages[0], batch=8),))
+    train(whole, files(tmp_path / "one"), Data(field), ONE_THREAD, Follower())
+    two, one = (load(tmp_path / name / "last.safetensors") for name in ("two", "one"))
+    assert two.facts["images_shown"] == one.facts["images_shown"] == 240
+    assert two.facts["processes"] == 2
+    state, other = two.member.network.state_dict(), one.member.network.state_dict()
+    for name in state:
+        if name != "variance":  # of a few validation frames: a ratio of small errors
+            assert torch.allclose(state[name], other[name], rtol=1e-4, atol=1e-5), name
 
 
 def test_the_log_tells_training_and_validation_apart(unbroken):

@@ -88,10 +88,10 @@ class TinyNet(nn.Module):
     scale: Tensor
     variance: Tensor
 
-    def __init__(self, width: int, dropout: float):
+    def __init__(self, width: int, dropout: float, normalised: bool):
         super().__init__()
         self.convolution = nn.Conv2d(3, width, 4, stride=4)
-        self.normalisation = nn.BatchNorm2d(width)
+        self.normalisation = nn.BatchNorm2d(width) if normalised else nn.Identity()
         self.dropout = nn.Dropout(dropout)
         self.out = nn.Linear(width, 7)
         self.register_buffer("center", torch.zeros(3))
@@ -109,20 +109,22 @@ class TinyMember(Member):
     kind: ClassVar[str] = "tiny"
     weights_name = ""
 
-    def __init__(self, width: int, dropout: float):
-        self._options = {"width": width, "dropout": dropout}
-        self.network: TinyNet = TinyNet(width, dropout)
+    def __init__(self, width: int, dropout: float, normalised: bool):
+        self._options = {"width": width, "dropout": dropout, "normalised": normalised}
+        self.network: TinyNet = TinyNet(width, dropout, normalised)
         self._brightness = 0.0
         self._sick_at = 2.0
 
     @classmethod
     def make(cls, options: Mapping[str, Any], seed: int) -> Self:
-        unknown = [name for name in options if name not in ("width", "dropout")]
-        if unknown:
-            raise InputError(f"kind tiny has no option {unknown[0]!r}")
+        chosen = {"width": 8, "dropout": 0.1, "normalised": True}
+        for name, value in options.items():
+            if name not in chosen:
+                raise InputError(f"kind tiny has no option {name!r}")
+            chosen[name] = value
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return cls(int(options.get("width", 8)), float(options.get("dropout", 0.1)))
+            return cls(**chosen)
 
     @property
     def options(self) -> dict[str, Any]:
