@@ -18,7 +18,6 @@ from spn_model.members.member import Member
 from spn_model.members.regression import RegressionMember
 from spn_model.members.regression_examples import input_size, resized
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
-from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX, grid_size
 from spn_model.onboard.bundle import CellDecoding, Decoding, PoseDecoding
 
 _OPSET = 17  # read by onnxruntime from 1.12 on
@@ -50,10 +49,9 @@ def deployment(member: Member, size: tuple[int, int]) -> Deployment:
     Raises InputError for a kind of network that has no graph.
     """
     if isinstance(member, SceneCoordinatesMember):
-        grid_size(*size)
         cells = CellDecoding(
-            first_px=float(FIRST_CELL_PX),
-            stride_px=float(STRIDE_PX),
+            first_px=member.network.first_cell_px,
+            stride_px=member.network.stride_px,
             options=member.decoding_options,
         )
         return Deployment(member.network, cells, size, ("out.",))

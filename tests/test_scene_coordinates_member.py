@@ -24,7 +24,9 @@ STILL = {
     "roll_deg": 0,
     "zoom_min": 1,
     "zoom_max": 1,
-    "coarse_share": 0,
+    "size_min": 1,
+    "size_max": 1,
+    "ramp_share": 0,
     "look": False,
 }
 VIEWS = {"views_share": 0.5, "views_rise": 0.3}
@@ -50,8 +52,10 @@ def data(hall: Path) -> TrainingSet:
         return TrainingSet(dataset.groups["train"])
 
 
-def fitted(data: TrainingSet, stage: dict[str, object]) -> SceneCoordinatesMember:
-    member = SceneCoordinatesMember.make({}, seed=0)
+def fitted(
+    data: TrainingSet, stage: dict[str, object], *, shrink: int = 1
+) -> SceneCoordinatesMember:
+    member = SceneCoordinatesMember.make({"shrink": shrink}, seed=0)
     member.load_pretrained(member.weights_name)
     member.fit(data)
     member.begin_stage(stage, data)
@@ -72,22 +76,32 @@ def test_a_batch_depends_on_its_arguments_alone(data):
     )
 
 
-def test_small_images_are_more_of_them(data):
-    """A stage begins at about half the resolution, with twice the images; at full zoom there are B."""
+def test_images_follow_the_zoom(data):
+    """Turns and zooms grow at a stage's beginning; small images are more of them, at most twice as many."""
     rows = np.arange(6)
-    coarse = fitted(data, {}).batch(data, rows, np.random.default_rng(0), 0.1)
-    assert len(coarse["images"]) == 12
-    assert 0.4 * 320 < coarse["images"].shape[2] < 0.65 * 320
+    small = fitted(data, STILL | {"size_min": 0.5, "size_max": 0.5})
+    batch = small.batch(data, rows, np.random.default_rng(0), 0.5)
+    assert batch["images"].shape == (12, 90, 160, 3)
     full = fitted(data, STILL).batch(data, rows, np.random.default_rng(0), 0.1)
     assert full["images"].shape == (6, 180, 320, 3)
     assert np.array_equal(full["images"][2], data.image(2))
+    free = {"zoom_min": 0.5, "zoom_max": 2.0, "size_min": 0.1, "size_max": 9.0, "ramp_share": 0.5}
+    zooming = fitted(data, free)
+    widths = {
+        progress: [
+            zooming.batch(data, rows[:1], np.random.default_rng(k), progress)["images"].shape[2]
+            for k in range(12)
+        ]
+        for progress in (0.0, 0.9)
+    }
+    assert np.ptp(np.log(widths[0.0])) < 0.5 * np.ptp(np.log(widths[0.9]))
 
 
 @pytest.mark.parametrize(
     ("stage", "known_share"),
     [
         ({}, 0.25),
-        ({"views_share": 1.0, "views_rise": 0.3}, 0.3),
+        ({"views_share": 1.0, "views_rise": 0.3}, 0.2),
         ({"surfaces": False}, 0.15),
     ],
     ids=["surfaces", "views", "points"],
@@ -100,7 +114,8 @@ def test_targets_are_what_the_cells_show(data, stage, known_share):
     """
     zoom = 0.8
     member = fitted(
-        data, {"zoom_min": zoom, "zoom_max": zoom, "coarse_share": 0, "look": False} | stage
+        data,
+        {"zoom_min": zoom, "zoom_max": zoom, "ramp_share": 0, "look": False} | stage,
     )
     rows = np.arange(6)
     batch = member.batch(data, rows, np.random.default_rng(0), 0.5)
@@ -161,6 +176,7 @@ def test_frozen_layers_are_in_no_group(data):
     groups = {group["name"]: group for group in member.parameter_groups()}
     assert groups["pretrained"]["rate"] == 0.1
     assert len(groups["pretrained"]["params"]) == 36
+    assert len(groups["added"]["params"]) == 22
 
 
 def test_published_weights_are_loaded(data):
@@ -179,7 +195,7 @@ def test_published_weights_are_loaded(data):
         ({"tilt": 3}, "'tilt' is not known"),
         ({"tilt_deg": "3"}, "tilt_deg is '3', needs a float"),
         ({"look": 1}, "look is 1, needs a bool"),
-        ({"zoom_min": 2.0, "zoom_max": 1.0}, "zoom_max is 1.0, needs to lie from 2.0 to 4"),
+        ({"zoom_min": 2.0, "zoom_max": 1.0}, "zoom_max is 1.0, needs to lie from 2.0 to 10"),
         ({"freeze_layers": 14}, "freeze_layers is 14"),
         ({"tilt_deg": float("nan")}, "needs a finite number"),
         ({"views_share": 0.5, "surfaces": False}, "needs surfaces"),
@@ -191,9 +207,40 @@ def test_stages_that_make_no_sense_are_refused(data, stage, message):
         SceneCoordinatesMember.make({}).begin_stage(stage, data)
 
 
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
+    """Where each cell shows what the image shows at its stated pixel, the pose is exact."""
+    member = fitted(data, STILL, shrink=shrink)
+    images = torch.zeros(1, 3, 180, 320)
+    rows, columns = member.network(images)[1].shape[2:]
+    first, stride = member.network.first_cell_px, member.network.stride_px
+    # A camera of which each pixel is a cell.
+    near = Camera(
+        "PINHOLE",
+        columns,
+        rows,
+        np.array([230, 230, 160 - first + stride / 2, 90 - first + stride / 2]) / stride,
+    )
+    _, shown = seen_by(data.poses[:1], near)
+    found = member.decode(
+        shown.transpose(2, 0, 1).astype(np.float32), np.full((rows, columns), -5.0), CAMERA.matrix
+    )
+    error_m, error_deg = pose_errors(found.poses, data.poses[:1])
+    assert error_m < 1e-3
+    assert error_deg < 1e-2
+
+
+def test_images_that_are_too_small_once_reduced_are_refused(data):
+    """The message tells the size, and what to do."""
+    member = fitted(data, STILL, shrink=2)
+    with pytest.raises(InputError, match=r"100 x 180, reduced by 2, .* or shrink = 1"):
+        member.estimate(np.zeros((1, 180, 100, 3), np.uint8), CAMERA.matrix[None])
+
+
 def test_options_of_decoding_make_the_member():
     """What `options` gives makes the member anew; an unknown one is refused."""
-    member = SceneCoordinatesMember.make({"cells": 300})
+    member = SceneCoordinatesMember.make({"cells": 300, "shrink": 1})
+    assert SceneCoordinatesMember.make(member.options).network.shrink == 1
     assert SceneCoordinatesMember.make(member.options).decoding == member.decoding
     assert member.decoding.cells == 300
     with pytest.raises(InputError, match="'cell' is not known"):
@@ -254,7 +301,7 @@ def test_the_scale_of_covariances_is_part_of_the_state(data):
     before = member.decode(coordinates, log_scale, CAMERA.matrix)
     member.set_covariance_scale(3.0)
     member.set_covariance_scale(2.0)
-    other = SceneCoordinatesMember.make({})
+    other = SceneCoordinatesMember.make({"shrink": 1})
     other.network.load_state_dict(member.network.state_dict())
     after = other.decode(coordinates, log_scale, CAMERA.matrix)
     assert other.covariance_scale == 6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,10 +18,7 @@ from spn_model.members.member import Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.scene_examples import Examples, StageOptions
 from spn_model.networks.scene_coordinates import (
-    FIRST_CELL_PX,
-    STRIDE_PX,
     SceneCoordinates,
-    grid_size,
     laplace_loss,
 )
 from spn_model.tensors import load_pretrained, read_tensors
@@ -33,10 +30,21 @@ _MEASURED = 16  # training images, spread evenly, by which features are normalis
 _UNSURE = 0.25  # spreads of the scene; a cell of a larger scale does not know where it is
 
 
+@dataclass(frozen=True, kw_only=True)
+class MemberOptions(DecodingOptions):
+    """What makes a member."""
+
+    shrink: int = 2  # factor by which images are reduced: more surroundings, a quarter of the time
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.shrink <= 8:
+            raise InputError(f"shrink is {self.shrink}, needs to lie from 1 to 8")
+
+
 class SceneCoordinatesMember(Member):
     """Learns, for each cell of an image, the point of the map that it shows; PnP makes a pose of them.
 
-    Fixed options, in `make`: those of DecodingOptions. Of a stage: StageOptions.
+    Fixed options, in `make`: `shrink`, and those of DecodingOptions. Of a stage: StageOptions.
     """
 
     kind: ClassVar[str] = "scene-coordinates"
@@ -52,15 +60,18 @@ class SceneCoordinatesMember(Member):
     @classmethod
     def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesMember:
         """With weights drawn by the seed. Raises InputError for an unknown option."""
-        decoding = from_mapping(DecodingOptions, options, f"network {cls.kind}")
+        chosen = from_mapping(MemberOptions, options, f"network {cls.kind}")
+        decoding = DecodingOptions(
+            **{f.name: getattr(chosen, f.name) for f in fields(DecodingOptions)}
+        )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            network = SceneCoordinates()
+            network = SceneCoordinates(chosen.shrink)
         return cls(network.eval(), decoding)
 
     @property
     def options(self) -> dict[str, Any]:
-        return asdict(self.decoding)
+        return {"shrink": self.network.shrink, **asdict(self.decoding)}
 
     @property
     def weights_name(self) -> str:
@@ -78,7 +89,7 @@ class SceneCoordinatesMember(Member):
                 f"the training images see {len(xyz)} map points: a scene-coordinate network learns from "
                 "points; train another network, or make the data set from a model with points"
             )
-        grid_size(*data.size)
+        self._check_size(*data.size)
         self.network.set_scene(torch.from_numpy(xyz.astype(np.float32)))
         chosen = np.unique(np.linspace(0, len(data) - 1, _MEASURED).astype(int))
         images = np.stack([data.image(k) for k in chosen])
@@ -106,7 +117,8 @@ class SceneCoordinatesMember(Member):
         """
         if self._examples is None or self._examples[0] is not data:
             center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
-            self._examples = (data, Examples(data, self._stage, center, spread))
+            made = Examples(data, self._stage, center, spread, self.network.shrink)
+            self._examples = (data, made)
         images, targets, known = self._examples[1].batch(rows, generator, progress)
         return {
             "images": torch.from_numpy(images),
@@ -121,7 +133,7 @@ class SceneCoordinatesMember(Member):
         """
         images, known = batch["images"], batch["known"]
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.bfloat16):
-            coordinates, log_scale = self.network(_normalised(images))
+            coordinates, log_scale = self.network.cells(_normalised(images))
         if not known.any():
             return (coordinates.sum() + log_scale.sum()) * 0, {}
         loss = laplace_loss(coordinates, log_scale, batch["targets"], known)
@@ -156,15 +168,23 @@ class SceneCoordinatesMember(Member):
             coordinates,
             log_scale,
             matrix,
-            first_px=FIRST_CELL_PX,
-            stride_px=STRIDE_PX,
+            first_px=self.network.first_cell_px,
+            stride_px=self.network.stride_px,
             options=self.decoding_options,
         )
+
+    def _check_size(self, width: int, height: int) -> None:
+        shrink, smallest = self.network.shrink, SceneCoordinates.min_side_px
+        if min(width, height) // shrink < smallest:
+            raise InputError(
+                f"images of {width} x {height}, reduced by {shrink}, are smaller than the {smallest} pixels "
+                "that the network needs; give it larger ones, or shrink = 1"
+            )
 
     @torch.inference_mode()
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
         """As `Member.estimate`; in float32, as the exported network computes."""
-        grid_size(images.shape[2], images.shape[1])
+        self._check_size(images.shape[2], images.shape[1])
         device = self.network.center.device
         poses = Poses.unknown(len(images))
         covariance = np.full((len(images), 6, 6), np.nan)

@@ -21,8 +21,7 @@ from spn_model.virtual_views import ViewOptions, random_place, view_from
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
 _VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 30 ms
-_COARSE_ZOOM = (0.42, 0.6)  # of a stage's beginning
-_WARP_AT_START = 0.3  # of tilt and roll there
+_RAMP_FROM = 0.3  # of turns, and of zooms in their logarithm, at a stage's beginning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +33,11 @@ class StageOptions:
     surfaces: bool = True  # learn from surfaces between map points; else from the points alone
     tilt_deg: float = 20.0  # largest turn about each of the image's axes
     roll_deg: float = 20.0  # and about the optical axis
-    zoom_min: float = 0.45  # focal length against the real one
-    zoom_max: float = 1.35
-    coarse_share: float = 0.35  # first share of the stage, at about half the resolution
+    zoom_min: float = 0.65  # focal length against that of the images as the network is given them
+    zoom_max: float = 1.6
+    size_min: float = 0.9  # sides of the images that it is shown, against the same
+    size_max: float = 1.2  # between these they follow the focal length
+    ramp_share: float = 0.2  # first share of the stage, over which turns and zooms grow to these
     look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
     views_share: float = 0.0  # share of images rendered from another place
     views_per_image: int = (
@@ -51,9 +52,11 @@ class StageOptions:
             ("features_rate", 0, 10),
             ("tilt_deg", 0, 60),
             ("roll_deg", 0, 180),
-            ("zoom_min", 0.1, 4),
-            ("zoom_max", self.zoom_min, 4),
-            ("coarse_share", 0, 1),
+            ("zoom_min", 0.1, 10),
+            ("zoom_max", self.zoom_min, 10),
+            ("size_min", 0.1, 10),
+            ("size_max", self.size_min, 10),
+            ("ramp_share", 0, 1),
             ("views_share", 0, 1),
             ("views_per_image", 1, 1000),
             ("views_rise", 0, 10),
@@ -69,11 +72,19 @@ class StageOptions:
 class Examples:
     """Examples of one data set, as one stage varies them; surfaces and views are kept once they are made.
 
-    center (3,), spread : of the scene. What is kept is made of the data alone, whichever row comes first.
+    center (3,), spread : of the scene; shrink : factor by which the network's images are smaller than the
+    data's. What is kept is made of the data alone, whichever row comes first.
     """
 
-    def __init__(self, data: TrainingSet, options: StageOptions, center: np.ndarray, spread: float):
-        self._data, self._options = data, options
+    def __init__(
+        self,
+        data: TrainingSet,
+        options: StageOptions,
+        center: np.ndarray,
+        spread: float,
+        shrink: int,
+    ):
+        self._data, self._options, self._shrink = data, options, shrink
         self._center, self._spread = center, spread
         level = _LEVEL * spread if data.up_is_known else 0.0
         self._surface_options = SurfaceOptions(level_m=level)
@@ -96,16 +107,17 @@ class Examples:
 
         Images that the zoom makes smaller are up to twice as many, of further rows.
         """
-        data = self._data
+        data, options = self._data, self._options
         zoom, warp = self._variation(generator, progress)
-        scale = min(1.0, zoom * 1.05)
+        scale = min(max(zoom * 1.05, options.size_min), options.size_max) / self._shrink
         width, height = (
-            max(round(side * scale), min(side, SceneCoordinates.min_side_px)) for side in data.size
+            max(round(side * scale), SceneCoordinates.min_side_px) for side in data.size
         )
-        count = round(len(rows) * min(2.0, data.size[0] * data.size[1] / (width * height)))
-        more = generator.integers(len(data), size=max(0, count - len(rows)))
+        whole = data.size[0] * data.size[1] / self._shrink**2
+        count = max(len(rows), round(len(rows) * min(2.0, whole / (width * height))))
+        more = generator.integers(len(data), size=count - len(rows))
         made = [
-            self._example(int(row), generator, warp, zoom, (width, height))
+            self._example(int(row), generator, warp, zoom / self._shrink, (width, height))
             for row in np.concatenate([rows, more])
         ]
         images, targets, known = (np.stack(part) for part in zip(*made, strict=True))
@@ -115,12 +127,12 @@ class Examples:
         self, generator: np.random.Generator, progress: float
     ) -> tuple[float, WarpOptions]:
         options = self._options
-        low, high, ramp = options.zoom_min, options.zoom_max, 1.0
-        if progress < options.coarse_share:
-            low, high = _COARSE_ZOOM
-            ramp = _WARP_AT_START + (1 - _WARP_AT_START) * progress / options.coarse_share
+        ramp = 1.0
+        if progress < options.ramp_share:
+            ramp = _RAMP_FROM + (1 - _RAMP_FROM) * progress / options.ramp_share
+        low, high = np.log([options.zoom_min, options.zoom_max]) * ramp
         warp = WarpOptions(tilt_deg=options.tilt_deg * ramp, roll_deg=options.roll_deg * ramp)
-        return float(np.exp(generator.uniform(np.log(low), np.log(high)))), warp
+        return float(np.exp(generator.uniform(low, high))), warp
 
     def _example(
         self,

@@ -47,16 +47,37 @@ class Fire(nn.Module):
         return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], 1), inplace=True)
 
 
+class Context(nn.Module):
+    """What lies around each cell, at a distance: added to it. 53 thousand parameters."""
+
+    def __init__(self, channels: int, inner: int, dilation: int):
+        super().__init__()
+        self.reduce = nn.Conv2d(channels, inner, 1)
+        self.around = nn.Conv2d(inner, inner, 3, padding=dilation, dilation=dilation)
+        self.expand = nn.Conv2d(inner, channels, 1)
+        for layer in (self.reduce, self.around):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+        # It begins as nothing.
+        nn.init.zeros_(self.expand.weight)
+        nn.init.zeros_(self.expand.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        near = functional.relu(self.reduce(x), inplace=True)
+        return x + self.expand(functional.relu(self.around(near), inplace=True))
+
+
 class SceneCoordinates(nn.Module):
     """Images (B, 3, H, W) -> coordinates (B, 3, h, w) in the scene's frame, log scale (B, 1, h, w).
 
-    Images are RGB, normalised as ImageNet's. The log scale is that of an isotropic Laplace distribution in
-    the scene's unit: the smaller, the surer. Cell (0, 0) has its centre at pixel (7.5, 7.5) in COLMAP's
+    Images are RGB, normalised as ImageNet's; they are first reduced by `shrink`, then given to `cells`, which
+    training does directly. The log scale is that of an isotropic Laplace distribution in the scene's unit:
+    the smaller, the surer. Of a reduced image, cell (0, 0) has its centre at pixel (7.5, 7.5) in COLMAP's
     convention, its neighbours 8 pixels on; `grid_size` gives h and w.
 
     The features are SqueezeNet 1.1's as published, without normalisation: the head needs no descriptor of
-    the whole image, and batches of one scene have statistics of their own. Weights at stride 16 see about
-    200 pixels around a cell: facades repeat, and only their surroundings tell windows apart.
+    the whole image, and batches of one scene have statistics of their own. Weights at stride 16 see all
+    of an image of 480 x 270: facades repeat, and only what lies around them tells windows apart.
 
     center (3,), spread () : of the training images' points; outputs are centred and scaled by them.
     fine_mean (256,), coarse_mean (512,), fine_std, coarse_std () : of the published features on training
@@ -67,7 +88,7 @@ class SceneCoordinates(nn.Module):
     min_side_px: ClassVar[int] = 63
     weights_name: ClassVar[str] = "squeezenet1_1-features"
     added: ClassVar[tuple[str, ...]] = (
-        *("coarse", "context", "fine", "merge", "out", "center", "spread"),
+        *("coarse", "context", "wide", "fine", "merge", "out", "center", "spread"),
         *("fine_mean", "fine_std", "coarse_mean", "coarse_std"),
         "covariance_scale",
     )
@@ -80,8 +101,9 @@ class SceneCoordinates(nn.Module):
     coarse_std: Tensor
     covariance_scale: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, shrink: int = 1):
         super().__init__()
+        self.shrink = shrink
         self.features = nn.Sequential(
             nn.Conv2d(3, 64, 3, stride=2),  # (B, 64, H/2, W/2)
             nn.ReLU(inplace=True),
@@ -99,6 +121,7 @@ class SceneCoordinates(nn.Module):
         )
         self.coarse = nn.Conv2d(512, 128, 1)
         self.context = nn.Conv2d(128, 128, 3, padding=2, dilation=2)
+        self.wide = nn.Sequential(Context(128, 64, 4), Context(128, 64, 8))
         self.fine = nn.Conv2d(256, 128, 1)
         self.merge = nn.Conv2d(128, 128, 3, padding=1)
         self.out = nn.Conv2d(128, 4, 1)
@@ -128,7 +151,7 @@ class SceneCoordinates(nn.Module):
 
         Without it the first steps of the training blow up: a published feature may be 800 large.
         """
-        fine = self.features[:8](images)
+        fine = self.features[:8](self.reduced(images))
         for name, x in (("fine", fine), ("coarse", self.features[8:](fine))):
             mean = x.mean(dim=(0, 2, 3))
             # One scale for all channels: channels that rarely answer would be blown up by their own.
@@ -136,11 +159,29 @@ class SceneCoordinates(nn.Module):
             getattr(self, f"{name}_mean").copy_(mean)
             getattr(self, f"{name}_std").copy_(spread)
 
+    @property
+    def first_cell_px(self) -> float:
+        """Where the centre of the first cell lies in an image, along both axes."""
+        return FIRST_CELL_PX * self.shrink
+
+    @property
+    def stride_px(self) -> float:
+        """From one cell to the next, in the image."""
+        return float(STRIDE_PX * self.shrink)
+
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        return self.cells(self.reduced(images))
+
+    def reduced(self, images: Tensor) -> Tensor:
+        """What `cells` takes: each pixel the mean of shrink x shrink."""
+        return functional.avg_pool2d(images, self.shrink) if self.shrink > 1 else images
+
+    def cells(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """As `forward`, of images that are reduced already."""
         fine = self.features[:8](images)
         coarse = self._normalised("coarse", self.features[8:](fine))
         coarse = functional.relu(self.coarse(coarse), inplace=True)
-        coarse = coarse + functional.relu(self.context(coarse))
+        coarse = self.wide(coarse + functional.relu(self.context(coarse)))
         # Cell n at stride 16 lies on cell 2n + 1 at stride 8, and half-way cells between.
         coarse = functional.pad(coarse, (1, 1, 1, 1), mode="replicate")
         size = [2 * side - 1 for side in coarse.shape[-2:]]
