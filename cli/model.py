@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import click
 
+from cli.benchmark_model import benchmark
 from cli.console import Group
 from cli.evaluate import evaluate
+from cli.export_model import export
 from cli.predict import predict
 from cli.train import train
 from cli.weights import weights
@@ -21,4 +23,6 @@ def main(verbose: bool) -> None:
 main.add_command(train)
 main.add_command(evaluate)
 main.add_command(predict)
+main.add_command(export)
+main.add_command(benchmark)
 main.add_command(weights)

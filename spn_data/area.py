@@ -35,7 +35,7 @@ EVALUATION, DENSE = "4-eval", "4-dense"  # folders with one stage a sequence
 _GROUPS = (EVALUATION, DENSE)
 RUNS = "runs"  # trained networks, a folder each; made by spn-model
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
-ERRORS, FIGURES = "errors.csv", "figures"
+ERRORS, FIGURES, BUNDLE = "errors.csv", "figures", "bundle"
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
 COMPARED = "compared"  # beside them: several runs evaluated together
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_to_json
-from spn_data.errors import InputError, StageError
+from spn_data.errors import InputError, SpnError, StageError
 from spn_data.files import write_whole
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
@@ -42,6 +42,7 @@ from spn_model.onboard.bundle import (
     VERSION,
     read_bundle,
     sha256_of,
+    verified,
 )
 from spn_model.quantization import quantize
 from spn_model.validation import spread_rows
@@ -133,6 +134,20 @@ def export(
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     return made
+
+
+def is_made_of(folder: Path, facts: Mapping[str, Any], options: ExportOptions) -> bool:
+    """Whether a whole bundle stands there that another export would make again."""
+    try:
+        bundle = read_bundle(folder)
+        document = bundle.document
+        measured, run = document["measured"], document["run"]
+        same = all(run[name] == value for name, value in facts.items())
+        for graph in bundle.graphs.values():
+            verified(graph)
+        return bool(same and measured["options"] == asdict(options))
+    except (SpnError, KeyError, TypeError):
+        return False
 
 
 def _check_free(folder: Path, overwrite: bool) -> None:

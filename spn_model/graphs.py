@@ -18,10 +18,9 @@ from spn_model.members.member import Member
 from spn_model.members.regression import RegressionMember
 from spn_model.members.regression_examples import input_size, resized
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
-from spn_model.onboard.bundle import CellDecoding, Decoding, PoseDecoding
+from spn_model.onboard.bundle import INPUT, CellDecoding, Decoding, PoseDecoding
 
 _OPSET = 17  # read by onnxruntime from 1.12 on
-INPUT = "image"
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,22 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 # Read by OpenCV when it is loaded: an image's header may claim any size.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(100_000_000))
 
 import cv2
-import numpy as np
 
 from spn_data.camera_file import read_camera
-from spn_data.errors import InputError, SpnError
+from spn_data.errors import SpnError
 from spn_model.onboard import lines
 from spn_model.onboard.localizer import Localizer
-
-_IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-_MAX_IMAGE_BYTES = 500_000_000
+from spn_model.onboard.sources import frames
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,7 +58,7 @@ def _localize_all(given: argparse.Namespace) -> None:
         sys.stdout.write(lines.csv_header() + "\n")
     told = False
     for source in given.sources:
-        for frame, time_s, image in _images(source):
+        for frame, time_s, image in frames(source):
             seen = localizer.renderer(camera, image.shape[1], image.shape[0]).valid.mean()
             if seen < 1 and not told:
                 sys.stderr.write(
@@ -73,37 +69,6 @@ def _localize_all(given: argparse.Namespace) -> None:
             located = localizer.localize(image, camera)
             sys.stdout.write(line(str(source), frame, time_s, located, origin) + "\n")
             sys.stdout.flush()
-
-
-def _images(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
-    """Frame, seconds since the video's start (NaN for an image), BGR."""
-    if not source.is_file():
-        raise InputError("does not exist" if not source.exists() else "is no file", path=source)
-    if source.suffix.lower() in _IMAGES:
-        if source.stat().st_size > _MAX_IMAGE_BYTES:
-            raise InputError("is too large for an image", path=source)
-        try:
-            image = cv2.imdecode(np.fromfile(source, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error as error:
-            raise InputError(f"cannot be read as an image ({error.err})", path=source) from error
-        if image is None:
-            raise InputError("cannot be read as an image", path=source)
-        yield 0, float("nan"), image
-        return
-    # Resolved: OpenCV takes some names for a device, a pattern or an address.
-    video = cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
-    try:
-        frame = 0
-        while True:
-            read, image = video.read()
-            if not read:
-                break
-            yield frame, video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image
-            frame += 1
-        if not frame:
-            raise InputError("is no video that can be decoded", path=source)
-    finally:
-        video.release()
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ VERSION = 1
 DOCUMENT, CARD = "bundle.json", "MODEL_CARD.md"
 FLOAT32, INT8 = "float32", "int8"
 GRAPHS = {FLOAT32: "model.onnx", INT8: "model-int8.onnx"}
+INPUT = "image"  # of a graph: (1, h, w, 3) uint8 RGB
 CONVENTIONS = (
     "World: East, North, Up in metres about the origin where units is 'm' and origin is not null. A pose is "
     "the camera centre in the world and a unit quaternion, scalar first, w >= 0, that turns world axes into "

@@ -16,6 +16,7 @@ from spn_data.rendering import Renderer
 from spn_model.decoding import decode
 from spn_model.onboard.bundle import (
     FLOAT32,
+    INPUT,
     INT8,
     Bundle,
     CellDecoding,
@@ -28,7 +29,6 @@ from spn_model.onboard.bundle import (
 # images differ from those of the data set by less than one grey level in the mean.
 SAMPLE_STEP_PX = 1.5
 _SHAPE_TOLERANCE = 0.005  # of the aspect, between a camera file and the images
-_INPUT = "image"
 _FATAL = 4  # what goes wrong is raised: onnxruntime prints it as well, in colour
 
 
@@ -90,7 +90,7 @@ class Localizer:
 
     def run(self, images: np.ndarray) -> list[np.ndarray]:
         """Outputs of the network, as the bundle's decoding names them, of an image (1, h, w, 3) uint8 RGB."""
-        found: list[np.ndarray] = self.session.run(self.bundle.decoding.outputs, {_INPUT: images})
+        found: list[np.ndarray] = self.session.run(self.bundle.decoding.outputs, {INPUT: images})
         return found
 
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
@@ -138,7 +138,7 @@ class Localizer:
     def _check_graph(self, path: Path) -> None:
         inputs = [(i.name, i.type, i.shape) for i in self.session.get_inputs()]
         shape = [1, self.camera.height, self.camera.width, 3]
-        if inputs != [(_INPUT, "tensor(uint8)", shape)]:
+        if inputs != [(INPUT, "tensor(uint8)", shape)]:
             raise FormatError(f"{path}: is no graph of this bundle: its input is {inputs}")
         shapes = {o.name: o.shape for o in self.session.get_outputs() if o.type == "tensor(float)"}
         decoding = self.bundle.decoding
