@@ -116,20 +116,24 @@ def run(
                 kept=runs / ".retrieval.npz",
             )
     show_networks.comparison(found)
-    facts = {
-        name: {**network_facts(networks[name]), "checkpoint": content_fingerprint(file)}
-        for name, file in files.items()
-    }
+    facts, courses = {}, {}
+    unit = "m" if found.units == "m" else "model units"
+    for name, folder in folders.items():
+        log, course = folder / names_of.LOG, None
+        try:
+            course = read_log(log) if log.exists() else None
+        except InputError as error:
+            console.note(f"the course of the training is not drawn: {error}")
+        courses[folder] = {} if course is None else {"training": training_figure(course, unit=unit)}
+        facts[name] = {
+            **network_facts(networks[name]),
+            "checkpoint": content_fingerprint(files[name]),
+            "course": None if course is None else course.facts(),
+        }
     parts = [(folders[name], of_network(found, name), {name: facts[name]}) for name in files]
     if len(files) > 1:
         parts.append((runs / names_of.COMPARED, found, facts))
-    unit = "m" if found.units == "m" else "model units"
     for folder, part, of in parts:
-        log, course = folder / names_of.LOG, {}
-        try:
-            course = {"training": training_figure(read_log(log), unit=unit)} if log.exists() else {}
-        except InputError as error:
-            console.note(f"the course of the training is not drawn: {error}")
         folder.mkdir(parents=True, exist_ok=True)
         write_comparison(
             part,
@@ -137,7 +141,7 @@ def run(
             metrics=folder / names_of.METRICS,
             errors=folder / names_of.ERRORS,
             drawings=folder / names_of.FIGURES,
-            more_drawings=course,
+            more_drawings=courses.get(folder),
         )
         console.out.print(f"{folder}: {names_of.METRICS}, {names_of.ERRORS}, {names_of.FIGURES}/.")
     page.refresh_if_free(area)

@@ -40,6 +40,10 @@ class TrainingLog:
     minutes: float
     images: int
 
+    def facts(self) -> dict[str, float]:
+        """Of the whole training, for metrics.json."""
+        return {"minutes": round(self.minutes, 3), "images": self.images}
+
 
 def read_log(path: Path) -> TrainingLog:
     """Raises InputError with the line where it is no log of a training."""
@@ -49,7 +53,7 @@ def read_log(path: Path) -> TrainingLog:
     for line, row in read_csv(path, COLUMNS, max_bytes=_MAX_BYTES):
         try:
             minutes, images = float(row["train_s"]) / 60, int(row["images"])
-            if not (np.isfinite(minutes) and 0 <= minutes):
+            if not (np.isfinite(minutes) and minutes >= 0):
                 raise ValueError(f"train_s is {row['train_s']!r}")
             if row["event"] == "steps":
                 rows["steps"].append((minutes, _number(row["loss"]), np.nan))

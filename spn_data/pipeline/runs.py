@@ -112,15 +112,16 @@ def _checkpoint(runs: Path, name: str) -> str:
 
 
 def _network(of: Mapping[str, Any], cost: Mapping[str, Any]) -> NetworkFacts:
-    training = of["training"]
+    training, course = of["training"], of.get("course") or {}
     seconds = _number(training.get("train_s"))
     return NetworkFacts(
         kind=_text(of["kind"]),
         checkpoint=_text(of["checkpoint"]),
         parameters=_count(of["parameters"]),
         size_bytes=_count(of["bytes"]),
-        images=_count(training.get("images_shown")),
-        minutes=None if seconds is None else seconds / 60,
+        images=_count(course.get("images", training.get("images_shown"))),
+        minutes=_number(course.get("minutes", None if seconds is None else seconds / 60)),
+        kept_minutes=None if seconds is None else seconds / 60,
         ms_an_image=_number(cost.get("ms_an_image")),
     )
 

@@ -177,8 +177,8 @@ class MethodErrors:
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """A trained network. parameters, size_bytes, images, minutes (of training), ms_an_image : None where
-    nothing tells; checkpoint : fingerprint of what was judged."""
+    """A trained network; None where nothing tells. checkpoint : fingerprint of what was judged; images,
+    minutes : of the whole training; kept_minutes : of it, when this network was the best so far."""
 
     kind: str
     checkpoint: str
@@ -186,6 +186,7 @@ class NetworkFacts:
     size_bytes: int | None
     images: int | None
     minutes: float | None
+    kept_minutes: float | None
     ms_an_image: float | None
 
 

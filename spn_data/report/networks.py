@@ -8,7 +8,7 @@ from html import escape
 
 from spn_data.report.data import MethodErrors, NetworkFacts, ReportData, RunFacts
 
-# A training that has shown fewer images is called short: on two cores, 30 minutes show about twice as many.
+# A training that has shown fewer images is called short: two cores show several times as many in 30 minutes.
 SHORT_IMAGES = 30_000
 _ROLES = {"test": "test frames", "validation": "validation frames", "train": "training images"}
 _ORDER = tuple(_ROLES)
@@ -81,6 +81,7 @@ def _described(network: NetworkFacts) -> tuple[str, ...]:
         told(network.parameters, ",", ""),
         told(size, ".1f", " MB"),
         told(network.minutes, ".1f", " min"),
+        told(network.kept_minutes, ".1f", " min"),
         told(network.images, ",", ""),
         told(network.ms_an_image, ".1f", " ms"),
     )
