@@ -1,0 +1,49 @@
+"""A network that knows four views of the painted hall by heart, as a bundle for the drone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from spn_data.camera import Camera
+from spn_data.hdf5_reader import Dataset
+from spn_model.checkpoint import Checkpoint
+from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.precision import bfloat16_is_fast
+from spn_model.training_set import TrainingSet
+from spn_model.view import View
+
+STEPS = 100
+# A lens with distortion that sees a little more than the data set's camera.
+LENS = Camera("OPENCV", 640, 360, np.array([425.0, 428.0, 322.0, 178.0, -0.06, 0.02, 1e-3, -5e-4]))
+_AS_THEY_ARE = {
+    **{"tilt_deg": 0, "roll_deg": 0, "zoom_min": 1, "zoom_max": 1},
+    **{"size_min": 1, "size_max": 1, "ramp_share": 0, "look": False},
+}
+
+
+def learnt(dataset: Path) -> Checkpoint:
+    """A scene-coordinate network after 100 steps on the data set's training images, as they are."""
+    with Dataset(dataset) as data:
+        training, view = TrainingSet(data.groups["train"]), View.of(data)
+    member = SceneCoordinatesMember.make({"shrink": 2}, seed=0)
+    member.load_pretrained(member.weights_name)
+    member.fit(training)
+    member.begin_stage(_AS_THEY_ARE, training)
+    member.bfloat16 = bfloat16_is_fast("cpu")
+    optimizer = torch.optim.AdamW([{**group, "lr": 0.0} for group in member.parameter_groups()])
+    generator, rows = np.random.default_rng(0), np.arange(len(training))
+    member.network.train()
+    for step in range(STEPS):
+        rate = 3e-3 * min(1, (step + 1) / 10) * (1 + np.cos(np.pi * step / STEPS)) / 2
+        for group in optimizer.param_groups:
+            group["lr"] = rate * group["rate"]
+        loss, _ = member.loss(member.batch(training, rows, generator, step / STEPS))
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(member.network.parameters(), 5.0)
+        optimizer.step()
+    member.network.eval()
+    return Checkpoint(member, view, {"recipe": {"weights": "published"}})
