@@ -113,7 +113,7 @@ def run(
                 (names_of.MODEL, names_of.GEO),
                 progress,
                 wanted,
-                kept=runs / ".retrieval.npz",
+                kept=runs / ".retrieval.json",
             )
     show_networks.comparison(found)
     facts, courses = {}, {}

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
-from spn_data.files import writing_whole
 from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.record import content_fingerprint, versions
+from spn_data.record import content_fingerprint, versions, write_json
 from spn_data.timing import Progress
 from spn_model.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
 from spn_model.feature_maps import squeezenet_maps
@@ -21,7 +18,6 @@ from spn_model.feature_maps import squeezenet_maps
 VERSION = 1  # of what is kept; another one whenever a way of describing images changes
 _METHODS = (VLAD, GEM)
 _MAX_BYTES = 100_000_000
-_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
 
 
 def most_alike(
@@ -54,11 +50,8 @@ def most_alike(
         rows[method] = [most_similar(known, describe(images)) for images in counted[1:]]
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
-        columns = {
-            f"{m}_{k}": rows[name][k] for m, name in enumerate(_METHODS) for k in range(len(groups))
-        }
-        with writing_whole(kept) as file:
-            np.savez(file, key=np.array(key), **columns)  # type: ignore[arg-type]
+        plain = {method: [one.tolist() for one in of] for method, of in rows.items()}
+        write_json(kept, {"version": VERSION, "key": key, "rows": plain})
     return rows
 
 
@@ -103,19 +96,18 @@ def _read(
     try:
         if path.stat().st_size > _MAX_BYTES:
             return None
-        with np.load(path, allow_pickle=False) as file:
-            if str(file["key"]) != key:
-                return None
-            found = {
-                name: [np.asarray(file[f"{m}_{k}"]) for k in range(len(groups))]
-                for m, name in enumerate(_METHODS)
-            }
-    except _DAMAGED:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        if table["key"] != key:
+            return None
+        found = {
+            method: [np.array(rows, dtype=np.int64) for rows in table["rows"][method]]
+            for method in _METHODS
+        }
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
-    for rows in found.values():
-        for one, group in zip(rows, groups, strict=True):
-            if one.shape != (len(group),) or one.dtype.kind != "i":
-                return None
-            if len(one) and not (one.min() >= -1 and one.max() < len(training)):
-                return None
+    for of in found.values():
+        if [rows.shape for rows in of] != [(len(group),) for group in groups]:
+            return None
+        if any(len(rows) and not -1 <= rows.min() <= rows.max() < len(training) for rows in of):
+            return None
     return found
