@@ -104,14 +104,14 @@ def train(
             if images is None or data.of(stage) != path:
                 path = data.of(stage)
                 dataset = area if path == data.area else stack.enter_context(Dataset(path))
-                images = TrainingSet(_training_group(dataset))
+                images = TrainingSet(_training_group(dataset), up_is_known=dataset.info.up_is_known)
                 if state is None:
                     member.fit(images)
             member.network.to(machine.device)
             member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
             member.begin_stage(stage.options, images)
             ranks.start_alike(list(member.network.state_dict().values()))
-            optimizer = _optimizer(recipe, stage, member)
+            optimizer = optimizer_of(recipe, stage, member)
             if state is not None:
                 state.restore_optimizer(optimizer)
                 state = None
@@ -239,7 +239,7 @@ def _training_group(dataset: Dataset) -> DatasetGroup:
     return filled[0]
 
 
-def _optimizer(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Optimizer:
+def optimizer_of(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Optimizer:
     """Raises InputError where the stage trains nothing."""
     groups = [group for group in member.parameter_groups() if group["params"]]
     if not groups:
