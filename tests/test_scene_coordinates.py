@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional
 
 from spn_data.camera import Camera
 from spn_data.hdf5_reader import FramePoints
@@ -174,10 +175,12 @@ def test_it_learns_one_image():
     net.measure_features(image)
     known = torch.ones(1, rows, columns, dtype=torch.bool)
     optimizer = torch.optim.AdamW(net.parameters(), lr=1e-3)
+    parts = net.part_of(targets.permute(0, 2, 3, 1)[known])
     distances, scales = [], []
     for _ in range(30):
-        coordinates, log_scale = net(image)
-        loss = laplace_loss(coordinates, log_scale, targets, known)
+        coordinates, log_scale, logits = net.cells(image)
+        choice = functional.cross_entropy(logits.permute(0, 2, 3, 1)[known], parts)
+        loss = laplace_loss(coordinates, log_scale, targets, known) + choice
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -185,6 +188,29 @@ def test_it_learns_one_image():
         scales.append(float(log_scale.mean().detach()))
     assert distances[-1] < 0.5 * distances[0]
     assert scales[-1] < scales[0] - 0.3
+
+
+def test_parts_of_the_scene_are_where_points_are():
+    """Four clumps of points share 48 middles, each of which lies in a clump; strays are in no part."""
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.tensor([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [30, 30, 0]])
+    points = corners.repeat(500, 1) + torch.rand(2000, 3, generator=generator)
+    net = SceneCoordinates()
+    net.set_scene(torch.cat([points, torch.full((3, 3), 1e5)]))
+    middles = net.place.weight[:, :, 0, 0].T * net.spread + net.center
+    off = (middles[:, None] - corners - 0.5).abs().amax(dim=2).min(dim=1).values
+    assert float(off.max()) < 0.6
+    assert len(net.part_of(points).unique()) == 48
+    other = SceneCoordinates()
+    other.set_scene(torch.cat([points, torch.full((3, 3), 1e5)]))
+    assert torch.equal(other.place.weight, net.place.weight)
+
+
+def test_few_points_make_a_scene_too():
+    """Fewer points than parts leave parts without a point, and no number that is none."""
+    net = SceneCoordinates()
+    net.set_scene(torch.rand(5, 3))
+    assert torch.isfinite(net.place.weight).all()
 
 
 def test_a_cell_takes_the_point_nearest_to_its_middle():

@@ -176,7 +176,7 @@ def test_frozen_layers_are_in_no_group(data):
     groups = {group["name"]: group for group in member.parameter_groups()}
     assert groups["pretrained"]["rate"] == 0.1
     assert len(groups["pretrained"]["params"]) == 36
-    assert len(groups["added"]["params"]) == 22
+    assert len(groups["added"]["params"]) == 24
 
 
 def test_published_weights_are_loaded(data):

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from spn_data.errors import GeometryError, InputError
 from spn_data.pose import Poses
@@ -127,20 +128,25 @@ class SceneCoordinatesMember(Member):
         }
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Laplace likelihood; figures: median distance of cells, and median scale, in the scene's unit.
+        """Laplace likelihood, and cross entropy of the parts of the scene.
+
+        Figures: median distance of cells, and median scale, in the scene's unit; the cross entropy.
 
         Where no cell of the batch has a target the loss is 0.
         """
         images, known = batch["images"], batch["known"]
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.bfloat16):
-            coordinates, log_scale = self.network.cells(_normalised(images))
+            coordinates, log_scale, logits = self.network.cells(_normalised(images))
         if not known.any():
             return (coordinates.sum() + log_scale.sum()) * 0, {}
         loss = laplace_loss(coordinates, log_scale, batch["targets"], known)
+        parts = self.network.part_of(batch["targets"].permute(0, 2, 3, 1)[known])
+        choice = functional.cross_entropy(logits.permute(0, 2, 3, 1)[known], parts)
         with torch.no_grad():
             distance = (coordinates - batch["targets"]).norm(dim=1)[known].median()
             scale = log_scale[:, 0][known].median().exp()
-        return loss, {"distance": distance, "scale": scale}
+        figures = {"distance": distance, "scale": scale, "choice": choice.detach()}
+        return loss + self._stage.choice_weight * choice, figures
 
     @property
     def covariance_scale(self) -> float:

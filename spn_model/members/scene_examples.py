@@ -30,6 +30,7 @@ class StageOptions:
 
     freeze_layers: int = 5  # first layers of SqueezeNet that stay as published
     features_rate: float = 0.3  # rate of SqueezeNet's other layers against that of the head
+    choice_weight: float = 1.0  # of the choice among parts of the scene, in the loss
     surfaces: bool = True  # learn from surfaces between map points; else from the points alone
     tilt_deg: float = 20.0  # largest turn about each of the image's axes
     roll_deg: float = 20.0  # and about the optical axis
@@ -50,6 +51,7 @@ class StageOptions:
         for name, low, high in (
             ("freeze_layers", 0, 13),
             ("features_rate", 0, 10),
+            ("choice_weight", 0, 100),
             ("tilt_deg", 0, 60),
             ("roll_deg", 0, 180),
             ("zoom_min", 0.1, 10),

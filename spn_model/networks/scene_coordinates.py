@@ -15,6 +15,10 @@ from torch.nn import functional
 STRIDE_PX = 8
 # SqueezeNet 1.1 neither pads its first convolution nor its pooling: the first cell lies this far in.
 FIRST_CELL_PX = 7.5
+PARTS = 48  # of the scene, among which each cell chooses
+_SHARPNESS = 4.0  # factor of the choice's logits, and
+_REACH = 0.3  # of the coordinates within a part, in spreads: what makes both learn at one rate
+_FAR = 4.0  # spreads from the centre: points beyond are in no part
 _LOG_SCALE = (-6.0, 4.0)  # bounds of the certainty: 0.2 % to 55 times the scene's spread
 
 
@@ -79,7 +83,12 @@ class SceneCoordinates(nn.Module):
     the whole image, and batches of one scene have statistics of their own. Weights at stride 16 see all
     of an image of 480 x 270: facades repeat, and only what lies around them tells windows apart.
 
+    A cell chooses among parts of the scene (`pick`), then tells where it lies against the mean of their
+    middles: a choice tells repeated facades apart sooner than a regression (Li et al. 2020, "Hierarchical
+    scene coordinate classification and regression for visual localization").
+
     center (3,), spread () : of the training images' points; outputs are centred and scaled by them.
+    place : middles of the parts as the weight (3, 48, 1, 1) of a layer that is not learnt, scaled likewise.
     fine_mean (256,), coarse_mean (512,), fine_std, coarse_std () : of the published features on training
     images; what the head receives is centred and scaled by them, once for all.
     covariance_scale () : factor of the covariances of decoded poses, measured on validation images.
@@ -88,7 +97,8 @@ class SceneCoordinates(nn.Module):
     min_side_px: ClassVar[int] = 63
     weights_name: ClassVar[str] = "squeezenet1_1-features"
     added: ClassVar[tuple[str, ...]] = (
-        *("coarse", "context", "wide", "fine", "merge", "out", "center", "spread"),
+        *("coarse", "context", "wide", "fine", "merge", "out", "pick", "place"),
+        *("center", "spread"),
         *("fine_mean", "fine_std", "coarse_mean", "coarse_std"),
         "covariance_scale",
     )
@@ -125,6 +135,8 @@ class SceneCoordinates(nn.Module):
         self.fine = nn.Conv2d(256, 128, 1)
         self.merge = nn.Conv2d(128, 128, 3, padding=1)
         self.out = nn.Conv2d(128, 4, 1)
+        self.pick = nn.Conv2d(128, PARTS, 1)
+        self.place = nn.Conv2d(PARTS, 3, 1, bias=False).requires_grad_(False)
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("spread", torch.ones(()))
         self.register_buffer("covariance_scale", torch.ones(()))
@@ -134,16 +146,26 @@ class SceneCoordinates(nn.Module):
         for layer in (self.coarse, self.context, self.fine, self.merge):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-        nn.init.normal_(self.out.weight, std=0.01)
-        nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+        for layer in (self.out, self.pick):
+            nn.init.normal_(layer.weight, std=0.01)
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.place.weight)
 
+    @torch.no_grad()
     def set_scene(self, xyz: Tensor) -> None:
-        """Centre and spread of the outputs, from points (N, 3) that the training images see.
+        """Centre and spread of the outputs, and parts, from points (N, 3) that the training images see.
 
         By medians: a map has points far outside the scene.
         """
         self.center = xyz.median(dim=0).values.to(self.center)
         self.spread = (xyz - xyz.median(dim=0).values).norm(dim=1).median().to(self.spread)
+        scaled = (xyz.to(self.center) - self.center) / self.spread
+        self.place.weight.copy_(_middles(scaled[scaled.norm(dim=1) < _FAR]).T[:, :, None, None])
+
+    def part_of(self, xyz: Tensor) -> Tensor:
+        """Index of the part (N,) whose middle is the nearest to points (N, 3)."""
+        scaled = (xyz - self.center) / self.spread
+        return torch.cdist(scaled, self.place.weight[:, :, 0, 0].T).argmin(dim=1)
 
     @torch.no_grad()
     def measure_features(self, images: Tensor) -> None:
@@ -170,14 +192,15 @@ class SceneCoordinates(nn.Module):
         return float(STRIDE_PX * self.shrink)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        return self.cells(self.reduced(images))
+        coordinates, log_scale, _ = self.cells(self.reduced(images))
+        return coordinates, log_scale
 
     def reduced(self, images: Tensor) -> Tensor:
         """What `cells` takes: each pixel the mean of shrink x shrink."""
         return functional.avg_pool2d(images, self.shrink) if self.shrink > 1 else images
 
-    def cells(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """As `forward`, of images that are reduced already."""
+    def cells(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `forward`, of images that are reduced already; also logits (B, 48, h, w) of the parts."""
         fine = self.features[:8](images)
         coarse = self._normalised("coarse", self.features[8:](fine))
         coarse = functional.relu(self.coarse(coarse), inplace=True)
@@ -192,10 +215,12 @@ class SceneCoordinates(nn.Module):
         x = functional.relu(x + self.merge(x), inplace=True)
         # bfloat16 would round coordinates to 0.4 %: decimetres.
         with torch.autocast(x.device.type, enabled=False):
-            out = self.out(x.float())
-            coordinates = out[:, :3] * self.spread + self.center[:, None, None]
+            x = x.float()
+            out, logits = self.out(x), self.pick(x) * _SHARPNESS
+            coordinates = self.place(logits.softmax(dim=1)) + out[:, :3] * _REACH
+            coordinates = coordinates * self.spread + self.center[:, None, None]
             log_scale = out[:, 3:].clamp(*_LOG_SCALE) + self.spread.log()
-        return coordinates, log_scale
+        return coordinates, log_scale, logits
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters as "added" and "pretrained", as the regressors have them."""
@@ -223,3 +248,24 @@ def laplace_loss(coordinates: Tensor, log_scale: Tensor, targets: Tensor, known:
     distance = (coordinates - targets).square().sum(1).add(1e-12).sqrt()
     log_scale = log_scale[:, 0]
     return (distance * (-log_scale).exp() + 3 * log_scale)[known].mean()
+
+
+def _middles(points: Tensor, rounds: int = 15, most: int = 20_000) -> Tensor:
+    """Middles (48, 3) of as many groups of points (N, 3), always the same ones: Lloyd's k-means.
+
+    It begins as k-means++ (Arthur and Vassilvitskii 2007). Without points all middles are 0.
+    """
+    generator = torch.Generator(points.device).manual_seed(0)
+    if not len(points):
+        return points.new_zeros(PARTS, 3)
+    points = points[torch.randperm(len(points), generator=generator, device=points.device)[:most]]
+    middles = points[:1]
+    for _ in range(PARTS - 1):
+        squared = torch.cdist(points, middles).min(dim=1).values.square() + 1e-12
+        middles = torch.cat([middles, points[torch.multinomial(squared, 1, generator=generator)]])
+    for _ in range(rounds):
+        nearest = torch.cdist(points, middles).argmin(dim=1)
+        count = torch.bincount(nearest, minlength=PARTS)[:, None]
+        sums = torch.zeros_like(middles).index_add_(0, nearest, points)
+        middles = torch.where(count > 0, sums / count.clamp(min=1), middles)
+    return middles
