@@ -211,7 +211,7 @@ def _write_graphs(
                 progress("int8", done, len(rows))
                 yield deployed.sized(training.image(int(row)))
 
-        quantize(folder / GRAPHS[FLOAT32], folder / GRAPHS[INT8], images(), deployed.last)
+        quantize(folder / GRAPHS[FLOAT32], folder / GRAPHS[INT8], images())
         progress("int8", len(rows), len(rows))
 
 

@@ -28,14 +28,12 @@ class Deployment:
     """How a member becomes a graph.
 
     network : images (1, 3, h, w) as ImageNet's -> outputs in the order of decoding.outputs; decoding : what
-    makes poses of them on board; size : (width, height) of the graph's input; last : beginnings of the names
-    of the parameters that give the outputs, which quantization leaves alone.
+    makes poses of them on board; size : (width, height) of the graph's input.
     """
 
     network: nn.Module
     decoding: Decoding
     size: tuple[int, int]
-    last: tuple[str, ...]
 
     def sized(self, image: np.ndarray) -> np.ndarray:
         """(1, h, w, 3): a data set's image as the graph takes it."""
@@ -53,12 +51,11 @@ def deployment(member: Member, size: tuple[int, int]) -> Deployment:
             stride_px=member.network.stride_px,
             options=member.decoding_options,
         )
-        return Deployment(member.network, cells, size, ("out.",))
+        return Deployment(member.network, cells, size)
     if isinstance(member, RegressionMember):
         pose = PoseDecoding(center=member.network.targets.center.cpu().numpy())
-        last = ("regressor.x.", "regressor.q.", "uncertainty.")
         width = int(member.options["width"])
-        return Deployment(member.network, pose, input_size(*size, width), last)
+        return Deployment(member.network, pose, input_size(*size, width))
     raise InputError(f"a network of kind {member.kind!r} cannot be exported")
 
 

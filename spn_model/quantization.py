@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,8 @@ from onnxruntime.quantization import (
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 # What computes in 8 bits; all else would only be wrapped into conversions.
-_OPERATORS = ["Conv", "Gemm", "MatMul", "MaxPool", "Relu", "LeakyRelu", "Concat"]
+_LEARNT = ("Conv", "Gemm")
+_OPERATORS = [*_LEARNT, "MaxPool", "Relu", "LeakyRelu", "Concat"]
 
 
 class _Images(CalibrationDataReader):  # type: ignore[misc]
@@ -30,20 +31,18 @@ class _Images(CalibrationDataReader):  # type: ignore[misc]
         return None if image is None else {self._name: image}
 
 
-def quantize(
-    graph: Path, quantized: Path, images: Iterable[np.ndarray], last: Sequence[str]
-) -> int:
-    """Write the 8-bit form of a float32 graph; the number of operators that stay float32 of those named.
+def quantize(graph: Path, quantized: Path, images: Iterable[np.ndarray]) -> int:
+    """Write the 8-bit form of a float32 graph; the number of learnt operators that stay in float32.
 
-    images : (1, h, w, 3) uint8, for the ranges of activations; each is used once. last : beginnings of
-    parameters' names in the network, whose operators stay in float32: what they lose, poses lose.
+    images : (1, h, w, 3) uint8, for the ranges of activations; each is used once. The last learnt operators
+    before the outputs stay as they are: what they lose, poses lose.
     """
     with tempfile.TemporaryDirectory(dir=quantized.parent, prefix=".int8-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         # Shapes are fixed: onnx infers them, without symbols.
         quant_pre_process(str(graph), str(prepared), skip_symbolic_shape=True)
         model = onnx.load(str(prepared))
-        kept = list(_reading(model, last))
+        kept = _last(model.graph)
         quantize_static(
             str(prepared),
             str(quantized),
@@ -59,9 +58,16 @@ def quantize(
     return len(kept)
 
 
-def _reading(model: onnx.ModelProto, beginnings: Sequence[str]) -> Iterator[str]:
-    """Names of the nodes that read parameters whose names in the network begin so."""
-    starts = tuple(f"network.{name}" for name in beginnings)
-    for node in model.graph.node:
-        if any(name.startswith(starts) for name in node.input):
-            yield node.name
+def _last(graph: onnx.GraphProto) -> list[str]:
+    """Names of the learnt operators on whose outputs no other one depends."""
+    makers = {output: node for node in graph.node for output in node.output}
+    used: set[str] = set()  # operators that another learnt one depends on
+    for node in graph.node:
+        if node.op_type in _LEARNT:
+            open_inputs = list(node.input)
+            while open_inputs:
+                maker = makers.get(open_inputs.pop())
+                if maker is not None and maker.name not in used:
+                    used.add(maker.name)
+                    open_inputs += maker.input
+    return [n.name for n in graph.node if n.op_type in _LEARNT and n.name not in used]
