@@ -1,0 +1,237 @@
+"""Images a second of the training loop, of the computing alone, and of a loader that decodes JPEGs.
+
+    python benchmarks/training_speed.py AREA [--recipe default] [--steps 24] [--rounds 3] [--threads N]
+        [--device auto] [--precision auto] [--json FILE]
+
+Four loops take the same steps of a recipe's last stage in turns, so that what else the machine does meets all
+of them:
+
+loop      `spn_model.train.run_stage`, as `spn-model train` runs it: batches made ahead, log, state saved
+bare      the same batches, made before and kept in memory: the limit that computing sets
+in turns  each batch is made, then used: what making ahead saves
+plain     as published PoseNet code feeds a network: each image of a batch is read from its JPEG in
+          1-frames, decoded, resized to the batch's size and normalised, every time that it is used; no
+          augmentation
+
+Beside images a second stand milliseconds of processor time for an image, of the thread that steps and of all
+threads: on a machine that has other work to do too, they say more. Judging is not timed, writing the state
+is. Steps are spread over the whole stage, as kinds of networks vary their images with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from spn_data.hdf5_reader import Dataset
+from spn_data.hdf5_schema import Role
+from spn_model.batches import generator_of_step, rows_of_step
+from spn_model.imagenet import MEAN, STD
+from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
+from spn_model.members.member import Batch, Member
+from spn_model.members.registry import make
+from spn_model.recipe import Stage, read_recipe
+from spn_model.train import optimizer_of, run_stage
+from spn_model.training_record import Files, Record
+from spn_model.training_set import TrainingSet
+from spn_model.training_state import Position
+from spn_model.view import View
+
+
+@dataclass(frozen=True)
+class Round:
+    """One loop over all steps. Milliseconds of processor time an image: of the stepping thread, of all."""
+
+    images_per_s: float
+    stepping_ms: float
+    all_threads_ms: float
+
+
+class Silent:
+    """Follows a training without a word."""
+
+    def row(self, values: Mapping[str, Any]) -> None:
+        """Nothing."""
+
+    def wants_stop(self) -> bool:
+        return False
+
+
+def step(member: Member, batch: Batch, optimizer: torch.optim.Optimizer, clip: float) -> None:
+    """What one step computes."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    loss, _ = member.loss(batch)
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    nn.utils.clip_grad_norm_(parameters, clip or float("inf"))
+    optimizer.step()
+
+
+class Contest:
+    """Loops over the same steps of one stage."""
+
+    def __init__(
+        self,
+        member: Member,
+        stage: Stage,
+        images: TrainingSet,
+        machine: Machine,
+        optimizer: torch.optim.Optimizer,
+        jpegs: list[Path],
+        steps: int,
+    ):
+        self.member, self.images, self.machine, self.jpegs = member, images, machine, jpegs
+        self.stage = replace(stage, images=steps * stage.batch, minutes=0.0)
+        self.optimizer, self.steps = optimizer, steps
+        self.batches = [self.batch(k) for k in range(steps)]
+        self.shown = sum(len(next(iter(batch.values()))) for batch in self.batches)
+
+    def batch(self, k: int) -> Batch:
+        """As the loop has it at step k."""
+        rows = rows_of_step(len(self.images), self.stage.batch, k, 0, 0)
+        progress = self.stage.progress(k * self.stage.batch, 0.0)
+        made = self.member.batch(self.images, rows, generator_of_step(0, 0, k), progress)
+        return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
+
+    def loop(self, record: Record) -> None:
+        run_stage(
+            *(self.stage, 0, self.images, self.member, self.optimizer, record.position),
+            *(self.machine, Ranks(), record, Silent(), 0, 1),
+        )
+
+    def bare(self) -> None:
+        for batch in self.batches:
+            step(self.member, batch, self.optimizer, self.stage.clip)
+
+    def in_turns(self) -> None:
+        for k in range(self.steps):
+            step(self.member, self.batch(k), self.optimizer, self.stage.clip)
+
+    def plain(self) -> None:
+        for k, batch in enumerate(self.batches):
+            images = batch["images"]
+            rows = rows_of_step(len(self.images), len(images), k, 0, 0)
+            loaded = np.stack([self.decoded(int(row), images.shape[1:3]) for row in rows])
+            # The member normalises by itself: what was normalised here is not used for more than time.
+            assert loaded.shape == (len(rows), 3, *images.shape[1:3])
+            step(self.member, batch, self.optimizer, self.stage.clip)
+
+    def decoded(self, row: int, size: tuple[int, int]) -> np.ndarray:
+        """(3, h, w) float32 of the JPEG of a training image."""
+        image = cv2.imread(str(self.jpegs[row]), cv2.IMREAD_COLOR_RGB)
+        small = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+        scaled = (small.astype(np.float32) / 255 - MEAN) / np.asarray(STD, np.float32)
+        return scaled.transpose(2, 0, 1).astype(np.float32)
+
+
+def measure(
+    area: Path, recipe_name: str, machine: Machine, steps: int, rounds: int
+) -> dict[str, Any]:
+    """Images a second of each loop, round by round."""
+    recipe = read_recipe(recipe_name)
+    stage = recipe.stages[-1]
+    member = make(recipe.kind, recipe.options)
+    member.bfloat16 = machine.bfloat16
+    if recipe.weights != "none":
+        member.load_pretrained(
+            member.weights_name if recipe.weights == "published" else recipe.weights
+        )
+    with (
+        Dataset(area / "5-split" / "dataset.h5") as dataset,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        group = dataset.of_role(Role.TRAIN)[0]
+        images = TrainingSet(group)
+        jpegs = [area / "1-frames" / name for name in group.names]
+        jpegs = [path for path in jpegs if path.is_file()] or [Path("none")]
+        jpegs = [jpegs[k % len(jpegs)] for k in range(len(group))]
+        member.fit(images)
+        member.network.to(machine.device)
+        member.network.to(memory_format=torch.channels_last)
+        member.begin_stage(stage.options, images)
+        member.network.train()
+        contest = Contest(
+            member, stage, images, machine, optimizer_of(recipe, stage, member), jpegs, steps
+        )
+        paths = [Path(folder) / name for name in ("best", "last", "state", "log")]
+
+        def loop() -> None:
+            record = Record(Files(*paths), Silent(), member, View.of(dataset), [], Position(), {})
+            with closing(record):
+                contest.loop(record)
+
+        loops = {"loop": loop, "bare": contest.bare, "in turns": contest.in_turns}
+        if jpegs[0].is_file() and "images" in contest.batches[0]:
+            loops["plain"] = contest.plain
+        contest.bare()  # nothing is made for the first time later on
+        found: dict[str, list[Round]] = {name: [] for name in loops}
+        for _ in range(rounds):
+            for name, run in loops.items():
+                found[name].append(timed(run, contest.shown, machine))
+    return {"images_per_round": contest.shown, "training_images": len(group), "loops": found}
+
+
+def timed(run: Callable[[], None], images: int, machine: Machine) -> Round:
+    wall, mine, every = time.perf_counter(), time.thread_time(), time.process_time()
+    run()
+    if machine.device.type == "cuda":
+        torch.cuda.synchronize()
+    return Round(
+        images_per_s=images / (time.perf_counter() - wall),
+        stepping_ms=(time.thread_time() - mine) / images * 1e3,
+        all_threads_ms=(time.process_time() - every) / images * 1e3,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("area", type=Path)
+    parser.add_argument("--recipe", default="default")
+    parser.add_argument("--steps", type=int, default=24)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--precision", choices=PRECISIONS, default="auto")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    machine = choose(given.device, given.threads, given.precision)
+    with prepared(machine):
+        found = measure(given.area, given.recipe, machine, given.steps, given.rounds)
+    loops = found["loops"]
+    columns = ("loop", "images/s", "of bare", "ms an image, stepping", "all threads")
+    table = Table(*columns, title=f"{given.recipe}: {machine.plain()}")
+    for name, rounds in loops.items():
+        of_bare = [
+            a.images_per_s / b.images_per_s for a, b in zip(rounds, loops["bare"], strict=True)
+        ]
+        table.add_row(
+            name,
+            f"{median(one.images_per_s for one in rounds):.1f}",
+            f"{median(of_bare):.0%}",
+            f"{median(one.stepping_ms for one in rounds):.2f}",
+            f"{median(one.all_threads_ms for one in rounds):.2f}",
+        )
+    Console(width=110).print(table)
+    if given.json:
+        plain = {name: [asdict(one) for one in rounds] for name, rounds in loops.items()}
+        result = {"recipe": given.recipe, **machine.plain(), **found, "loops": plain}
+        given.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
