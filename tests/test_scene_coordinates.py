@@ -197,20 +197,20 @@ def test_parts_of_the_scene_are_where_points_are():
     points = corners.repeat(500, 1) + torch.rand(2000, 3, generator=generator)
     net = SceneCoordinates()
     net.set_scene(torch.cat([points, torch.full((3, 3), 1e5)]))
-    middles = net.place.weight[:, :, 0, 0].T * net.spread + net.center
+    middles = net.place.T * net.spread + net.center
     off = (middles[:, None] - corners - 0.5).abs().amax(dim=2).min(dim=1).values
     assert float(off.max()) < 0.6
     assert len(net.part_of(points).unique()) == 48
     other = SceneCoordinates()
     other.set_scene(torch.cat([points, torch.full((3, 3), 1e5)]))
-    assert torch.equal(other.place.weight, net.place.weight)
+    assert torch.equal(other.place, net.place)
 
 
 def test_few_points_make_a_scene_too():
     """Fewer points than parts leave parts without a point, and no number that is none."""
     net = SceneCoordinates()
     net.set_scene(torch.rand(5, 3))
-    assert torch.isfinite(net.place.weight).all()
+    assert torch.isfinite(net.place).all()
 
 
 def test_a_cell_takes_the_point_nearest_to_its_middle():

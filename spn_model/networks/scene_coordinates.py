@@ -88,7 +88,7 @@ class SceneCoordinates(nn.Module):
     scene coordinate classification and regression for visual localization").
 
     center (3,), spread () : of the training images' points; outputs are centred and scaled by them.
-    place : middles of the parts as the weight (3, 48, 1, 1) of a layer that is not learnt, scaled likewise.
+    place (3, 48) : middles of the parts, centred and scaled likewise.
     fine_mean (256,), coarse_mean (512,), fine_std, coarse_std () : of the published features on training
     images; what the head receives is centred and scaled by them, once for all.
     covariance_scale () : factor of the covariances of decoded poses, measured on validation images.
@@ -103,6 +103,7 @@ class SceneCoordinates(nn.Module):
         "covariance_scale",
     )
     replaced: ClassVar[tuple[str, ...]] = ("classifier.1.",)
+    place: Tensor
     center: Tensor
     spread: Tensor
     fine_mean: Tensor
@@ -136,9 +137,9 @@ class SceneCoordinates(nn.Module):
         self.merge = nn.Conv2d(128, 128, 3, padding=1)
         self.out = nn.Conv2d(128, 4, 1)
         self.pick = nn.Conv2d(128, PARTS, 1)
-        self.place = nn.Conv2d(PARTS, 3, 1, bias=False).requires_grad_(False)
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("spread", torch.ones(()))
+        self.register_buffer("place", torch.zeros(3, PARTS))
         self.register_buffer("covariance_scale", torch.ones(()))
         for name, channels in (("fine", 256), ("coarse", 512)):
             self.register_buffer(f"{name}_mean", torch.zeros(channels))
@@ -149,7 +150,6 @@ class SceneCoordinates(nn.Module):
         for layer in (self.out, self.pick):
             nn.init.normal_(layer.weight, std=0.01)
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-        nn.init.zeros_(self.place.weight)
 
     @torch.no_grad()
     def set_scene(self, xyz: Tensor) -> None:
@@ -160,12 +160,12 @@ class SceneCoordinates(nn.Module):
         self.center = xyz.median(dim=0).values.to(self.center)
         self.spread = (xyz - xyz.median(dim=0).values).norm(dim=1).median().to(self.spread)
         scaled = (xyz.to(self.center) - self.center) / self.spread
-        self.place.weight.copy_(_middles(scaled[scaled.norm(dim=1) < _FAR]).T[:, :, None, None])
+        self.place.copy_(_middles(scaled[scaled.norm(dim=1) < _FAR]).T)
 
     def part_of(self, xyz: Tensor) -> Tensor:
         """Index of the part (N,) whose middle is the nearest to points (N, 3)."""
         scaled = (xyz - self.center) / self.spread
-        return torch.cdist(scaled, self.place.weight[:, :, 0, 0].T).argmin(dim=1)
+        return torch.cdist(scaled, self.place.T).argmin(dim=1)
 
     @torch.no_grad()
     def measure_features(self, images: Tensor) -> None:
@@ -217,7 +217,9 @@ class SceneCoordinates(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             out, logits = self.out(x), self.pick(x) * _SHARPNESS
-            coordinates = self.place(logits.softmax(dim=1)) + out[:, :3] * _REACH
+            # A product of matrices, not a convolution: a quantizer leaves it alone, and what comes before.
+            chosen = self.place @ logits.softmax(dim=1).flatten(2)
+            coordinates = chosen.reshape(out[:, :3].shape) + out[:, :3] * _REACH
             coordinates = coordinates * self.spread + self.center[:, None, None]
             log_scale = out[:, 3:].clamp(*_LOG_SCALE) + self.spread.log()
         return coordinates, log_scale, logits
