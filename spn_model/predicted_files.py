@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TextIO
+from typing import IO
 
 import numpy as np
 
@@ -103,47 +105,60 @@ class PoseTable:
     def __init__(self, path: Path):
         self._path = path
         self._parts: list[Rows] = []
-        self._file: TextIO | None = None
+        self._length = 0  # of the file with whole batches
+        self._file: IO[bytes] | None = None
 
     def __enter__(self) -> PoseTable:
-        try:
-            self._file = self._path.open("w", encoding="utf-8", newline="")
-            csv.writer(self._file, lineterminator="\n").writerow(COLUMNS)
-        except OSError as error:
-            raise StageError(f"{self._path} cannot be written: {error.strerror}") from error
+        with self._told():
+            self._file = self._path.open("wb")
+            self._length = self._file.write(_lines([COLUMNS]))
         return self
 
     def __exit__(self, *error: object) -> None:
         assert self._file is not None
-        try:
+        with self._told():
             self._file.close()
-        except OSError as full:
-            raise StageError(f"{self._path} cannot be written: {full.strerror}") from full
 
     def add(self, rows: Rows) -> None:
         """Raises StageError where the disk does not take them."""
         assert self._file is not None
         poses = np.hstack([rows.poses.centers, rows.poses.quats_wxyz])
         covariance = rows.covariance[:, _UPPER[0], _UPPER[1]]
-        writer = csv.writer(self._file, lineterminator="\n")
-        try:
-            for k in range(len(rows)):
-                writer.writerow(
-                    [
-                        *(rows.names[k], _cell(rows.time_s[k]), rows.status[k], rows.reason[k]),
-                        *(_cell(value) for value in poses[k]),
-                        *(rows.sources[k], rows.video_frame[k]),
-                        *(_cell(value) for value in covariance[k]),
-                    ]
-                )
+        content = _lines(
+            [
+                *(rows.names[k], _cell(rows.time_s[k]), rows.status[k], rows.reason[k]),
+                *(_cell(value) for value in poses[k]),
+                *(rows.sources[k], rows.video_frame[k]),
+                *(_cell(value) for value in covariance[k]),
+            ]
+            for k in range(len(rows))
+        )
+        with self._told():
+            self._file.write(content)
             self._file.flush()
-        except OSError as error:
-            raise StageError(f"{self._path} cannot be written: {error.strerror}") from error
         self._parts.append(rows)
+        self._length += len(content)
 
     def rows(self) -> Rows:
-        """All of them."""
+        """All of them; what an interruption left of another batch is cut off the file."""
+        assert self._file is not None
+        with self._told():
+            self._file.flush()
+            self._file.truncate(self._length)
         return Rows.concatenate(self._parts)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StageError(f"{self._path} cannot be written: {error.strerror}") from error
+
+
+def _lines(rows: Iterable[Sequence[object]]) -> bytes:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode("utf-8")
 
 
 def write_tum(rows: Rows, world: str) -> Iterator[tuple[str, str]]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import cv2
 import numpy as np
 import piexif
@@ -255,6 +257,10 @@ def test_stopped_work_keeps_whole_rows_and_says_so(network, photos, tmp_path):
 
     def stop(step: str, done: int, total: int) -> None:
         if done > 2:
+            # What the signal finds half written, it leaves so.
+            (half,) = tmp_path.glob(".out.partial/poses.csv")
+            with half.open("a") as file:
+                file.write("flight/002.jpg,2.0,estim")
             raise KeyboardInterrupt
 
     with pytest.raises(Stopped) as stopped:
@@ -359,3 +365,22 @@ def test_errors_of_the_command_are_one_line(network, photos, video, tmp_path):
         assert ran.exit_code == 1
         assert "Traceback" not in ran.output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["evaluate", "predict"])
+def test_options_are_documented_with_their_defaults(name):
+    """The command's page has a row for each option and argument, and no other; numbers are the defaults."""
+    page = {"evaluate": "evaluation", "predict": "predict"}[name]
+    text = (Path(__file__).resolve().parents[1] / "docs" / f"{page}.md").read_text("utf-8")
+    table = text[text.index("| option | default |") :]
+    rows = re.findall(r"^\| `([^|]+)` \|([^|]*)\|", table[: table.index("\n\n")], re.MULTILINE)
+    listed = {first.split("`")[0]: default.strip("` ") for first, default in rows}
+    command = main.commands[name]
+    wanted = {
+        p.opts[0] if isinstance(p, click.Option) else (p.metavar or p.name or "").strip(".").upper()
+        for p in command.params
+    }
+    assert set(listed) == wanted
+    for parameter in command.params:
+        if isinstance(parameter.default, int) and not isinstance(parameter.default, bool):
+            assert listed[parameter.opts[0]] == str(parameter.default)
