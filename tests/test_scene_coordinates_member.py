@@ -13,8 +13,10 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.hdf5_reader import Dataset
 from spn_data.pose import Poses, pose_errors, rotations_from_vectors
 from spn_model.covariance_scale import measured_scale
+from spn_model.decoding import decode
 from spn_model.members.member import PoseEstimates
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX
 from spn_model.precision import bfloat16_is_fast
 from spn_model.training_set import TrainingSet
 from tests.box_world import CAMERA, seen_by, write_box
@@ -98,15 +100,16 @@ def test_images_follow_the_zoom(data):
 
 
 @pytest.mark.parametrize(
-    ("stage", "known_share"),
+    ("stage", "known_share", "shrink"),
     [
-        ({}, 0.25),
-        ({"views_share": 1.0, "views_rise": 0.3}, 0.2),
-        ({"surfaces": False}, 0.15),
+        ({}, 0.25, 1),
+        ({"views_share": 1.0, "views_rise": 0.3}, 0.2, 1),
+        ({"views_share": 1.0, "views_rise": 0.3}, 0.2, 2),
+        ({"surfaces": False}, 0.15, 1),
     ],
-    ids=["surfaces", "views", "points"],
+    ids=["surfaces", "views", "reduced views", "points"],
 )
-def test_targets_are_what_the_cells_show(data, stage, known_share):
+def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
     """A pose made of the targets alone is that of a camera that would take this very image.
 
     For turned and zoomed images its centre is the training camera's: 2 cm in a hall of 20 m. What lies at
@@ -116,7 +119,9 @@ def test_targets_are_what_the_cells_show(data, stage, known_share):
     member = fitted(
         data,
         {"zoom_min": zoom, "zoom_max": zoom, "ramp_share": 0, "look": False} | stage,
+        shrink=shrink,
     )
+    zoom /= shrink
     rows = np.arange(6)
     batch = member.batch(data, rows, np.random.default_rng(0), 0.5)
     height, width = batch["images"].shape[1:3]
@@ -132,7 +137,9 @@ def test_targets_are_what_the_cells_show(data, stage, known_share):
         assert known.mean() > known_share
         log_scale = np.where(known, -5.0, 5.0).astype(np.float32)
         coordinates = np.where(known, targets, np.float32(np.nan))
-        found = member.decode(coordinates, log_scale, lens.matrix)
+        found = decode(
+            coordinates, log_scale, lens.matrix, first_px=FIRST_CELL_PX, stride_px=STRIDE_PX
+        )
         expected, _ = seen_by(found.poses, lens)
         off = np.abs(image.astype(float) - expected).max(axis=2)
         rows_of, columns_of = (np.argwhere(known).T * 8 + 7)[:, :]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from spn_data.errors import InputError
@@ -41,9 +42,7 @@ class StageOptions:
     ramp_share: float = 0.2  # first share of the stage, over which turns and zooms grow to these
     look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
     views_share: float = 0.0  # share of images rendered from another place
-    views_per_image: int = (
-        4  # of these there are, for each training image, as far as memory reaches
-    )
+    views_per_image: int = 4  # of these, for each training image, as far as memory reaches
     views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
     views_side: float = 0.2  # how far aside
 
@@ -97,8 +96,12 @@ class Examples:
         )
         self._surfaces: dict[int, Surface] = {}
         width, height = data.size
+        step = self._surface_options.step_px
+        fits = step % shrink == 0 and width % shrink == 0 and height % shrink == 0
+        self._view_shrink = shrink if fits else 1
+        view_bytes = width * height * (3 / self._view_shrink**2 + 4 / step**2)
         self._view_count = min(
-            len(data) * options.views_per_image, max(1, _VIEW_BYTES // (width * height * 4))
+            len(data) * options.views_per_image, max(1, int(_VIEW_BYTES / view_bytes))
         )
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
 
@@ -146,7 +149,11 @@ class Examples:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, seen = self._source(row, generator)
         matrix = self._data.intrinsics[row] if seen is None else seen.matrix
-        warp = random_warp(generator, matrix, self._data.size, options, zoom=zoom, target_size=size)
+        # A view is kept as small as it is needed.
+        zoom *= self._data.size[0] / image.shape[1]
+        warp = random_warp(
+            generator, matrix, image.shape[1::-1], options, zoom=zoom, target_size=size
+        )
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
         image = warp.image(image, (red, green, blue))
         if self._options.look:
@@ -211,7 +218,15 @@ class Examples:
         generator = np.random.default_rng(number)
         place = random_place(generator, seen, self._view_options)
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
-        return view_from(self._image(row), seen, place, (red, green, blue))
+        image, moved = view_from(self._image(row), seen, place, (red, green, blue))
+        if self._view_shrink == 1:
+            return image, moved
+        by = self._view_shrink
+        image = cv2.resize(
+            image, (image.shape[1] // by, image.shape[0] // by), interpolation=cv2.INTER_AREA
+        )
+        matrix = np.diag([1 / by, 1 / by, 1.0]) @ moved.matrix
+        return image, replace(moved, step_px=moved.step_px // by, matrix=matrix)
 
 
 def _mean_up(data: TrainingSet) -> tuple[float, float, float]:
