@@ -209,7 +209,7 @@ def main() -> None:
     parser.add_argument("--precision", choices=PRECISIONS, default="auto")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    machine = choose(given.device, given.threads, given.precision)
+    machine = choose(given.device, given.threads, given.precision, makes_batches=True)
     with prepared(machine):
         found = measure(given.area, given.recipe, machine, given.steps, given.rounds)
     loops = found["loops"]

@@ -20,7 +20,7 @@ _MAX_WORKERS = 8
 
 @dataclass(frozen=True)
 class Machine:
-    """device : of torch. threads : of the network's computations on the processor. workers : threads that
+    """device : of torch. threads : that the network computes with on the processor. workers : others, that
     make batches. bfloat16 : matrices are multiplied in it while training."""
 
     device: torch.device
@@ -45,10 +45,13 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def choose(device: str, threads: int, precision: str, local_rank: int = 0) -> Machine:
-    """device : "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N"; threads : 0 for all cores.
+def choose(
+    device: str, threads: int, precision: str, local_rank: int = 0, *, makes_batches: bool = False
+) -> Machine:
+    """device : "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N"; threads : in all, 0 for all cores.
 
-    Raises InputError for a device that there isn't.
+    With makes_batches some of the threads are set apart for that; it takes one in any case. Raises
+    InputError for a device that there isn't.
     """
     available = torch.cuda.is_available()
     if device == "auto":
@@ -67,9 +70,13 @@ def choose(device: str, threads: int, precision: str, local_rank: int = 0) -> Ma
         raise InputError(f"device {device} is not in this machine, or torch was built without CUDA")
     threads = threads or cores()
     fast = bfloat16_is_fast(chosen.type) if precision == "auto" else precision == "bfloat16"
-    on_card = chosen.type == "cuda"
-    workers = max(1, threads - 1 if on_card else threads // 4)
-    return Machine(chosen, threads, min(workers, _MAX_WORKERS), fast)
+    if not makes_batches:
+        return Machine(chosen, threads, 0, fast)
+    if chosen.type == "cuda":
+        return Machine(chosen, 1, min(max(1, threads - 1), _MAX_WORKERS), fast)
+    # Threads of one convolution wait for each other: one that shares its core holds up all of them.
+    workers = min(max(1, threads // 4), _MAX_WORKERS)
+    return Machine(chosen, max(1, threads - workers), workers, fast)
 
 
 @contextmanager

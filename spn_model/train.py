@@ -78,7 +78,10 @@ def train(
     that nothing can be trained with or on, StageError where the loss diverges or the disk is full.
     """
     with joined(options.device) as ranks, ExitStack() as stack:
-        machine = choose(options.device, options.threads, options.precision, ranks.local_rank)
+        machine = choose(
+            *(options.device, options.threads, options.precision, ranks.local_rank),
+            makes_batches=True,
+        )
         stack.enter_context(prepared(machine))
         state = read_state(files.state)
         position = Position() if state is None else state.position

@@ -39,7 +39,7 @@ def test_every_loop_takes_the_same_steps(benchmark, tmp_path, monkeypatch):
         return loss(member, batch)
 
     monkeypatch.setattr("tests.training_world.TinyMember.loss", watched)
-    machine = choose("cpu", 1, "float32")
+    machine = choose("cpu", 1, "float32", makes_batches=True)
     with prepared(machine):
         found = benchmark.measure(tmp_path, str(recipe), machine, 4, 1)
     assert found["images_per_round"] == 20

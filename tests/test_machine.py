@@ -1,0 +1,56 @@
+"""What a training runs on: devices that are not there are refused, threads are divided."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from spn_data.errors import InputError
+from spn_model.machine import choose, cores, prepared
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:x", "mps", "meta", ""])
+def test_what_is_no_device_is_refused(device):
+    """By name, with those that there are."""
+    with pytest.raises(InputError, match=f"there is no device '{device}': auto, cpu, cuda"):
+        choose(device, 1, "auto")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a graphics card")
+def test_a_graphics_card_that_is_not_there_is_refused():
+    """cuda is no wish: nothing else is taken in its place; auto is."""
+    with pytest.raises(InputError, match="is not in this machine"):
+        choose("cuda", 1, "auto")
+    assert choose("auto", 1, "auto").device.type == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("threads", "computing", "making"), [(1, 1, 1), (2, 1, 1), (4, 3, 1), (8, 6, 2), (64, 56, 8)]
+)
+def test_makers_of_batches_have_their_own_threads(threads, computing, making):
+    """On a processor no thread is shared, but where there is only one; without makers all compute."""
+    machine = choose("cpu", threads, "float32", makes_batches=True)
+    assert (machine.threads, machine.workers) == (computing, making)
+    assert choose("cpu", threads, "float32").threads == threads
+    assert choose("cpu", 0, "float32").threads == cores()
+
+
+def test_precision_is_taken_as_it_is_given():
+    """bfloat16 where it is asked for, even where it is slow; auto is what the processor can."""
+    assert choose("cpu", 1, "bfloat16").bfloat16
+    assert not choose("cpu", 1, "float32").bfloat16
+    assert choose("cpu", 1, "bfloat16").plain()["precision"] == "bfloat16"
+
+
+def test_libraries_are_left_as_they_were():
+    """Inside, torch computes with the machine's threads; after it as before, whatever went wrong."""
+    before = torch.get_num_threads()
+
+    def fail() -> None:
+        with prepared(choose("cpu", 3, "float32")):
+            assert torch.get_num_threads() == 3
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert torch.get_num_threads() == before
