@@ -48,7 +48,7 @@ def cores() -> int:
 def choose(
     device: str, threads: int, precision: str, local_rank: int = 0, *, makes_batches: bool = False
 ) -> Machine:
-    """device : "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N"; threads : in all, 0 for all cores.
+    """device : "auto" (CUDA where there is one), "cpu", "cuda", "cuda:N"; threads : in all, 0 for all cores.
 
     With makes_batches some of the threads are set apart for that; it takes one in any case. Raises
     InputError for a device that there isn't.
