@@ -134,6 +134,16 @@ def test_the_view_on_board_is_that_of_the_data_set(flown):
     assert np.hypot(*shift) < 0.02
 
 
+def test_images_are_rendered_with_the_coarser_step(bundle, flown):
+    """The localizer's own view is that of the test above, not the data set's slower one."""
+    lens, localizer = LENS.scaled(896, 504), Localizer(bundle)
+    image = cv2.resize(flown[0], (896, 504), interpolation=cv2.INTER_CUBIC)
+    found = localizer.view(image, lens)[0][..., ::-1]
+    coarse = Renderer(lens, localizer.camera, sample_step_px=SAMPLE_STEP_PX).render(image)
+    assert np.array_equal(found, coarse)
+    assert not np.array_equal(found, Renderer(lens, localizer.camera).render(image))
+
+
 def test_another_size_of_the_same_shape_is_scaled(bundle, flown, truth):
     """A camera file of 1280 x 720 serves images of 640 x 360, and no images of another shape."""
     localizer = Localizer(bundle)
