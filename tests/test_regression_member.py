@@ -189,6 +189,10 @@ def test_fitting_keeps_the_pretrained_features(data):
         after = member.network.regressor.trunk(images)[0]
     assert len(layers) == 25
     assert torch.allclose(without, after, rtol=1e-4, atol=1e-4)
+    # A fresh normalisation in eval mode would be the identity too, but not what its statistics call for.
+    for layer in layers:
+        assert layer.running_mean.abs().max() > 0.1
+        assert torch.equal(layer.bias, layer.running_mean)
 
 
 def test_another_data_set_moves_the_targets_alone(data, four):
