@@ -108,6 +108,8 @@ def test_training_images_are_a_fixed_sample(dataset, tmp_path):
 
 
 MOVED = GeoOrigin(-33.87, 151.2, 12.5, HeightReference.TAKEOFF)
+HIGHER = GeoOrigin(-33.86, 151.2, 13.5, HeightReference.TAKEOFF)
+ABOVE_SEA = GeoOrigin(-33.86, 151.2, 12.5, HeightReference.AMSL)
 OTHER_WORLDS = {
     "lengths are in units 'model'": {"units": "model"},
     "knows where up is": {"up_is_known": False},
@@ -122,8 +124,17 @@ OTHER_WORLDS = {
 def test_another_world_is_refused(dataset, tmp_path, why):
     """Errors against labels of another map would mean nothing: the line says what differs."""
     network = write_network(tmp_path / "n.safetensors", dataset)
-    other = write_judged(tmp_path / "other.h5", **OTHER_WORLDS[why])
+    other = write_judged(tmp_path / "other.h5", {"train": 2, "low": 1}, **OTHER_WORLDS[why])
     with pytest.raises(InputError, match=why):
+        judged(other, n=network)
+
+
+@pytest.mark.parametrize("origin", [HIGHER, ABOVE_SEA])
+def test_another_height_is_another_world(dataset, tmp_path, origin):
+    """An origin that lies higher, or counts from something else, moves every pose."""
+    network = write_network(tmp_path / "n.safetensors", dataset)
+    other = write_judged(tmp_path / "other.h5", {"train": 2, "low": 1}, origin=origin)
+    with pytest.raises(InputError, match="its origin is another"):
         judged(other, n=network)
 
 
@@ -228,6 +239,10 @@ def test_what_looks_alike_is_found_once(dataset, tmp_path, monkeypatch):
         assert len(described) == 6, wrong
     found(write_judged(tmp_path / "b.h5", {"train": 9, "medium": 5, "low": 2}))
     assert described == [9, 2, 5, 9, 2, 5]
+    found(dataset)
+    alike = write_judged(tmp_path / "c.h5", fingerprints={**INFO.fingerprints, "1-frames": "x"})
+    found(alike)
+    assert len(described) == 6
 
 
 def test_dropout_scatters_and_leaves_the_network_as_it_was(dataset, tmp_path):
@@ -240,6 +255,8 @@ def test_dropout_scatters_and_leaves_the_network_as_it_was(dataset, tmp_path):
     found = dropout_estimates(network.member, images, k, 40, seed=1)
     again = dropout_estimates(network.member, images, k, 40, seed=1)
     np.testing.assert_array_equal(found.covariance, again.covariance)
+    others = dropout_estimates(network.member, images, k, 40, seed=2)
+    assert not np.array_equal(found.covariance, others.covariance)
     assert (np.linalg.eigvalsh(found.covariance[:, :3, :3])[:, -1] > 1e-6).all()
     np.testing.assert_array_equal(network.member.estimate(images, k).poses.centers, before)
     single = dropout_estimates(network.member, images[:1], k[:1], 40, seed=1)

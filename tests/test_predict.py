@@ -201,22 +201,24 @@ def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp
 
     def lost(images, intrinsics):
         found = real(images, intrinsics)
-        found.poses.centers[0] = np.nan
+        found.poses.centers[0] = found.poses.quats_wxyz[5] = np.nan
+        found.poses.quats_wxyz[1:] *= -1  # the same turns
         reasons = found.reasons.astype(object)
         reasons[0] = "12 cells agree, need 20"
         return replace(found, reasons=reasons)
 
     monkeypatch.setattr(network.member, "estimate", lost)
     found = predicted(network, photos, tmp_path / "out", formats=("csv", "tum", "wgs84"))
-    assert found.counts == {ESTIMATED: 5, FAILED: 1, UNREADABLE: 1}
+    assert found.counts == {ESTIMATED: 4, FAILED: 2, UNREADABLE: 1}
     rows = rows_of(tmp_path / "out")
+    assert all(float(row["qw"]) >= 0 for row in rows if row["status"] == ESTIMATED)
     assert rows[0]["status"] == FAILED
     assert rows[0]["reason"] == "12 cells agree, need 20"
     assert rows[3]["status"] == UNREADABLE
-    for row in (rows[0], rows[3]):
+    for row in (rows[0], rows[3], rows[6]):
         assert row["reason"]
         assert {row[c] for c in COLUMNS if c in "xyz" or c[:2] == "qw" or c[:3] == "cov"} == {""}
-    assert len((tmp_path / "out" / "tum" / "flight.txt").read_text().splitlines()) == 3 + 5
+    assert len((tmp_path / "out" / "tum" / "flight.txt").read_text().splitlines()) == 3 + 4
     places = (tmp_path / "out" / "wgs84.csv").read_text().splitlines()
     assert places[1].startswith('flight/000.jpg,0.0,failed,"12 cells agree, need 20",,,,takeoff')
 

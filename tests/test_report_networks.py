@@ -162,6 +162,19 @@ def test_what_is_no_json_is_told(root, content):
     assert "metrics.json: cannot be shown" in page(root)
 
 
+def test_numbers_that_are_none_are_not_shown_as_numbers(root):
+    """NaN and infinity, which some JSON holds, are as unknown as null."""
+
+    def change(table: dict[str, Any]) -> None:
+        table["groups"]["medium"]["first"]["position"].update(median=float("nan"), p95=float("inf"))
+
+    rewrite(root / "runs" / "first" / "metrics.json", change)
+    table = page(root).split("<h3>medium")[1].split("</table>")[0]
+    (row,) = re.findall(r"<tr><td><b>first</b>.*?</tr>", table)
+    assert row.count("<td>&ndash;</td>") == 2
+    assert not re.search(r"\b(nan|inf)\b", row)
+
+
 def test_no_text_of_metrics_becomes_markup(root):
     """Names of methods, groups, kinds and notes with tags in them are shown as they are."""
 
