@@ -201,7 +201,8 @@ def test_a_training_killed_with_signal_9_goes_on_to_the_same_end(field, unbroken
 ALIKE = replace(
     RECIPE,
     options={"dropout": 0.0, "normalised": False},
-    stages=(Stage(name="all", images=240, batch=4, rate=0.02, clip=1.0),),
+    optimizer="sgd",  # unlike Adam it tells a mean of gradients from their sum
+    stages=(Stage(name="all", images=240, batch=4, rate=0.05),),
 )
 SHARED = """
 import sys
@@ -266,8 +267,15 @@ def test_the_log_tells_training_and_validation_apart(unbroken):
     assert all("position=" in row["figures"] for row in rows if row["event"] == "steps")
 
 
-def test_a_budget_in_minutes_is_of_training_alone(field, tmp_path, monkeypatch):
-    """0.02 minutes are 1.2 s of training, however long judging takes; both are told, each for itself."""
+def test_a_budget_in_minutes_ends_a_training(field, tmp_path):
+    """0.02 minutes are 1.2 s of training, and a step more at most."""
+    recipe = RECIPE.with_budget(None, 0.02)
+    facts = train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())
+    assert 1.2 <= facts["train_s"] < 1.8
+
+
+def test_judging_does_not_count_as_training(field, tmp_path, monkeypatch):
+    """However long it takes; both are told, each for itself."""
     quick = TinyMember.estimate
 
     def slow(self: TinyMember, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
@@ -275,14 +283,11 @@ def test_a_budget_in_minutes_is_of_training_alone(field, tmp_path, monkeypatch):
         return quick(self, images, intrinsics)
 
     monkeypatch.setattr(TinyMember, "estimate", slow)
-    began = time.perf_counter()
-    facts = train(
-        RECIPE.with_budget(None, 0.02), files(tmp_path), Data(field), ONE_THREAD, Follower()
-    )
-    wall_s = time.perf_counter() - began
-    assert facts["validate_s"] > 4 * 3 * 0.1  # 6 validation frames and 16 others, 8 at once
-    assert facts["train_s"] >= 1.2
-    assert facts["train_s"] + facts["validate_s"] < wall_s
+    recipe = replace(RECIPE, stages=RECIPE.stages[1:])
+    often = replace(ONE_THREAD, validations=8)
+    facts = train(recipe, files(tmp_path), Data(field), often, Follower())
+    assert facts["validate_s"] > 8 * 3 * 0.1  # 6 validation frames and 16 others, 8 at once
+    assert facts["train_s"] < 0.7 * facts["validate_s"]
 
 
 def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
