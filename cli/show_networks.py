@@ -6,10 +6,12 @@ import math
 
 from cli import console
 from spn_data.hdf5_schema import Role
-from spn_model.baselines import PAPER_TABLE_1
+from spn_model.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
 from spn_model.evaluate import Comparison, Judged
 from spn_model.metrics import Evaluation, Summary
 
+# Where many columns leave little room for names; the table of errors has them in full.
+_SHORT = {MEAN: "mean pose", VLAD: "VLAD", GEM: "GeM", ORACLE: "oracle"}
 _WHAT = {
     Role.TEST: "test frames",
     Role.VALIDATION: "validation frames, of the mapping flights",
@@ -50,11 +52,7 @@ def _errors(group: Judged, unit: str) -> None:
             one.method + (" (the better)" if one.method == group.retrieval else ""),
             f"{one.summary.located} of {one.summary.frames}",
             *(
-                _pair(
-                    getattr(one.summary.position, what),
-                    getattr(one.summary.rotation_deg, what),
-                    unit,
-                )
+                _pair(getattr(one.summary.position, what), getattr(one.summary.rotation_deg, what))
                 for what in ("median", "mean", "p95")
             ),
         )
@@ -64,7 +62,7 @@ def _errors(group: Judged, unit: str) -> None:
         (
             f"{row.network}, in the paper*",
             "",
-            f"{row.position_m:.2f} m, {row.rotation_deg:.1f} deg",
+            _pair(row.position_m, row.rotation_deg),
             "",
             "",
         )
@@ -72,9 +70,9 @@ def _errors(group: Judged, unit: str) -> None:
         if row.sequence == group.frames.group
     ]
     console.table(
-        f"{group.frames.group}: errors of {len(group.frames)} {_WHAT[group.role]}",
+        f"{group.frames.group}: errors of {len(group.frames)} {_WHAT[group.role]} ({unit} / deg)",
         [*rows, *published],
-        ("method", "poses", "median", "mean of poses", "p95"),
+        ("method", "poses", "median", "mean", "p95"),
     )
     if published:
         console.out.print(
@@ -87,7 +85,7 @@ def _shares(group: Judged, unit: str) -> None:
     within = group.evaluations[0].summary.within
     rows = [
         (
-            one.method,
+            _short(one),
             *(f"{100 * part.share:.0f} %" for part in one.summary.within),
             *(_signed(axis.signed_median) for axis in one.summary.axes),
             _ratio(one),
@@ -96,13 +94,13 @@ def _shares(group: Judged, unit: str) -> None:
     ]
     header = (
         "method",
-        *(f"{part.limit:g} {unit}, {part.limit_deg:g} deg" for part in within),
-        *(f"{axis} ({unit})" for axis in group.frames.axes),
-        "covariance",
+        *(f"{part.limit:g}/{part.limit_deg:g}" for part in within),
+        *group.frames.axes,
+        "fit",
     )
     console.table(
-        f"{group.frames.group}: frames within limits, median signed error by axis, median squared error "
-        "over what the covariance says (1 is right)",
+        f"{group.frames.group}: share within {unit}/deg, median signed errors ({unit}), fit of covariances "
+        "(1 is right)",
         rows,
         header,
     )
@@ -113,23 +111,25 @@ def _strata(group: Judged, unit: str) -> None:
     if len(first.strata) < 2:
         return
     rows = [
-        (one.method, *(_median(one.strata[name], unit) for name in first.strata))
+        (_short(one), *(_median(one.strata[name]) for name in first.strata))
         for one in group.evaluations
     ]
     header = ("method", *(f"{name} ({part.frames})" for name, part in first.strata.items()))
-    console.table(f"{group.frames.group}: medians by coverage", rows, header)
+    console.table(f"{group.frames.group}: medians by coverage ({unit} / deg)", rows, header)
 
 
-def _median(summary: Summary, unit: str) -> str:
-    return _pair(summary.position.median, summary.rotation_deg.median, unit)
+def _short(one: Evaluation) -> str:
+    return _SHORT.get(one.method, one.method)
 
 
-def _pair(position: float, rotation_deg: float, unit: str) -> str:
+def _median(summary: Summary) -> str:
+    return _pair(summary.position.median, summary.rotation_deg.median)
+
+
+def _pair(position: float, rotation_deg: float) -> str:
     if math.isnan(position):
         return ""
-    if math.isinf(position):
-        return "too few poses"
-    return f"{position:.2f} {unit}, {rotation_deg:.1f} deg"
+    return "too few" if math.isinf(position) else f"{position:.2f} / {rotation_deg:.1f}"
 
 
 def _signed(value: float) -> str:

@@ -29,7 +29,7 @@ def trajectories(
     drawn = len(thinned(len(frames)))
     parts = [svg.text(20, 22, heading, bold=True)]
     for left, width, (azimuth, elevation), words in (
-        (20.0, 560.0, (-60.0, 25.0), "from the south-east, above"),
+        (56.0, 524.0, (-60.0, 25.0), "from the south-east, above"),
         (600.0, 380.0, (-90.0, 90.0), "from above"),
     ):
         if frames.axes != ENU:
