@@ -115,6 +115,6 @@ def _show(found: tuple[Cost, ...]) -> None:
         ("graph", *_STEPS, "of bare", "file", "memory", "with a pose"),
     )
     console.out.print(
-        "of bare: our call of onnxruntime against its own on the same tensor. memory: greatest of the "
-        "program's process."
+        "of bare: processor's time of our call of onnxruntime against its own on the same tensor. "
+        "memory: greatest of the program's process."
     )

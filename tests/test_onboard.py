@@ -407,8 +407,9 @@ def test_benchmark_times_both_graphs(bundle, hall, tmp_path):
         assert one["threads"] == 1
         spent = one["milliseconds"]
         assert 0 < spent["graph"]["p50"] <= spent["graph"]["p95"]
+        assert set(spent) == set(one["cpu_milliseconds"])
         assert spent["total"]["p50"] > spent["preprocessing"]["p50"] + spent["decoding"]["p50"]
-        assert 0.2 < one["overhead"] < 5  # of few poses, on a busy machine
+        assert 0.7 < one["overhead"] < 1.4  # of few poses
         assert 40 < one["memory_mb"] < 400
     assert told["int8"]["file_mb"] < told["float32"]["file_mb"]
 

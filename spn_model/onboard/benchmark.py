@@ -9,9 +9,10 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +25,8 @@ from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import read_image
 
 _WARM_UP = 3
+_STEPS = ("preprocessing", "graph", "decoding")
+_T = TypeVar("_T")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,43 +59,50 @@ def main(arguments: list[str] | None = None) -> int:
 def measure(
     localizer: Localizer, images: Sequence[np.ndarray], camera: Camera, poses: int
 ) -> dict[str, Any]:
-    """Milliseconds of each step, p50 and p95 over `poses` poses of the images (BGR) in turn.
+    """Milliseconds of each step, of the clock and of the processor, p50 and p95 over `poses` poses of the
+    images (BGR) in turn.
 
     `bare` is onnxruntime called on the same tensor, right before or right after our own call of it, by turns;
-    `overhead` the ratio of the medians. `located` : share of the poses that were found. `memory_mb` :
-    greatest of this process so far, None where the system does not tell.
+    `overhead` the ratio of the medians of the processor's time. `located` : share of the poses that were
+    found. `memory_mb` : greatest of this process so far, None where the system does not tell.
     """
     session, names = localizer.session, localizer.bundle.decoding.outputs
-    steps: dict[str, list[float]] = {n: [] for n in ("preprocessing", "graph", "bare", "decoding")}
+    clocks = {"milliseconds": time.perf_counter, "cpu_milliseconds": time.process_time}
+    steps: dict[str, dict[str, list[float]]] = {
+        clock: {name: [] for name in (*_STEPS, "bare")} for clock in clocks
+    }
     located = 0
     for k in range(-_WARM_UP, poses):
         image = images[k % len(images)]
-        began = time.perf_counter()
-        view = localizer.view(image, camera)
-        rendered = time.perf_counter()
-        spent = {"preprocessing": rendered - began}
-        outputs: list[np.ndarray] = []
-        for which in ("graph", "bare") if k % 2 else ("bare", "graph"):
-            began = time.perf_counter()
-            if which == "graph":
-                outputs = localizer.run(view)
-            else:
-                session.run(names, {INPUT: view})
-            spent[which] = time.perf_counter() - began
-        began = time.perf_counter()
-        found = localizer.decode(outputs)
-        spent["decoding"] = time.perf_counter() - began
-        if k >= 0:
-            located += not found.reason
-            for name, seconds in spent.items():
-                steps[name].append(1000 * seconds)
-    total = np.sum([steps[name] for name in ("preprocessing", "graph", "decoding")], axis=0)
-    return {
-        "milliseconds": {
+
+        def timed(name: str, work: Callable[[], _T], counts: bool = k >= 0) -> _T:
+            began = {clock: now() for clock, now in clocks.items()}
+            made = work()
+            for clock, now in clocks.items():
+                if counts:
+                    steps[clock][name].append(1000 * (now() - began[clock]))
+            return made
+
+        view = timed("preprocessing", partial(localizer.view, image, camera))
+        bare = partial(session.run, names, {INPUT: view})
+        if k % 2:
+            timed("bare", bare)
+        outputs = timed("graph", partial(localizer.run, view))
+        if not k % 2:
+            timed("bare", bare)
+        found = timed("decoding", partial(localizer.decode, outputs))
+        located += k >= 0 and not found.reason
+    told: dict[str, Any] = {}
+    for clock, by_name in steps.items():
+        total = np.sum([by_name[name] for name in _STEPS], axis=0)
+        told[clock] = {
             name: {"p50": float(np.median(values)), "p95": float(np.percentile(values, 95))}
-            for name, values in {**steps, "total": total}.items()
-        },
-        "overhead": float(np.median(steps["graph"]) / np.median(steps["bare"])),
+            for name, values in {**by_name, "total": total}.items()
+        }
+    cpu = steps["cpu_milliseconds"]
+    return {
+        **told,
+        "overhead": float(np.median(cpu["graph"]) / np.median(cpu["bare"])),
         "poses": poses,
         "located": located / poses,
         "frame": [images[0].shape[1], images[0].shape[0]],
