@@ -224,6 +224,10 @@ def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
     images = torch.zeros(1, 3, 180, 320)
     rows, columns = member.network(images)[1].shape[2:]
     first, stride = member.network.first_cell_px, member.network.stride_px
+    # An image of its own pixels' places: cell 0 lies on pixel 7 of the reduced one, cell 1 on pixel 15.
+    places = (torch.arange(320) + 0.5).expand(1, 3, 180, 320)
+    seen = member.network.reduced(places)[0, 0, 0]
+    assert [float(seen[7]), float(seen[15])] == [first, first + stride]
     # A camera of which each pixel is a cell.
     near = Camera(
         "PINHOLE",
