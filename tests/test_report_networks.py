@@ -98,6 +98,13 @@ def test_a_short_training_is_called_short(root):
     """Forty images are no training to judge a kind of network by, and the page says so."""
     shown = page(root)
     assert "A short training: first (40 images), second (40 images)." in shown
+    table = shown[shown.index('class="trained"') : shown.index("</table>")]
+    (first, _) = re.findall(r"<tr><td>(.*?)</td></tr>", table)
+    titles = re.findall(r"<th>(.*?)</th>", table)
+    told = dict(zip(titles, first.split("</td><td>"), strict=True))
+    assert told["trained for"] == told["kept after"] == "0.1 min"
+    assert told["images seen"] == "40"
+    assert told["a pose takes"].endswith(" ms")
 
 
 def test_figures_are_images_and_nothing_else(root):
@@ -173,6 +180,20 @@ def test_numbers_that_are_none_are_not_shown_as_numbers(root):
     (row,) = re.findall(r"<tr><td><b>first</b>.*?</tr>", table)
     assert row.count("<td>&ndash;</td>") == 2
     assert not re.search(r"\b(nan|inf)\b", row)
+
+
+def test_runs_with_other_columns_share_a_table(root):
+    """A run that counts other limits or axes leaves cells empty; it neither shifts nor breaks the table."""
+
+    def change(table: dict[str, Any]) -> None:
+        one = table["groups"]["medium"]["second"]
+        one["within"], one["axes"] = one["within"][1:] * 4, []
+
+    rewrite(root / "runs" / "second" / "metrics.json", change)
+    table = page(root).split("<h3>medium")[1].split("</table>")[0]
+    (row,) = re.findall(r"<tr><td><b>second</b>.*?</tr>", table)
+    assert row.count("<td>") == table.count("<th>")
+    assert row.count("<td>&ndash;</td>") == 2
 
 
 def test_no_text_of_metrics_becomes_markup(root):

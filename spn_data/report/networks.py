@@ -54,13 +54,8 @@ def _trained(runs: Iterable[RunFacts]) -> str:
             if network.images is not None and network.images < SHORT_IMAGES:
                 short.append(f"{name} ({network.images:,} images)")
     header = (
-        "network",
-        "kind",
-        "parameters",
-        "size",
-        "trained for",
-        "images seen",
-        "an image takes",
+        *("network", "kind", "parameters", "size", "trained for", "kept after", "images seen"),
+        "a pose takes",
     )
     told = (
         f'<p class="note warn">A short training: {escape(", ".join(short))}. What a longer one would give '
@@ -108,7 +103,7 @@ def _group(name: str, role: str, runs: list[RunFacts]) -> str:
     better = next((run.retrieval[name] for run in runs if name in run.retrieval), "")
     ordered = {**of_networks, **{m: beside[m] for m in sorted(beside, key=_rank)}}
     rows = [
-        (_bold(method, method in of_networks, method == better), *_cells(errors, unit))
+        (_bold(method, method in of_networks, method == better), *_cells(errors, first, unit))
         for method, errors in ordered.items()
     ]
     published = [row for row in runs[0].published if row[1] == name]
@@ -155,18 +150,22 @@ def _rank(method: str) -> tuple[int, str]:
     return next((k for k, kind in enumerate(kinds) if method.startswith(kind)), 9), method
 
 
-def _cells(errors: MethodErrors, unit: str) -> list[str]:
+def _cells(errors: MethodErrors, first: MethodErrors, unit: str) -> list[str]:
+    """Of the columns that `first` has."""
     pairs = [
         f"{position:.2f} {unit}, {rotation:.1f}&deg;"
         if position is not None and rotation is not None
         else _NOTHING
         for position, rotation in zip(errors.position, errors.rotation_deg, strict=True)
     ]
+    shares = {(limit, deg): share for limit, deg, share in errors.within}
+    found = [shares.get((limit, deg)) for limit, deg, _ in first.within]
+    signed = [dict(errors.signed).get(axis) for axis, _ in first.signed[-1:]]
     return [
         f"{errors.located:,} of {errors.frames:,}",
         *pairs,
-        *(f"{share:.0%}" for _, _, share in errors.within),
-        *(_NOTHING if value is None else f"{value:+.2f}" for _, value in errors.signed[-1:]),
+        *(_NOTHING if share is None else f"{share:.0%}" for share in found),
+        *(_NOTHING if value is None else f"{value:+.2f}" for value in signed),
         "" if errors.ratio is None else f"{errors.ratio:.2f}",
     ]
 
@@ -196,9 +195,12 @@ def _figures(run: RunFacts, *, opened: bool) -> str:
 
 
 def _table(header: tuple[str, ...], rows: Iterable[Iterable[str]], kind: str) -> str:
-    """Cells are HTML already."""
+    """Cells are HTML already, as many in a row as there are titles."""
+    cells = [tuple(row) for row in rows]
+    if any(len(row) != len(header) for row in cells):
+        raise ValueError(f"a row of {kind} does not fit {header}")
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in cells)
     return (
         f'<div class="wide"><table class="{kind}"><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
