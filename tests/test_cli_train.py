@@ -5,17 +5,21 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import threading
 from pathlib import Path
 
+import click
 import pytest
 import torch
 from click.testing import CliRunner, Result
 
 from cli.model import main
+from cli.train import train
 from spn_model.checkpoint import load
 from spn_model.members.registry import KINDS
+from spn_model.training_state import COLUMNS
 from tests.training_world import register_tiny, write_field
 
 TOML = """\
@@ -198,3 +202,22 @@ def test_an_area_without_a_split_is_refused(place):
     ran = CliRunner().invoke(main, ["train", "--area", str(place / "area")])
     assert ran.exit_code == 1
     assert "5-split is missing; run spn-data split first" in ran.output
+
+
+def test_options_are_documented_with_their_defaults():
+    """docs/training.md has a row for every option and no other."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "training.md"
+    rows = dict(re.findall(r"^\| `(--[a-z]+)` \|([^|]*)\|", page.read_text(), re.MULTILINE))
+    options = {p.opts[-1]: p for p in train.params if isinstance(p, click.Option)}
+    assert rows.keys() == options.keys()
+    for flag, option in options.items():
+        if option.show_default is True:
+            assert rows[flag].strip("` ") == str(option.default), flag
+
+
+def test_columns_of_the_log_are_documented():
+    """docs/training.md names every column of log.csv and no other."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "training.md"
+    part = page.read_text().split("Columns of `log.csv`")[1].split("Judged are")[0]
+    cells = "".join(re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE))
+    assert sorted(re.findall(r"`(\w+)`", cells)) == sorted(COLUMNS)
