@@ -329,10 +329,13 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "large": (lambda f: (f / "bundle.json").write_text(" " * 1_000_001), "larger than 1 MB"),
     "a list": (lambda f: (f / "bundle.json").write_text("[]"), "its format is not"),
     "newer": (edited(lambda d: d.update(version=2)), "is of format 2, this program reads 1"),
+    "no version": (edited(lambda d: d.update(version=float("inf"))), "no description of a bundle"),
     "no view": (edited(lambda d: d.pop("view")), "is damaged"),
     "infinite": (edited(lambda d: d["decoding"].update(stride_px=float("inf"))), "is damaged"),
     "no number": (edited(lambda d: d["decoding"].update(first_px="7")), "is damaged"),
     "many cells": (edited(lambda d: d["decoding"]["options"].update(cells=10**9)), "is damaged"),
+    "beyond floats": (edited(lambda d: d["input"].update(params=[10**400] * 3)), "is damaged"),
+    "no graphs": (edited(lambda d: d.update(graphs=[1])), "is damaged"),
     "other decoding": (edited(lambda d: d["decoding"].update(kind="magic")), "is damaged"),
     "huge input": (edited(lambda d: d["input"].update(width=60_000)), "is damaged"),
     "a lens": (

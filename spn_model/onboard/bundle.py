@@ -36,6 +36,8 @@ CONVENTIONS = (
     "parameters in COLMAP's order."
 )
 _MAX_DOCUMENT_BYTES = 1_000_000
+# What values of other kinds than those written raise where they are used.
+_DAMAGE = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
 _MAX_SIDE_PX = 8192
 _MAX_GRAPH_BYTES = 2 * 10**9  # no ONNX file is larger
 # Of decoding's options: what costs time or memory; a pose needs three points, and a fourth to choose.
@@ -136,7 +138,7 @@ def read_bundle(folder: Path) -> Bundle:
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         version = int(document["version"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (*_DAMAGE, OSError, RecursionError) as error:
         raise FormatError(f"{path}: is no description of a bundle ({error})") from error
     if version != VERSION:
         raise FormatError(
@@ -155,7 +157,7 @@ def read_bundle(folder: Path) -> Bundle:
             graphs={p: _graph(folder, p, entry) for p, entry in dict(document["graphs"]).items()},
             document=document,
         )
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+    except _DAMAGE as error:
         raise FormatError(f"{path}: is damaged ({error!r})") from error
 
 
