@@ -131,7 +131,7 @@ def errors_table(facts: Mapping[str, Any], unit: str) -> None:
 
 def _errors(values: Mapping[str, Any]) -> tuple[str, ...]:
     figures = [
-        "-" if values[name] is None else f"{values[name]:.{digits}f}"
+        "inf" if values[name] is None else f"{values[name]:.{digits}f}"
         for name, digits in (("median_m", 2), ("median_deg", 1), ("p95_m", 2), ("p95_deg", 1))
     ]
     return (*figures, f"{values['located']} of {values['frames']}")
