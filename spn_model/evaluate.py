@@ -51,12 +51,13 @@ class EvaluateOptions:
 class Cost:
     """Of one network, after a first image that does not count: images as they lie in the data set to poses.
 
-    seconds : wall clock; cpu_seconds : of this process, all its threads.
+    seconds : wall clock; cpu_seconds : of this process, all its threads; batch : images given at once.
     """
 
     images: int
     seconds: float
     cpu_seconds: float
+    batch: int
     threads: int
     device: str
 
@@ -276,7 +277,7 @@ def _estimated(
             progress(name, done, total)
         parts.append(joined(batches))
     device = next(member.network.parameters()).device.type
-    return parts, Cost(total, seconds, cpu, torch.get_num_threads(), device)
+    return parts, Cost(total, seconds, cpu, options.batch, torch.get_num_threads(), device)
 
 
 def joined(parts: Sequence[PoseEstimates]) -> PoseEstimates:

@@ -406,6 +406,23 @@ def test_several_runs_stand_in_one_table(tmp_path):
     assert "is no area" in shown.output  # a folder with nothing but networks
 
 
+def test_facts_of_a_run_are_documented(tmp_path):
+    """docs/evaluation.md names what metrics.json tells of a run, its network and its cost."""
+    place_run(tmp_path / "area", "first", 0)
+    words = ("--run", "first", "--no-baselines")
+    assert evaluated(tmp_path / "area", str(tmp_path / "own.h5"), *words).exit_code == 0
+    metrics = json.loads((tmp_path / "area" / "runs" / "first" / "metrics.json").read_text())
+    facts = metrics["facts"]
+    page = (Path(__file__).resolve().parents[1] / "docs" / "evaluation.md").read_text("utf-8")
+    table = page.split("### Facts")[1].split("## errors.csv")[0]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == list(
+        dict.fromkeys(["roles", "networks", "runs", "costs", "dataset", "notes", *facts])
+    )
+    named = set(re.findall(r"`(\w+)`", table))
+    assert {*facts["runs"]["first"], *facts["runs"]["first"]["course"]} <= named
+    assert set(facts["costs"]["first"]) <= named
+
+
 def test_a_run_that_is_not_there_is_told(tmp_path):
     """The line names the folder and the command that makes it; `compared` is no run's name."""
     ran = evaluated(tmp_path / "area", "--run", "nothing")
