@@ -148,7 +148,7 @@ def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
     ("network", "stages"),
     [
         ("posenet", [(LEARNED, 80, 1e-3)]),
-        ("vgg16", [({**LEARNED, **CACHED}, 300, 1e-3), (LEARNED, 20, 1e-5)]),
+        ("vgg16", [({**LEARNED, **CACHED}, 300, 1e-3), (LEARNED, 15, 3e-6)]),
     ],
 )
 def test_large_networks_learn_four_images(four, network, stages):
