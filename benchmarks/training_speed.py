@@ -14,8 +14,8 @@ plain     as published PoseNet code feeds a network: each image of a batch is re
           augmentation
 
 Beside images a second stand milliseconds of processor time for an image, of the thread that steps and of all
-threads: on a machine that has other work to do too, they say more. Judging is not timed, writing the state
-is. Steps are spread over the whole stage, as kinds of networks vary their images with it.
+threads: on a machine that has other work to do too, they say more. Neither judging nor writing the
+state counts, as in a training's own log. Steps are spread over the whole stage, as kinds of networks vary their images with it.
 """
 
 from __future__ import annotations
@@ -170,12 +170,18 @@ def measure(
         )
         paths = [Path(folder) / name for name in ("best", "last", "state", "log")]
 
-        def loop() -> None:
-            record = Record(Files(*paths), Silent(), member, View.of(dataset), [], Position(), {})
+        def loop() -> float:
+            at = Position()
+            record = Record(Files(*paths), Silent(), member, View.of(dataset), [], at, {})
             with closing(record):
                 contest.loop(record)
+            return at.train_s
 
-        loops = {"loop": loop, "bare": contest.bare, "in turns": contest.in_turns}
+        loops: dict[str, Callable[[], float | None]] = {
+            "loop": loop,
+            "bare": contest.bare,
+            "in turns": contest.in_turns,
+        }
         if jpegs[0].is_file() and "images" in contest.batches[0]:
             loops["plain"] = contest.plain
         contest.bare()  # nothing is made for the first time later on
@@ -186,13 +192,14 @@ def measure(
     return {"images_per_round": contest.shown, "training_images": len(group), "loops": found}
 
 
-def timed(run: Callable[[], None], images: int, machine: Machine) -> Round:
+def timed(run: Callable[[], float | None], images: int, machine: Machine) -> Round:
+    """By the loop's own clock, where it has one."""
     wall, mine, every = time.perf_counter(), time.thread_time(), time.process_time()
-    run()
+    seconds = run()
     if machine.device.type == "cuda":
         torch.cuda.synchronize()
     return Round(
-        images_per_s=images / (time.perf_counter() - wall),
+        images_per_s=images / (seconds or time.perf_counter() - wall),
         stepping_ms=(time.thread_time() - mine) / images * 1e3,
         all_threads_ms=(time.process_time() - every) / images * 1e3,
     )
