@@ -14,8 +14,9 @@ plain     as published PoseNet code feeds a network: each image of a batch is re
           augmentation
 
 Beside images a second stand milliseconds of processor time for an image, of the thread that steps and of all
-threads: on a machine that has other work to do too, they say more. Neither judging nor writing the
-state counts, as in a training's own log. Steps are spread over the whole stage, as kinds of networks vary their images with it.
+threads: on a machine that has other work to do too, they say more. Neither judging nor writing the state
+counts, as in a training's own log. Steps are spread over the whole stage, as kinds of networks vary their
+images with it.
 """
 
 from __future__ import annotations
