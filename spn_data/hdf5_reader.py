@@ -235,6 +235,11 @@ class DatasetGroup:
         read = self._read("points", lambda: {n: d[part] for n, d in self._points.items()})
         return FramePoints(read["ids"], read["pixels"], read["xyz"])
 
+    def point_ids(self) -> list[np.ndarray]:
+        """For each frame the ids (K,) of the map points that it sees, all read at once."""
+        ids = self._read("points", lambda: self._points["ids"][:])
+        return np.split(ids, self._ends[1:-1]) if len(self) else []
+
     def training_points(self, row: int) -> FramePoints:
         """As `points`, where a network may learn from them. Raises InputError in any other group."""
         if not self.points_for_training:

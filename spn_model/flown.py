@@ -162,7 +162,9 @@ class Views:
                 target = canonical_camera([camera], RenderingOptions(width_px=width_px))
             renderer = Renderer(camera, target)
             if not renderer.valid.any():
-                raise GeometryError("the camera sees nothing of the view that the network was trained on")
+                raise GeometryError(
+                    "the camera sees nothing of the view that the network was trained on"
+                )
             self.seen = min(self.seen, float(renderer.valid.mean()))
             self._renderers[key] = renderer
         return self._renderers[key]

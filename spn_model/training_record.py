@@ -16,13 +16,14 @@ from spn_data.errors import GeometryError
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_model import checkpoint
-from spn_model.covariance_scale import measured_scale
+from spn_model.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.members.member import Member
 from spn_model.training_state import Log, Position, save_state
 from spn_model.validation import Errors, judge, spread_rows
 from spn_model.view import View
 
 _WORSE = 1.05  # a later network is kept where its score is at most this times the best one
+_SHOWN_SHARE = 0.5  # of a validation frame's map points, seen by training images too
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,23 @@ def judged_frames(
     dataset: Dataset, training: DatasetGroup, frames: int, sample: int
 ) -> list[Judged]:
     """Validation frames, where there are any, and a sample of those that are trained on."""
-    found = [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size]
-    judged = [Judged("validation", g, spread_rows(len(g), frames)) for g in found[:1]]
+    judged = []
+    for group in [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size][:1]:
+        rows = _shown_to_training(group, training)
+        judged.append(Judged("validation", group, rows[spread_rows(len(rows), frames)]))
     return [*judged, Judged("training", training, spread_rows(len(training), sample))]
+
+
+def _shown_to_training(group: DatasetGroup, training: DatasetGroup) -> np.ndarray:
+    """Rows of a group of whose map points training images show half or more; all rows where they are few.
+
+    Of a place that no training image shows a network can know nothing: such frames tell neither which
+    moment of a training was best nor how large covariances are.
+    """
+    known = np.unique(np.concatenate(training.point_ids()))
+    shares = [np.isin(ids, known).mean() if len(ids) else 0.0 for ids in group.point_ids()]
+    rows = np.flatnonzero(np.array(shares) >= _SHOWN_SHARE)
+    return rows if len(rows) >= LEAST_FRAMES else np.arange(len(group))
 
 
 @dataclass(eq=False)

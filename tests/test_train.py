@@ -316,6 +316,27 @@ def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
     assert kept == [1, 1, 3]
 
 
+def test_frames_of_places_that_no_training_image_shows_do_not_judge(tmp_path):
+    """Of 24 validation frames, 12 see points of their own alone; where 5 are left, all judge."""
+    for strange, expected in ((12, 12), (19, 24)):
+        path = tmp_path / f"{strange}.h5"
+        with DatasetWriter(
+            path, INFO, {"train": Role.TRAIN, "validation": Role.VALIDATION}
+        ) as writer:
+            for k in range(6):
+                writer.append("train", frame("train", k))
+            for k in range(24):
+                seen = frame("validation", k)
+                ids = seen.point_ids + (1000 if k < strange else 0)
+                writer.append("validation", replace(seen, point_ids=ids))
+        with Dataset(path) as dataset:
+            judged = judged_frames(dataset, dataset.groups["train"], 64, 4)
+        assert [one.event for one in judged] == ["validation", "training"]
+        assert len(judged[0].rows) == expected
+        if expected == 12:
+            assert judged[0].rows.min() == 12
+
+
 @pytest.mark.parametrize("at", [0.0, 0.6])
 def test_a_training_that_turns_to_nan_stops(field, tmp_path, at):
     """It says so, and keeps the checkpoint of before; without one it says that too."""
