@@ -22,7 +22,9 @@ from spn_model.training_state import Log, Position, save_state
 from spn_model.validation import Errors, judge, spread_rows
 from spn_model.view import View
 
-_WORSE = 1.05  # a later network is kept where its score is at most this times the best one
+# A later network is kept where its score is at most this times the best one: rates fall towards the end, and
+# validation frames are few and of one or two places.
+_WORSE = 1.25
 _SHOWN_SHARE = 0.5  # of a validation frame's map points, seen by training images too
 
 
