@@ -104,6 +104,7 @@ def _run(
         if not busy:
             return
         for connection in wait(list(busy), _LOOK_S):
+            raise_if_interrupted()
             assert isinstance(connection, Connection)
             worker = busy[connection]
             assert worker.batch is not None
