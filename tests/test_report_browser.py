@@ -68,12 +68,24 @@ class Visit:
 
 
 def visit(
-    tmp_path: Path, page: str, probe: str = "", *, before: str = "", phone: bool = False
+    tmp_path: Path,
+    page: str,
+    probe: str = "",
+    *,
+    before: str = "",
+    phone: bool = False,
+    when_loaded: bool = False,
 ) -> Visit:
-    """Open a page in headless Chromium, run a probe in it, and read the document that it leaves."""
+    """Open a page in headless Chromium, run a probe in it, and read the document that it leaves.
+
+    when_loaded : the probe waits for the page's images too.
+    """
     if before:
         page = page.replace("<body>", f"<body><script>{before}</script>", 1)
-    page = page.replace("</body>", PROBE % f"{probe}\nreport();" + "</body>")
+    probe = f"{probe}\nreport();"
+    if when_loaded:
+        probe = f'window.addEventListener("load", () => {{ {probe} }});'
+    page = page.replace("</body>", PROBE % probe + "</body>")
     if phone:  # a window of Chromium has a least width, a frame has none
         page = (
             f'<body><iframe srcdoc="{html.escape(page)}" width="390" height="844"></iframe></body>'

@@ -267,6 +267,7 @@ def test_a_hostile_figure_runs_nothing_in_a_browser(root, tmp_path):
         found.first = atob(images[0].src.split(",")[1]).includes("hacked");
         found.wide = document.documentElement.scrollWidth <= window.innerWidth;
         """,
+        when_loaded=True,
     )
     assert seen.found["first"]
     assert seen.console == []
