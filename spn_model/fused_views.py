@@ -27,6 +27,7 @@ _STRANGE = (
 )  # times by which, and grey levels beyond which, a colour differs from two alike
 _ALIKE = 40.0  # grey levels by which two sources of the same ground may differ
 _BLURRED = 0.1  # a source that shows less of a pixel shows nothing
+_GOOD = 0.6  # one that shows so much is enough for a surface that it has too, three for others
 _MOST_REDUCED = 3  # halvings of a source's image, where it is finer than the view
 
 
@@ -98,10 +99,12 @@ def _painted(
     distance = np.sqrt(_dot(toward, toward))
     values = np.zeros((len(xyz), max(len(chosen), 3)), np.float32)
     colours = np.zeros((len(xyz), max(len(chosen), 3), 3), np.uint8)
+    left, good = np.arange(len(xyz)), np.zeros(len(xyz), np.int64)
     for n, k in enumerate(chosen):
         row = int(sources.rows[k])
         source = data.poses[row : row + 1]
-        index, at, depth = projected(xyz, source, data.intrinsics[row], data.size)
+        index, at, depth = projected(xyz[left], source, data.intrinsics[row], data.size)
+        index = left[index]
         own = surface_of(row)
         with np.errstate(invalid="ignore"):
             ratio = depth * own.at(at)
@@ -124,6 +127,8 @@ def _painted(
             values[index, n] = value[take]
             reduced = shrink * float(np.median(finer[take]))
             colours[index, n] = _colours(data.image(row), at, reduced)
+            good[index] += value[take] > _GOOD
+            left = left[good[left] < (1 if confirmed else 3)]
     colour, agreed = _agreed(values, colours)
     return colour, (values.max(axis=1) > 0) & (confirmed | agreed)
 

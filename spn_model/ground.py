@@ -11,7 +11,7 @@ _CELL = 0.05  # spreads, side of a cell in plan
 _THICK = 0.01  # spreads, to either side of its height: what still lies on it
 _NEAR = 3  # cells around one with a point on the ground that are ground too
 _BETWEEN = 6  # and so many between such cells
-_SHARE = 0.2  # of all cells, at least: their lowest point lies on it
+_SHARE = 0.12  # of all cells, at least: all their points lie low, the lowest on it
 _LARGEST = 2000  # cells along a side: a scene is no larger
 
 
@@ -54,8 +54,8 @@ class Ground:
 def level_ground(xyz: np.ndarray, spread: float) -> Ground | None:
     """The ground of a scene whose z points up, from its map points (N, 3); None where it has no level one.
 
-    In each cell in plan the lowest point counts: a facade has points at all heights. The ground is the
-    height at which most of them lie, and a clear share does.
+    In each cell in plan the lowest point counts, where none lies clearly higher: a facade has points at all
+    heights. The ground is the height at which most of them lie, and a clear share of all cells does.
     """
     cell, thick = _CELL * spread, _THICK * spread
     corner = xyz[:, :2].min(axis=0) - (_BETWEEN + 1) * cell
@@ -64,11 +64,17 @@ def level_ground(xyz: np.ndarray, spread: float) -> Ground | None:
     if max(columns, rows) > _LARGEST:
         return None
     lowest = np.full(rows * columns, np.inf)
-    np.minimum.at(lowest, at @ [1, columns], xyz[:, 2])
-    lowest = np.sort(lowest[np.isfinite(lowest)])
+    highest = np.full(rows * columns, -np.inf)
+    index = at @ np.array([1, columns])
+    np.minimum.at(lowest, index, xyz[:, 2])
+    np.maximum.at(highest, index, xyz[:, 2])
+    occupied = np.isfinite(lowest)
+    lowest = np.sort(lowest[highest - lowest < cell])
+    if not len(lowest):
+        return None
     within = np.searchsorted(lowest, lowest + 2 * thick) - np.arange(len(lowest))
     first = int(within.argmax())
-    if within[first] < _SHARE * len(lowest):
+    if within[first] < _SHARE * occupied.sum():
         return None
     height = float(np.median(lowest[first : first + within[first]]))
     here = at[np.abs(xyz[:, 2] - height) < thick]

@@ -119,8 +119,11 @@ class Examples:
         )
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
         self._sources: Sources | None = None
+        self._looks_down = False
         if options.views_share and options.views_fused:
             self._sources = Sources(data, center, spread, _FAR * spread)
+            lies_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
+            self._looks_down = data.up_is_known and bool(lies_below.any())
 
     def batch(
         self, rows: np.ndarray, generator: np.random.Generator, progress: float
@@ -241,7 +244,7 @@ class Examples:
         generator = np.random.default_rng(number)
         if self._sources is None:
             return self._moved(row, seen, generator)
-        high = self._data.up_is_known and generator.random() < self._options.views_high
+        high = self._looks_down and generator.random() < self._options.views_high
         for _ in range(_ATTEMPTS):
             if high:
                 centers, scene = self._data.poses.centers, self._sources.samples
