@@ -82,7 +82,7 @@ def test_a_fused_view_is_what_a_camera_there_would_see(data, sources, shrink):
     off = np.linalg.norm(xyz - points, axis=2)[known]
     assert np.median(off) < 0.01
     assert np.percentile(off, 90) < 0.1
-    assert np.median(np.abs(image - expected).max(axis=2)[known]) < 14
+    assert np.median(np.abs(image - expected).max(axis=2)[known]) < 5
     assert (image[~known] == FILL).all()
 
 
@@ -207,7 +207,7 @@ def test_high_places_look_down_at_the_scene(data, sources):
     centers, scene = data.poses.centers, sources.samples
     options = ViewOptions(side_m=1.5, height_m=6.0)
     rng = np.random.default_rng(0)
-    places = [high_place(rng, centers, scene, options) for _ in range(60)]
+    places = [high_place(rng, centers, scene, options) for _ in range(150)]
     at = np.concatenate([place.centers for place in places])
     rotations = np.concatenate([place.rotations for place in places])
     assert at[:, 2].min() >= np.median(centers[:, 2])
@@ -217,8 +217,7 @@ def test_high_places_look_down_at_the_scene(data, sources):
     assert (rotations[:, 1, 2] <= 0).all()  # the image's upper edge is up
     assert np.linalg.det(rotations) == pytest.approx(1)
     pitch = np.degrees(np.arcsin(-rotations[:, 2, 2]))
-    assert pitch.min() < 25
-    assert pitch.max() > 65
+    assert np.histogram(pitch, [0, 30, 60, 90])[0].min() > 30
 
 
 def test_a_camera_may_look_straight_down():
