@@ -21,10 +21,8 @@ _HIDING_PX = 12  # side of the cells in which a map point hides what lies behind
 _HIDDEN = 1.25  # ratio of depths to the nearest point around, from which a point is hidden
 _BEFORE_PX = 4  # around a map point that lies before the ground, which is not drawn there
 _SAME = (0.9, 1.08)  # ratio of depths of one surface, as a source and as the view has it
-_STRANGE = (
-    2.0,
-    20.0,
-)  # times by which, and grey levels beyond which, a colour differs from two alike
+_STRANGE = 2.0  # times by which a colour differs from two others, more than they do from each other
+_STRANGE_LEVELS = 20.0  # and by so many grey levels more
 _ALIKE = 40.0  # grey levels by which two sources of the same ground may differ
 _BLURRED = 0.1  # a source that shows less of a pixel shows nothing
 _GOOD = 0.6  # one that shows so much is enough for a surface that it has too, three for others
@@ -156,7 +154,7 @@ def _agreed(values: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.nda
         np.where(there[:, 1], np.abs(first - second).max(axis=1), np.inf),
         np.where(there[:, 2], np.abs(first - third).max(axis=1), np.inf),
     )
-    strange = (off > _STRANGE[0] * apart + _STRANGE[1]) & there[:, 2]
+    strange = (off > _STRANGE * apart + _STRANGE_LEVELS) & there[:, 2]
     agreed = np.where(strange, apart, off) < _ALIKE
     return colours[every, np.where(strange, best[:, 1], best[:, 0])], agreed
 

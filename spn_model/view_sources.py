@@ -85,39 +85,39 @@ class Sources:
         self.centers = data.poses.centers[self.rows]
         self._axes = data.poses.rotations[self.rows, 2]
         self._apart = _APART * spread
-        # The ground hides nothing, and at a flat angle its nearer parts lie close below the farther ones.
-        hiding = np.unique(np.round(xyz / (_FINE * spread)).astype(np.int64), axis=0)
-        hiding = hiding * (_FINE * spread)
-        if self.ground is not None:
-            hiding = hiding[~self.ground.has(hiding)]
-        self.occluders = []
-        for row in self.rows:
-            pose = data.poses[row : row + 1]
-            _, pixels, depth = projected(hiding, pose, data.intrinsics[row], data.size)
-            self.occluders.append(Occluders.of(pixels, depth, data.size, _OCCLUDER_PX))
+        self.occluders = self._all_occluders(data, xyz, _FINE * spread)
         # Places of the scene: one for each voxel with map points, and for each cell of the ground.
-        voxel = np.floor((xyz - center) / (_VOXEL * spread)).astype(np.int64) @ [
-            1,
-            1 << 20,
-            1 << 40,
-        ]
-        _, first, place = np.unique(voxel, return_index=True, return_inverse=True)
+        voxel = np.floor((xyz - center) / (_VOXEL * spread)).astype(np.int64)
+        _, first, place = np.unique(
+            voxel @ np.array([1, 1 << 20, 1 << 40]), return_index=True, return_inverse=True
+        )
         self.samples = xyz[first]
         self._source, self._place = np.unique(np.column_stack([owner, place]), axis=0).T
         facing = np.ones(len(self._source))
         if self.ground is not None:
-            self._see_ground(data, self.ground, facing)
-        else:
-            self._facing = facing
+            facing = np.concatenate([facing, self._see_ground(data, self.ground)])
         toward = self.samples[self._place] - self.centers[self._source]
         distance = np.linalg.norm(toward, axis=1)
-        self._resolution = (np.sqrt(self._facing) / distance).astype(np.float32)
+        self._resolution = (np.sqrt(facing) / distance).astype(np.float32)
         self._toward = (toward / distance[:, None]).astype(np.float32)
 
-    def _see_ground(self, data: TrainingSet, ground: Ground, facing: np.ndarray) -> None:
-        """Adds the ground's cells to what the sources see."""
+    def _all_occluders(self, data: TrainingSet, xyz: np.ndarray, step: float) -> list[Occluders]:
+        """Of all sources, from all map points (N, 3): one image has few on what is smooth."""
+        hiding = np.unique(np.round(xyz / step).astype(np.int64), axis=0) * step
+        # The ground hides nothing, and at a flat angle its nearer parts lie close below the farther ones.
+        if self.ground is not None:
+            hiding = hiding[~self.ground.has(hiding)]
+        made = []
+        for row in self.rows:
+            pose = data.poses[row : row + 1]
+            _, pixels, depth = projected(hiding, pose, data.intrinsics[row], data.size)
+            made.append(Occluders.of(pixels, depth, data.size, _OCCLUDER_PX))
+        return made
+
+    def _see_ground(self, data: TrainingSet, ground: Ground) -> np.ndarray:
+        """Adds the ground's cells to what the sources see; the sines of the angles at which they do."""
         cells = ground.samples()
-        sources, places, angles = [self._source], [self._place], [facing]
+        sources, places, sines = [self._source], [self._place], [np.empty(0)]
         for k, row in enumerate(self.rows):
             pose = data.poses[row : row + 1]
             index, pixels, depth = projected(cells, pose, data.intrinsics[row], data.size)
@@ -125,15 +125,15 @@ class Sources:
             sources.append(np.full(len(index), k))
             places.append(index + len(self.samples))
             away = pose.centers[0] - cells[index]
-            angles.append(np.maximum(away[:, 2], 0) / np.linalg.norm(away, axis=1))
+            sines.append(np.maximum(away[:, 2], 0) / np.linalg.norm(away, axis=1))
         self.samples = np.concatenate([self.samples, cells])
         self._source, self._place = np.concatenate(sources), np.concatenate(places)
-        self._facing = np.concatenate(angles)
+        return np.concatenate(sines)
 
     def best(self, pose: Poses, matrix: np.ndarray, size: tuple[int, int], count: int) -> list[int]:
         """Up to `count` indices of sources, which together show most of what a camera would see.
 
-        Each part of the view counts by how finely its best source shows it, and from how like a direction.
+        Each part of the view counts alike; a source by how finely it shows it, and from how like a direction.
         """
         index, pixels, _ = projected(self.samples, pose, matrix, size)
         if not len(index):
@@ -150,9 +150,8 @@ class Sources:
         distance = np.linalg.norm(toward, axis=1)
         alike = (self._toward[use] * (toward / distance[:, None])[place]).sum(axis=1)
         value = np.minimum(self._resolution[use] * distance[place], 1) * np.maximum(alike, 0.05)
-        wanted = weight
+        wanted, taken = weight, np.zeros(len(self.rows), bool)
         chosen: list[int] = []
-        taken = np.zeros(len(self.rows), bool)
         for _ in range(count):
             total = np.bincount(source, value * wanted[place], len(self.rows))
             total[taken] = 0
@@ -161,9 +160,8 @@ class Sources:
                 break
             chosen.append(best)
             # Neighbouring frames are misled by the same things: they confirm nothing.
-            taken |= (np.linalg.norm(self.centers - self.centers[best], axis=1) < self._apart) & (
-                self._axes @ self._axes[best] > _SAME_WAY
-            )
+            near = np.linalg.norm(self.centers - self.centers[best], axis=1) < self._apart
+            taken |= near & (self._axes @ self._axes[best] > _SAME_WAY)
             mine = source == best
             wanted[place[mine]] *= 1 - _SEEN * value[mine]
         return chosen
