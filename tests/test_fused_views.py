@@ -234,9 +234,9 @@ def test_a_camera_may_look_straight_down():
 
 def test_a_stage_begins_with_few_views(data):
     """At its beginning a batch is drawn from the first 32 views alone, near its end from all."""
-    options = StageOptions(views_share=1.0, views_per_image=3, size_min=0.4, size_max=0.5)
+    options = StageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
     numbers: dict[float, set[int]] = {}
-    for progress in (0.0, 0.35, 0.9):
+    for progress in (0.0, 0.5, 0.9):
         examples = Examples(data, options, CENTER, SPREAD, 2)
         drawn: list[int] = []
         examples._view = lambda n, to=drawn, of=examples: (
@@ -247,7 +247,7 @@ def test_a_stage_begins_with_few_views(data):
             examples.batch(np.arange(24), rng, progress)
         numbers[progress] = set(drawn)
     assert max(numbers[0.0]) == 31
-    assert max(numbers[0.35]) == 41
+    assert max(numbers[0.5]) == 44
     assert max(numbers[0.9]) == 71
 
 

@@ -23,9 +23,9 @@ from spn_model.virtual_views import ViewOptions, high_place, random_place, view_
 
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
-_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 30 to 80 ms
+_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 20 to 80 ms
 _FIRST_VIEWS = 32  # at a stage's beginning: it does not wait until all are made
-_ALL_VIEWS_AT = 0.6  # progress from which on all of them are drawn
+_ALL_VIEWS_AT = 0.8  # progress from which on all of them are drawn
 _GOLDEN = 0.6180339887498949  # steps of it fill the circle evenly, however many
 _LEAST_SHOWN = 0.3  # share of a view that has to show something
 _ATTEMPTS = 4  # at such a view
@@ -49,7 +49,7 @@ class StageOptions:
     ramp_share: float = 0.2  # first share of the stage, over which turns and zooms grow to these
     look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
     views_share: float = 0.0  # share of images rendered from another place
-    views_per_image: int = 2  # of these, for each training image, as far as memory reaches
+    views: int = 1000  # how many of these are made, as far as memory reaches
     views_fused: bool = True  # of several images; else each is one training image, moved
     views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
     views_side: float = 0.2  # how far aside
@@ -69,7 +69,7 @@ class StageOptions:
             ("size_max", self.size_min, 10),
             ("ramp_share", 0, 1),
             ("views_share", 0, 1),
-            ("views_per_image", 1, 1000),
+            ("views", 1, 1_000_000),
             ("views_rise", 0, 10),
             ("views_side", 0, 10),
             ("views_high", 0, 1),
@@ -114,9 +114,7 @@ class Examples:
         self._view_shrink = shrink if fits else 1
         surface_step = self._view_shrink if options.views_fused else step
         view_bytes = width * height * (3 / self._view_shrink**2 + 4 / surface_step**2)
-        self._view_count = min(
-            len(data) * options.views_per_image, max(1, int(_VIEW_BYTES / view_bytes))
-        )
+        self._view_count = min(options.views, max(1, int(_VIEW_BYTES / view_bytes)))
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
         self._sources: Sources | None = None
         self._looks_down = False
