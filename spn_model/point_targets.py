@@ -69,15 +69,19 @@ class Surface:
     pose: Poses
     matrix: np.ndarray
 
-    def xyz(self, pixels: np.ndarray) -> np.ndarray:
-        """(N, 3) points of the world that pixels (N, 2) show; NaN outside and where it is unknown."""
+    def at(self, pixels: np.ndarray) -> np.ndarray:
+        """(N,) inverse depth at pixels (N, 2); NaN outside and where it is unknown."""
         rows, columns = self.inverse_depth.shape
         with np.errstate(invalid="ignore"):
             cell = np.floor(pixels / self.step_px)
             inside = (cell[:, 0] >= 0) & (cell[:, 1] >= 0)
             inside &= (cell[:, 0] < columns) & (cell[:, 1] < rows)
         x, y = np.where(inside[:, None], cell, 0).astype(np.int64).T
-        inverse = np.where(inside, self.inverse_depth[y, x], np.nan)
+        return np.where(inside, self.inverse_depth[y, x], np.nan)
+
+    def xyz(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the world that pixels (N, 2) show; NaN outside and where it is unknown."""
+        inverse = self.at(pixels)
         rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
         rays = rays @ np.linalg.inv(self.matrix).T
         return rays / inverse[:, None] @ self.pose.rotations[0] + self.pose.centers[0]

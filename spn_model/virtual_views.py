@@ -1,4 +1,4 @@
-"""Training images from places where no flight was: an image moved along with the surface that it shows."""
+"""Places where no flight was, and a training image moved there along with the surface that it shows."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from spn_data.pose import Poses, rotations_from_vectors
 from spn_model.point_targets import Surface, cell_centers
 
 _NEAREST = 0.5  # depth, in metres, before which nothing is drawn
+_PITCH_DEG = 5.0  # around a drawn pitch: places that are looked at alike
 _SAME_SURFACE = 1.05  # ratio of depths up to which two samples of a pixel are mixed
 _SEAM_PX = 6.0  # by more, what neighbouring cells show lies on different surfaces
 
@@ -21,6 +22,7 @@ class ViewOptions:
 
     rise_m: float = 11.0  # largest, evenly from 0
     side_m: float = 4.0  # largest level move along each axis, to either side
+    height_m: float = 13.0  # of a high place above the highest training image, at most
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, of length 1
 
 
@@ -46,6 +48,38 @@ def random_place(generator: np.random.Generator, seen: Surface, options: ViewOpt
     angle = np.arctan2(sine, before @ after)
     turn = rotations_from_vectors((axis / max(sine, 1e-12) * angle)[None])[0]
     return Poses.from_rotations((center + move)[None], (rotation @ turn.T)[None])
+
+
+def high_place(
+    generator: np.random.Generator, centers: np.ndarray, scene: np.ndarray, options: ViewOptions
+) -> Poses:
+    """(1,) pose of a level camera above the scene, which looks down at one of its places (P, 3).
+
+    It stands beside one of the training images' centers (N, 3), as high as half of them at least, and looks
+    level or straight down as often as anything between, as far as the scene has places there. z is up.
+    Raises ValueError where nothing of the scene lies below.
+    """
+    center = centers[generator.integers(len(centers))].copy()
+    center[:2] += generator.uniform(-1, 1, 2) * options.side_m
+    lowest, highest = np.median(centers[:, 2]), centers[:, 2].max() + options.height_m
+    center[2] = generator.uniform(lowest, highest)
+    toward = scene - center
+    toward = toward[toward[:, 2] < 0]
+    if not len(toward):
+        raise ValueError("nothing of the scene lies below its training images")
+    pitch = np.degrees(np.arctan2(-toward[:, 2], np.hypot(toward[:, 0], toward[:, 1])))
+    off = np.abs(pitch - generator.uniform(0, 90))
+    toward = toward[off <= max(_PITCH_DEG, off.min())]
+    forward = toward[generator.integers(len(toward))]
+    forward = forward / np.linalg.norm(forward)
+    # Straight down there is no level direction to the right but by chance.
+    azimuth = generator.uniform(0, 2 * np.pi)
+    level = np.hypot(forward[0], forward[1])
+    if level > 1e-6:
+        azimuth = np.arctan2(forward[0], forward[1])
+    right = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Poses.from_rotations(center[None], rotation[None])
 
 
 def view_from(

@@ -77,7 +77,7 @@ def frame(group: str, k: int, points: int) -> DatasetFrame:
         quat_wxyz=pose.quats_wxyz[0],
         intrinsics=CAMERA.matrix,
         image=image,
-        point_ids=np.arange(points),
+        point_ids=np.arange(points) + k * points,
         point_pixels=pixels.astype(np.float32),
         point_xyz=shown.reshape(-1, 3)[at],
     )

@@ -35,6 +35,8 @@ STILL = {
     "look": False,
 }
 VIEWS = {"views_share": 0.5, "views_rise": 0.3}
+# No higher than the hall.
+HIGH = {"views_share": 1.0, "views_rise": 0.3, "views_height": 0.3}
 
 
 @pytest.fixture(autouse=True)
@@ -106,11 +108,13 @@ def test_images_follow_the_zoom(data):
     ("stage", "known_share", "shrink"),
     [
         ({}, 0.25, 1),
-        ({"views_share": 1.0, "views_rise": 0.3}, 0.2, 1),
-        ({"views_share": 1.0, "views_rise": 0.3}, 0.2, 2),
+        (HIGH, 0.2, 1),
+        (HIGH, 0.2, 2),
+        ({"views_share": 1.0, "views_rise": 0.3, "views_fused": False}, 0.2, 1),
+        ({"views_share": 1.0, "views_rise": 0.3, "views_fused": False}, 0.2, 2),
         ({"surfaces": False}, 0.15, 1),
     ],
-    ids=["surfaces", "views", "reduced views", "points"],
+    ids=["surfaces", "views", "reduced views", "moved images", "reduced moved images", "points"],
 )
 def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
     """A pose made of the targets alone is that of a camera that would take this very image.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from threading import Lock
 from typing import Any, ClassVar
 
 import numpy as np
@@ -57,6 +58,7 @@ class SceneCoordinatesMember(Member):
         self.decoding = decoding
         self._stage = StageOptions()
         self._examples: tuple[TrainingSet, Examples] | None = None
+        self._making_examples = Lock()
 
     @classmethod
     def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesMember:
@@ -116,11 +118,13 @@ class SceneCoordinatesMember(Member):
 
         See `Examples.batch`: all images have one zoom, and smaller ones are more than the rows.
         """
-        if self._examples is None or self._examples[0] is not data:
-            center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
-            made = Examples(data, self._stage, center, spread, self.network.shrink)
-            self._examples = (data, made)
-        images, targets, known = self._examples[1].batch(rows, generator, progress)
+        with self._making_examples:  # once, whichever thread comes first: it may take seconds
+            if self._examples is None or self._examples[0] is not data:
+                center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
+                made = Examples(data, self._stage, center, spread, self.network.shrink)
+                self._examples = (data, made)
+            examples = self._examples[1]
+        images, targets, known = examples.batch(rows, generator, progress)
         return {
             "images": torch.from_numpy(images),
             "targets": torch.from_numpy(targets),

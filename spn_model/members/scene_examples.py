@@ -9,6 +9,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
+from spn_model.fused_views import fused_view
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -17,11 +18,17 @@ from spn_model.networks.scene_coordinates import (
 )
 from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, cell_targets, surface
 from spn_model.training_set import TrainingSet
-from spn_model.virtual_views import ViewOptions, random_place, view_from
+from spn_model.view_sources import Sources
+from spn_model.virtual_views import ViewOptions, high_place, random_place, view_from
 
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
-_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 30 ms
+_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 20 to 80 ms
+_FIRST_VIEWS = 32  # at a stage's beginning: it does not wait until all are made
+_ALL_VIEWS_AT = 0.8  # progress from which on all of them are drawn
+_GOLDEN = 0.6180339887498949  # steps of it fill the circle evenly, however many
+_LEAST_SHOWN = 0.3  # share of a view that has to show something
+_ATTEMPTS = 4  # at such a view
 _RAMP_FROM = 0.3  # of turns, and of zooms in their logarithm, at a stage's beginning
 
 
@@ -42,9 +49,12 @@ class StageOptions:
     ramp_share: float = 0.2  # first share of the stage, over which turns and zooms grow to these
     look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
     views_share: float = 0.0  # share of images rendered from another place
-    views_per_image: int = 4  # of these, for each training image, as far as memory reaches
+    views: int = 1000  # how many of these are made, as far as memory reaches
+    views_fused: bool = True  # of several images; else each is one training image, moved
     views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
     views_side: float = 0.2  # how far aside
+    views_high: float = 0.4  # share of fused views that look down from anywhere above the scene
+    views_height: float = 0.7  # spreads above the highest training image, at most
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -59,9 +69,11 @@ class StageOptions:
             ("size_max", self.size_min, 10),
             ("ramp_share", 0, 1),
             ("views_share", 0, 1),
-            ("views_per_image", 1, 1000),
+            ("views", 1, 1_000_000),
             ("views_rise", 0, 10),
             ("views_side", 0, 10),
+            ("views_high", 0, 1),
+            ("views_height", 0, 10),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -92,6 +104,7 @@ class Examples:
         self._view_options = ViewOptions(
             rise_m=options.views_rise * spread,
             side_m=options.views_side * spread,
+            height_m=options.views_height * spread,
             up=(0.0, 0.0, 1.0) if data.up_is_known else _mean_up(data),
         )
         self._surfaces: dict[int, Surface] = {}
@@ -99,11 +112,16 @@ class Examples:
         step = self._surface_options.step_px
         fits = step % shrink == 0 and width % shrink == 0 and height % shrink == 0
         self._view_shrink = shrink if fits else 1
-        view_bytes = width * height * (3 / self._view_shrink**2 + 4 / step**2)
-        self._view_count = min(
-            len(data) * options.views_per_image, max(1, int(_VIEW_BYTES / view_bytes))
-        )
+        surface_step = self._view_shrink if options.views_fused else step
+        view_bytes = width * height * (3 / self._view_shrink**2 + 4 / surface_step**2)
+        self._view_count = min(options.views, max(1, int(_VIEW_BYTES / view_bytes)))
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
+        self._sources: Sources | None = None
+        self._looks_down = False
+        if options.views_share and options.views_fused:
+            self._sources = Sources(data, center, spread, _FAR * spread)
+            lies_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
+            self._looks_down = data.up_is_known and bool(lies_below.any())
 
     def batch(
         self, rows: np.ndarray, generator: np.random.Generator, progress: float
@@ -122,7 +140,7 @@ class Examples:
         count = max(len(rows), round(len(rows) * min(2.0, whole / (width * height))))
         more = generator.integers(len(data), size=count - len(rows))
         made = [
-            self._example(int(row), generator, warp, zoom / self._shrink, (width, height))
+            self._example(int(row), generator, progress, warp, zoom / self._shrink, (width, height))
             for row in np.concatenate([rows, more])
         ]
         images, targets, known = (np.stack(part) for part in zip(*made, strict=True))
@@ -143,11 +161,12 @@ class Examples:
         self,
         row: int,
         generator: np.random.Generator,
+        progress: float,
         options: WarpOptions,
         zoom: float,
         size: tuple[int, int],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        image, seen = self._source(row, generator)
+        image, seen = self._source(row, generator, progress)
         matrix = self._data.intrinsics[row] if seen is None else seen.matrix
         # A view is kept as small as it is needed.
         zoom *= self._data.size[0] / image.shape[1]
@@ -179,11 +198,11 @@ class Examples:
         return image, np.where(known, targets, np.float32(0)), known
 
     def _source(
-        self, row: int, generator: np.random.Generator
+        self, row: int, generator: np.random.Generator, progress: float
     ) -> tuple[np.ndarray, Surface | None]:
         """A training image, or a view rendered from any of them, with the surface that it shows."""
         if generator.random() < self._options.views_share:
-            number = int(generator.integers(self._view_count))
+            number = int(generator.integers(self._views_at(progress)))
             if number not in self._views:
                 self._views[number] = self._view(number)
             return self._views[number]
@@ -209,13 +228,45 @@ class Examples:
             )
         return self._surfaces[row]
 
+    def _views_at(self, progress: float) -> int:
+        """How many views are drawn from, the first ones: they are made bit by bit, beside the training."""
+        share = min(1.0, progress / _ALL_VIEWS_AT)
+        return min(self._view_count, max(_FIRST_VIEWS, round(self._view_count * share)))
+
     def _view(self, number: int) -> tuple[np.ndarray, Surface]:
-        row = number * len(self._data) // self._view_count
+        row = int(number * _GOLDEN % 1 * len(self._data))
         seen = self._surface(row)
         if not np.isfinite(seen.inverse_depth).any():
             return self._image(row), seen
         # A view is the same whenever it is made: a batch depends on its arguments alone.
         generator = np.random.default_rng(number)
+        if self._sources is None:
+            return self._moved(row, seen, generator)
+        high = self._looks_down and generator.random() < self._options.views_high
+        for _ in range(_ATTEMPTS):
+            if high:
+                centers, scene = self._data.poses.centers, self._sources.samples
+                place = high_place(generator, centers, scene, self._view_options)
+            else:
+                place = random_place(generator, seen, self._view_options)
+            red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
+            image, fused = fused_view(
+                self._data,
+                self._sources,
+                self._surface,
+                place,
+                self._data.intrinsics[row],
+                self._view_shrink,
+                (red, green, blue),
+                self._surface_options,
+            )
+            if np.isfinite(fused.inverse_depth).mean() > _LEAST_SHOWN:
+                return image, fused
+        return self._image(row), seen
+
+    def _moved(
+        self, row: int, seen: Surface, generator: np.random.Generator
+    ) -> tuple[np.ndarray, Surface]:
         place = random_place(generator, seen, self._view_options)
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
         image, moved = view_from(self._image(row), seen, place, (red, green, blue))

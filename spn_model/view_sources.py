@@ -1,0 +1,167 @@
+"""Which training images show best what a camera at another place would see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spn_data.pose import Poses
+from spn_model.ground import Ground, level_ground
+from spn_model.training_set import TrainingSet
+
+_MOST_IMAGES = 600  # that views are made of; neighbouring frames of a video show the same
+_VOXEL = 0.05  # spreads, side of what counts as one place of the scene
+_FINE = 0.005  # spreads, between map points that hide what lies behind them
+_APART = 0.05  # spreads, between sources of one view that look the same way
+_SAME_WAY = 0.9  # cosine between their axes
+_OCCLUDER_PX = 6  # in a source a map point hides what lies behind it, so far around it at least
+_CLEARLY = 0.93  # ratio of depths below which a point lies before another
+_NEAREST = 0.1  # depth, in metres, before which nothing is seen
+_GRID = (16, 9)  # parts of a view that count alike
+_SEEN = 0.6  # by which a place is done with once a source shows it: others are to confirm it
+_WORTH = 0.005  # share of a view that one source more has to add
+
+
+@dataclass(frozen=True, eq=False)
+class Occluders:
+    """Depths (rows, columns) of the nearest map points around cells of one image, of cell_px."""
+
+    depth: np.ndarray
+    cell_px: int
+
+    @classmethod
+    def of(
+        cls, pixels: np.ndarray, depth: np.ndarray, size: tuple[int, int], cell_px: int
+    ) -> Occluders:
+        """From points at pixels (N, 2) of an image of a size, at depths (N,); each counts for 3 x 3 cells."""
+        columns, rows = (-(-side // cell_px) for side in size)
+        cell = np.floor(pixels / cell_px).astype(np.int64)
+        inside = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1) & (depth > 0)
+        nearest = np.full(rows * columns, 1e30, np.float32)
+        index = cell[inside] @ np.array([1, columns])
+        np.minimum.at(nearest, index, depth[inside].astype(np.float32))
+        return cls(cv2.erode(nearest.reshape(rows, columns), np.ones((3, 3), np.uint8)), cell_px)
+
+    def hide(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether what lies at pixels (N, 2) of the image, at depths (N,), has one before it."""
+        x, y = (pixels / self.cell_px).astype(np.int64).T
+        return self.depth[y, x] < _CLEARLY * depth
+
+
+def projected(
+    xyz: np.ndarray, pose: Poses, matrix: np.ndarray, size: tuple[int, int], margin: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (K,) of the points (N, 3) that lie in an image, with their pixels (K, 2) and depths (K,)."""
+    # Row by row of the matrix: this is done for every pixel of a view and every source.
+    x, y, depth = (matrix @ pose.rotations[0]) @ (xyz - pose.centers[0]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = x / depth, y / depth
+        inside = (depth > _NEAREST) & (x > -margin) & (x < size[0] + margin)
+        inside &= (y > -margin) & (y < size[1] + margin)
+    index = np.flatnonzero(inside)
+    return index, np.column_stack([x[index], y[index]]), depth[index]
+
+
+class Sources:
+    """Training images as sources of views.
+
+    rows (S,) : which images; ground : None where there is none, or up is not known; occluders : of each
+    source; samples (P, 3) : places of the scene, of which is known who sees them, and how well.
+    """
+
+    def __init__(self, data: TrainingSet, center: np.ndarray, spread: float, far: float):
+        count = min(len(data), _MOST_IMAGES)
+        self.rows = np.unique(np.linspace(0, len(data) - 1, count).round().astype(np.int64))
+        seen = [data.points(int(row)) for row in self.rows]
+        owner = np.repeat(np.arange(len(seen)), [len(points.ids) for points in seen])
+        xyz = np.concatenate([points.xyz for points in seen])
+        near = np.linalg.norm(xyz - center, axis=1) < far
+        owner, xyz = owner[near], xyz[near]
+        self.ground: Ground | None = None
+        if data.up_is_known and len(xyz):
+            self.ground = level_ground(xyz, spread)
+        self.centers = data.poses.centers[self.rows]
+        self._axes = data.poses.rotations[self.rows, 2]
+        self._apart = _APART * spread
+        self.occluders = self._all_occluders(data, xyz, _FINE * spread)
+        # Places of the scene: one for each voxel with map points, and for each cell of the ground.
+        voxel = np.floor((xyz - center) / (_VOXEL * spread)).astype(np.int64)
+        _, first, place = np.unique(
+            voxel @ np.array([1, 1 << 20, 1 << 40]), return_index=True, return_inverse=True
+        )
+        self.samples = xyz[first]
+        self._source, self._place = np.unique(np.column_stack([owner, place]), axis=0).T
+        facing = np.ones(len(self._source))
+        if self.ground is not None:
+            facing = np.concatenate([facing, self._see_ground(data, self.ground)])
+        toward = self.samples[self._place] - self.centers[self._source]
+        distance = np.linalg.norm(toward, axis=1)
+        self._resolution = (np.sqrt(facing) / distance).astype(np.float32)
+        self._toward = (toward / distance[:, None]).astype(np.float32)
+
+    def _all_occluders(self, data: TrainingSet, xyz: np.ndarray, step: float) -> list[Occluders]:
+        """Of all sources, from all map points (N, 3): one image has few on what is smooth."""
+        hiding = np.unique(np.round(xyz / step).astype(np.int64), axis=0) * step
+        # The ground hides nothing, and at a flat angle its nearer parts lie close below the farther ones.
+        if self.ground is not None:
+            hiding = hiding[~self.ground.has(hiding)]
+        made = []
+        for row in self.rows:
+            pose = data.poses[row : row + 1]
+            _, pixels, depth = projected(hiding, pose, data.intrinsics[row], data.size)
+            made.append(Occluders.of(pixels, depth, data.size, _OCCLUDER_PX))
+        return made
+
+    def _see_ground(self, data: TrainingSet, ground: Ground) -> np.ndarray:
+        """Adds the ground's cells to what the sources see; the sines of the angles at which they do."""
+        cells = ground.samples()
+        sources, places, sines = [self._source], [self._place], [np.empty(0)]
+        for k, row in enumerate(self.rows):
+            pose = data.poses[row : row + 1]
+            index, pixels, depth = projected(cells, pose, data.intrinsics[row], data.size)
+            index = index[~self.occluders[k].hide(pixels, depth)]
+            sources.append(np.full(len(index), k))
+            places.append(index + len(self.samples))
+            away = pose.centers[0] - cells[index]
+            sines.append(np.maximum(away[:, 2], 0) / np.linalg.norm(away, axis=1))
+        self.samples = np.concatenate([self.samples, cells])
+        self._source, self._place = np.concatenate(sources), np.concatenate(places)
+        return np.concatenate(sines)
+
+    def best(self, pose: Poses, matrix: np.ndarray, size: tuple[int, int], count: int) -> list[int]:
+        """Up to `count` indices of sources, which together show most of what a camera would see.
+
+        Each part of the view counts alike; a source by how finely it shows it, and from how like a direction.
+        """
+        index, pixels, _ = projected(self.samples, pose, matrix, size)
+        if not len(index):
+            return []
+        columns, rows = _GRID
+        part = np.floor(pixels / size * _GRID).astype(np.int64) @ [1, columns]
+        weight = 1 / np.bincount(part, minlength=columns * rows)[part] / (columns * rows)
+        order = np.full(len(self.samples), -1)
+        order[index] = np.arange(len(index))
+        place = order[self._place]
+        use = place >= 0
+        place, source = place[use], self._source[use]
+        toward = self.samples[index] - pose.centers[0]
+        distance = np.linalg.norm(toward, axis=1)
+        alike = (self._toward[use] * (toward / distance[:, None])[place]).sum(axis=1)
+        value = np.minimum(self._resolution[use] * distance[place], 1) * np.maximum(alike, 0.05)
+        wanted, taken = weight, np.zeros(len(self.rows), bool)
+        chosen: list[int] = []
+        for _ in range(count):
+            total = np.bincount(source, value * wanted[place], len(self.rows))
+            total[taken] = 0
+            best = int(total.argmax())
+            if total[best] < _WORTH:
+                break
+            chosen.append(best)
+            # Neighbouring frames are misled by the same things: they confirm nothing.
+            near = np.linalg.norm(self.centers - self.centers[best], axis=1) < self._apart
+            taken |= near & (self._axes @ self._axes[best] > _SAME_WAY)
+            mine = source == best
+            wanted[place[mine]] *= 1 - _SEEN * value[mine]
+        return chosen
