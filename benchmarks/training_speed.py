@@ -26,7 +26,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -42,6 +42,7 @@ from torch import nn
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
 from spn_model.batches import generator_of_step, rows_of_step
+from spn_model.gradients import Gradients, gradients
 from spn_model.imagenet import MEAN, STD
 from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.members.member import Batch, Member
@@ -73,16 +74,6 @@ class Silent:
         return False
 
 
-def step(member: Member, batch: Batch, optimizer: torch.optim.Optimizer, clip: float) -> None:
-    """What one step computes."""
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    loss, _ = member.loss(batch)
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    nn.utils.clip_grad_norm_(parameters, clip or float("inf"))
-    optimizer.step()
-
-
 class Contest:
     """Loops over the same steps of one stage."""
 
@@ -99,15 +90,30 @@ class Contest:
         self.member, self.images, self.machine, self.jpegs = member, images, machine, jpegs
         self.stage = replace(stage, images=steps * stage.batch, minutes=0.0)
         self.optimizer, self.steps = optimizer, steps
-        self.batches = [self.batch(k) for k in range(steps)]
-        self.shown = sum(len(next(iter(batch.values()))) for batch in self.batches)
+        self.parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        self.batches = [self.parts(k) for k in range(steps)]
+        self.shown = sum(len(next(iter(part.values()))) for parts in self.batches for part in parts)
 
-    def batch(self, k: int) -> Batch:
-        """As the loop has it at step k."""
-        rows = rows_of_step(len(self.images), self.stage.batch, k, 0, 0)
+    def parts(self, k: int) -> list[Batch]:
+        """The batch of step k in its parts, as the loop has it."""
+        return [self.part(k, part, self.stage.parts) for part in range(self.stage.parts)]
+
+    def part(self, k: int, part: int, parts: int) -> Batch:
+        rows = rows_of_step(
+            len(self.images), self.stage.batch // parts, k, 0, 0, rank=part, world=parts
+        )
         progress = self.stage.progress(k * self.stage.batch, 0.0)
-        made = self.member.batch(self.images, rows, generator_of_step(0, 0, k), progress)
+        made = self.member.batch(self.images, rows, generator_of_step(0, 0, k, part), progress)
         return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
+
+    def step(self, gradient: Gradients, parts: list[Batch]) -> None:
+        """What one step computes."""
+        gradient.of(parts)
+        nn.utils.clip_grad_norm_(self.parameters, self.stage.clip or float("inf"))
+        self.optimizer.step()
+
+    def computing(self) -> AbstractContextManager[Gradients]:
+        return gradients(self.member, self.parameters, self.stage.parts, self.machine)
 
     def loop(self, record: Record) -> None:
         run_stage(
@@ -116,21 +122,25 @@ class Contest:
         )
 
     def bare(self) -> None:
-        for batch in self.batches:
-            step(self.member, batch, self.optimizer, self.stage.clip)
+        with self.computing() as gradient:
+            for parts in self.batches:
+                self.step(gradient, parts)
 
     def in_turns(self) -> None:
-        for k in range(self.steps):
-            step(self.member, self.batch(k), self.optimizer, self.stage.clip)
+        with self.computing() as gradient:
+            for k in range(self.steps):
+                self.step(gradient, self.parts(k))
 
     def plain(self) -> None:
-        for k, batch in enumerate(self.batches):
-            images = batch["images"]
-            rows = rows_of_step(len(self.images), len(images), k, 0, 0)
-            loaded = np.stack([self.decoded(int(row), images.shape[1:3]) for row in rows])
-            # The member normalises by itself: what was normalised here is not used for more than time.
-            assert loaded.shape == (len(rows), 3, *images.shape[1:3])
-            step(self.member, batch, self.optimizer, self.stage.clip)
+        with self.computing() as gradient:
+            for k, parts in enumerate(self.batches):
+                for part in parts:
+                    images = part["images"]
+                    rows = rows_of_step(len(self.images), len(images), k, 0, 0)
+                    loaded = np.stack([self.decoded(int(row), images.shape[1:3]) for row in rows])
+                    # The member normalises by itself: this is here for the time that it takes.
+                    assert loaded.shape == (len(rows), 3, *images.shape[1:3])
+                self.step(gradient, parts)
 
     def decoded(self, row: int, size: tuple[int, int]) -> np.ndarray:
         """(3, h, w) float32 of the JPEG of a training image."""
@@ -183,7 +193,7 @@ def measure(
             "bare": contest.bare,
             "in turns": contest.in_turns,
         }
-        if jpegs[0].is_file() and "images" in contest.batches[0]:
+        if jpegs[0].is_file() and "images" in contest.batches[0][0]:
             loops["plain"] = contest.plain
         contest.bare()  # nothing is made for the first time later on
         found: dict[str, list[Round]] = {name: [] for name in loops}

@@ -44,7 +44,7 @@ def torch_seed_of_step(seed: int, stage: int, step: int, rank: int = 0) -> int:
 
 
 class Ahead:
-    """Batches step by step; while one is used the next are made, in threads.
+    """Batches by their numbers; while one is used the next are made, in threads.
 
     Threads, since OpenCV, NumPy and torch let others run while they compute, and images need not be sent.
     waited_s : seconds that `next` has waited for a batch that was not ready.
@@ -53,14 +53,14 @@ class Ahead:
     def __init__(
         self, make: Callable[[int], Batch], first: int, pool: ThreadPoolExecutor, depth: int
     ):
-        self._make, self._step, self._pool = make, first, pool
+        self._make, self._number, self._pool = make, first, pool
         self._made: deque[Future[Batch]] = deque()
         self.waited_s = 0.0
         for _ in range(depth):
             self._order()
 
     def next(self) -> Batch:
-        """The batch of the next step. Raises what making it has raised."""
+        """The next batch. Raises what making it has raised."""
         began = time.perf_counter()
         batch = self._made.popleft().result()
         self.waited_s += time.perf_counter() - began
@@ -68,15 +68,20 @@ class Ahead:
         return batch
 
     def _order(self) -> None:
-        self._made.append(self._pool.submit(self._make, self._step))
-        self._step += 1
+        self._made.append(self._pool.submit(self._make, self._number))
+        self._number += 1
 
 
 @contextmanager
-def batches_ahead(make: Callable[[int], Batch], first: int, workers: int) -> Iterator[Ahead]:
-    """`make` is called with step `first` and those after it, by threads that end with the block."""
+def batches_ahead(
+    make: Callable[[int], Batch], first: int, workers: int, depth: int = 0
+) -> Iterator[Ahead]:
+    """`make` is called with number `first` and those after it, by threads that end with the block.
+
+    depth : that are ready or under way, at most; at least two for each worker.
+    """
     pool = ThreadPoolExecutor(workers, "batches", initializer=torch.set_num_threads, initargs=(1,))
     try:
-        yield Ahead(make, first, pool, 2 * workers)
+        yield Ahead(make, first, pool, max(depth, 2 * workers))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

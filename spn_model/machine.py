@@ -21,12 +21,13 @@ _MAX_WORKERS = 8
 @dataclass(frozen=True)
 class Machine:
     """device : of torch. threads : that the network computes with on the processor. workers : others, that
-    make batches. bfloat16 : matrices are multiplied in it while training."""
+    make batches. bfloat16 : matrices are multiplied in it while training. cores : that all may use."""
 
     device: torch.device
     threads: int
     workers: int
     bfloat16: bool
+    cores: int = 1
 
     def plain(self) -> dict[str, str | int]:
         """For the log."""
@@ -71,12 +72,12 @@ def choose(
     threads = threads or cores()
     fast = bfloat16_is_fast(chosen.type) if precision == "auto" else precision == "bfloat16"
     if not makes_batches:
-        return Machine(chosen, threads, 0, fast)
+        return Machine(chosen, threads, 0, fast, threads)
     if chosen.type == "cuda":
-        return Machine(chosen, 1, min(max(1, threads - 1), _MAX_WORKERS), fast)
+        return Machine(chosen, 1, min(max(1, threads - 1), _MAX_WORKERS), fast, threads)
     # Threads of one convolution wait for each other: one that shares its core holds up all of them.
     workers = min(max(1, threads // 4), _MAX_WORKERS)
-    return Machine(chosen, max(1, threads - workers), workers, fast)
+    return Machine(chosen, max(1, threads - workers), workers, fast, threads)
 
 
 @contextmanager

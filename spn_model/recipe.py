@@ -20,6 +20,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "images": (0, 10**10),
     "minutes": (0, 10**6),
     "batch": (1, 100_000),
+    "parts": (1, 64),
     "rate": (0, 100),
     "warmup_steps": (0, 10**7),
     "weight_decay": (0, 10),
@@ -36,6 +37,7 @@ class Stage:
     images: int = 0  # budget: training images drawn; 0: no limit
     minutes: float = 0.0  # budget: of training, validation aside; 0: no limit
     batch: int = 8  # training images drawn for one step, of each process
+    parts: int = 1  # of a batch, computed beside each other; their losses count alike
     rate: float = 1e-3  # of learning, at its highest
     schedule: str = "cosine"  # falls to 0 along a cosine; or constant
     warmup_steps: int = 50  # over which the rate rises
@@ -164,6 +166,9 @@ class _Reader:
             if name in values and not low <= values[name] <= high:
                 told = f"{name} is {values[name]}, needs to lie from {low:g} to {high:g}"
                 raise self._wrong(name, told, k)
+        batch, parts = values.get("batch", Stage.batch), values.get("parts", Stage.parts)
+        if batch % parts:
+            raise self._wrong("parts", f"parts is {parts}, needs to divide the batch of {batch}", k)
         data = values.get("data", AREA)
         if data not in (AREA, PRETRAINING) and not Path(data).is_absolute():
             values["data"] = str(self._path.parent / data)

@@ -21,6 +21,7 @@ from spn_data.errors import InputError, StageError
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_model.batches import batches_ahead, generator_of_step, rows_of_step, torch_seed_of_step
+from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
@@ -86,6 +87,10 @@ def train(
         state = read_state(files.state)
         position = Position() if state is None else state.position
         member = make(recipe.kind, recipe.options, seed=options.seed)
+        if not member.has_parts and any(stage.parts > 1 for stage in recipe.stages):
+            raise InputError(
+                f"a network of kind {recipe.kind} computes a batch as a whole: parts needs to be 1"
+            )
         member.bfloat16 = machine.bfloat16
         if state is not None:
             state.restore_network(member.network)
@@ -154,28 +159,33 @@ def run_stage(
     clock = Clock(at.stage_s)
     progress = stage.progress(at.step * step_images, at.stage_s)
 
-    def batch_of(step: int) -> Batch:
-        part = {"rank": ranks.rank, "world": ranks.world}
-        rows = rows_of_step(len(images), stage.batch, step, seed, index, **part)
+    def batch_of(number: int) -> Batch:
+        step, part = divmod(number, stage.parts)
+        part += ranks.rank * stage.parts
+        world = ranks.world * stage.parts
+        rows = rows_of_step(
+            len(images), stage.batch // stage.parts, step, seed, index, rank=part, world=world
+        )
         # A budget in minutes is as far as it was when the batch was begun.
         spent = max(stage.progress(step * step_images, 0.0), progress if stage.minutes else 0.0)
-        generator = generator_of_step(seed, index, step, ranks.rank)
+        generator = generator_of_step(seed, index, step, part)
         return _pinned(member.batch(images, rows, generator, min(spent, 1.0)), machine)
 
     logged = saved = time.perf_counter()
     shown, save_s = at.shown, 0.0
-    with batches_ahead(batch_of, at.step, machine.workers) as ahead:
+    with (
+        batches_ahead(batch_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
+        gradients(member, parameters, stage.parts, machine) as gradient,
+    ):
         waited_s = at.wait_s
         member.network.train()
         while progress < 1:
             rate = stage.rate_at(at.step, progress)
             for group in optimizer.param_groups:
                 group["lr"] = rate * group["rate"]
-            batch = _on_device(ahead.next(), machine)
+            parts = [_on_device(ahead.next(), machine) for _ in range(stage.parts)]
             torch.manual_seed(torch_seed_of_step(seed, index, at.step, ranks.rank))
-            loss, figures = member.loss(batch)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss, figures = gradient.of(parts)
             seconds, stop = ranks.average(parameters, clock.seconds, watch.wants_stop())
             norm = nn.utils.clip_grad_norm_(parameters, stage.clip or math.inf)
             with _telling_what_is_kept(at):
@@ -183,7 +193,7 @@ def run_stage(
             optimizer.step()
             at.step, at.steps = at.step + 1, at.steps + 1
             at.drawn += step_images
-            at.shown += len(next(iter(batch.values()))) * ranks.world
+            at.shown += sum(len(next(iter(part.values()))) for part in parts) * ranks.world
             progress = stage.progress(at.step * step_images, seconds)
             at.stage_s, at.train_s = seconds, before_s + seconds
 

@@ -70,6 +70,7 @@ def test_a_recipe_is_read_whole(tmp_path):
         ("batch = 4", "batch = 4.5", ":10: batch is 4.5, needs a whole number"),
         ("batch = 4", "batch = true", ":10: batch is True, needs a whole number"),
         ("batch = 4", "batch = 0", ":10: batch is 0, needs to lie from 1 to"),
+        ("batch = 4", "batch = 4\nparts = 3", ":11: parts is 3, needs to divide the batch of 4"),
         ("rate = 1", "rate = nan", ":11: rate is nan, needs to lie from 0 to 100"),
         ("rate = 1", "speed = 1", ":11: 'speed' is no key of a stage"),
         ('"constant"', '"linear"', ":19: schedule is 'linear'"),

@@ -33,11 +33,14 @@ class Member(ABC):
     kind : as recipes and checkpoints have it. network : everything learnt or measured on training images is
     in its parameters and buffers, so that its state is the whole member. options : JSON-able, what `make`
     needs to build the member anew. any_camera : poses are right for images of any K; else only for those of
-    the camera that it was trained on. bfloat16 : `loss` runs the network in it; set by who trains.
+    the camera that it was trained on. has_parts : a batch may be computed in parts, in several threads; not
+    where layers draw at random, or keep statistics of a whole batch. bfloat16 : `loss` runs the network in
+    it; set by who trains.
     """
 
     kind: ClassVar[str]
     any_camera: ClassVar[bool] = False
+    has_parts: ClassVar[bool] = False
     network: nn.Module
     bfloat16: bool = False
 

@@ -51,6 +51,7 @@ class SceneCoordinatesMember(Member):
 
     kind: ClassVar[str] = "scene-coordinates"
     any_camera: ClassVar[bool] = True
+    has_parts: ClassVar[bool] = True
     network: SceneCoordinates
 
     def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):
@@ -139,7 +140,10 @@ class SceneCoordinatesMember(Member):
         Where no cell of the batch has a target the loss is 0.
         """
         images, known = batch["images"], batch["known"]
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.bfloat16):
+        # Each weight is used once: a cache of them serves nothing, and other threads would share it.
+        with torch.autocast(
+            images.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False
+        ):
             coordinates, log_scale, logits = self.network.cells(_normalised(images))
         if not known.any():
             return (coordinates.sum() + log_scale.sum()) * 0, {}
