@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 _PLAIN_EVERY_S = 60.0
 _SHOWN = 12  # rows of the live table
-_NAMES = {"validation": "validation", "training": "training images"}
+_NAMES = {
+    "validation": "validation",
+    "held out": "validation, before it was learnt too",
+    "training": "training images",
+}
 
 
 class Following:

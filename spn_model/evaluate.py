@@ -128,6 +128,12 @@ def compare(
         found: list[list[Estimates]] = [[] for _ in chosen]
         costs = {}
         for name, network in networks.items():
+            learnt = [g.name for g in groups if g.name in network.facts.get("trained_on", ())]
+            if learnt:
+                notes.append(
+                    f"{name} was trained on {', '.join(learnt)} too: there its errors are those of training "
+                    "images, and baselines knew less."
+                )
             parts, costs[name] = _estimated(network.member, chosen, progress, name, options)
             for estimates, part in zip(found, parts, strict=True):
                 estimates.append(Estimates(name, part.poses, part.covariance))

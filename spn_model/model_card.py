@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spn_data.errors import InputError
@@ -54,7 +54,7 @@ def model_card(
             ),
         ),
         "## Errors",
-        *_evaluated(metrics, str(facts.get("run", "")), unit),
+        *_evaluated(metrics, str(facts.get("run", "")), unit, facts.get("trained_on", ())),
         "## What the bundle loses",
         f"On {made.parity.images} images, outputs of the float32 graph differ from PyTorch's by at most "
         f"{made.parity.output:.1e} of an output's largest value; half of the poses by at most "
@@ -93,14 +93,16 @@ def _percent(before: float, after: float) -> float:
     return 100 * (after / before - 1)
 
 
-def _evaluated(metrics: Mapping[str, Any] | None, run: str, unit: str) -> list[str]:
+def _evaluated(
+    metrics: Mapping[str, Any] | None, run: str, unit: str, learnt: Collection[str]
+) -> list[str]:
     if metrics is None:
         return [
             "The run was not evaluated: `spn-model evaluate` measures it, and another export tells it."
         ]
     rows = [
         (
-            group,
+            f"{group} (trained on)" if group in learnt else group,
             str(found["frames"]),
             str(found["located"]),
             *(_figure(found["position"][name]) for name in ("median", "mean", "p95")),

@@ -14,6 +14,7 @@ from spn_data.errors import InputError
 
 SHIPPED = Path(__file__).parent / "recipes"
 AREA, PRETRAINING = "area", "pretraining"  # data sets that a stage names without a path
+TRAINING, ALL = "training", "all"  # frames of the mapping flights that a stage trains on
 _MAX_BYTES = 100_000
 _MAX_STAGES = 50
 _RANGES: dict[str, tuple[float, float]] = {
@@ -34,6 +35,7 @@ class Stage:
 
     name: str
     data: str = AREA  # area, pretraining (--pretrain, else as area), or the path of a data set
+    frames: str = TRAINING  # or all: validation frames too, which judge the network no longer then
     images: int = 0  # budget: training images drawn; 0: no limit
     minutes: float = 0.0  # budget: of training, validation aside; 0: no limit
     batch: int = 8  # training images drawn for one step, of each process
@@ -162,6 +164,9 @@ class _Reader:
         if values.get("schedule", "cosine") not in ("cosine", "constant"):
             told = f"schedule is {values['schedule']!r}, needs to be cosine or constant"
             raise self._wrong("schedule", told, k)
+        if values.get("frames", TRAINING) not in (TRAINING, ALL):
+            told = f"frames is {values['frames']!r}, needs to be {TRAINING} or {ALL}"
+            raise self._wrong("frames", told, k)
         for name, (low, high) in _RANGES.items():
             if name in values and not low <= values[name] <= high:
                 told = f"{name} is {values[name]}, needs to lie from {low:g} to {high:g}"

@@ -25,7 +25,7 @@ from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
-from spn_model.recipe import AREA, PRETRAINING, Recipe, Stage
+from spn_model.recipe import ALL, AREA, PRETRAINING, TRAINING, Recipe, Stage
 from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
 from spn_model.training_set import TrainingSet
@@ -98,23 +98,30 @@ def train(
             published = recipe.weights == "published"
             member.load_pretrained(member.weights_name if published else recipe.weights)
         area = stack.enter_context(Dataset(data.area))
-        training = _training_group(area)
         record = None
         if ranks.leads:
-            judged = judged_frames(area, training, options.validation_frames, options.sample)
+            judged = judged_frames(
+                area, _training_group(area), options.validation_frames, options.sample
+            )
             facts = {"recipe": recipe.plain(), "seed": options.seed, **machine.plain()}
             facts["processes"] = ranks.world
             record = Record(files, watch, member, View.of(area), judged, position, facts)
             stack.enter_context(closing(record))
-        path, images = data.area, None
+        path, frames, images = None, "", None
         for index in range(position.stage, len(recipe.stages)):
             stage = recipe.stages[index]
-            if images is None or data.of(stage) != path:
-                path = data.of(stage)
+            if images is None or (data.of(stage), stage.frames) != (path, frames):
+                is_new = data.of(stage) != path
+                path, frames = data.of(stage), stage.frames
                 dataset = area if path == data.area else stack.enter_context(Dataset(path))
-                images = TrainingSet(_training_group(dataset), up_is_known=dataset.info.up_is_known)
-                if state is None:
+                groups = _groups_of(dataset, frames)
+                images = TrainingSet(*groups, up_is_known=dataset.info.up_is_known)
+                if is_new and state is None:
                     member.fit(images)
+            if record is not None:
+                until_now = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
+                learnt = ALL if any(s.frames == ALL for s in until_now) else TRAINING
+                record.trains_on([group.name for group in _groups_of(area, learnt)])
             member.network.to(machine.device)
             member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
             member.begin_stage(stage.options, images)
@@ -250,6 +257,16 @@ def _training_group(dataset: Dataset) -> DatasetGroup:
             "holds no training images: there is nothing to train on", path=dataset.path
         )
     return filled[0]
+
+
+def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:
+    """That a stage trains on."""
+    groups = [_training_group(dataset)]
+    if frames == ALL:
+        size = groups[0].image_size
+        found = dataset.of_role(Role.VALIDATION)
+        groups += [group for group in found if len(group) and group.image_size == size]
+    return groups
 
 
 def optimizer_of(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Optimizer:

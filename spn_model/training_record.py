@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,6 +106,7 @@ class Record:
     judged: list[Judged]
     position: Position
     facts: dict[str, Any]
+    _learnt: list[str] = field(default_factory=list)
     _log: Log = field(init=False)
 
     def __post_init__(self) -> None:
@@ -122,8 +123,18 @@ class Record:
             {**{k: figures[k] for k in own}, "rate": rate, "figures": others},
         )
 
+    def trains_on(self, groups: Sequence[str]) -> None:
+        """Before a stage: names of the area's groups that it trains on. Those judge no longer."""
+        self._learnt = sorted({*self._learnt, *groups})
+        left = [j for j in self.judged if j.event == "training" or j.group.name not in self._learnt]
+        if len(left) == len(self.judged):
+            return
+        self.judged, latest = left, self.position.latest
+        if "validation" in latest:
+            latest["held out"] = latest.pop("validation")
+
     def validate(self, stage: str, progress: float) -> None:
-        """Judge, and keep the network where it is among the best so far."""
+        """Judge, and keep the network where it is among the best so far, or where nothing can tell."""
         at = self.position
         began = time.perf_counter()
         found = {one.event: one.errors(self.member) for one in self.judged}
@@ -163,6 +174,7 @@ class Record:
             "wait_s": at.wait_s,
             "kept": at.kept,
             "latest": at.latest,
+            "trained_on": self._learnt,
         }
 
     def _row(self, event: str, stage: str, progress: float, values: Mapping[str, Any]) -> None:
