@@ -72,7 +72,7 @@ def main(verbose: bool) -> None:
     show_default=True,
     help="Longer side in pixels on which features are found.",
 )
-@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+@options.threads
 @options.seed
 @options.georegistration
 def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen: Any) -> None:

@@ -45,8 +45,8 @@ from cli import console, options
     show_default=True,
     help="Images given to a network at once.",
 )
-@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
-@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+@options.device
+@options.threads
 @options.seed
 def evaluate(dataset: Path | None, area_folder: Path, runs: tuple[str, ...], **chosen: Any) -> None:
     """Errors of trained networks on the frames that test them.

@@ -30,6 +30,10 @@ seed = click.option(
     show_default=True,
     help="Of everything random.",
 )
+threads = click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+device = click.option(
+    "--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."
+)
 
 
 class Finite(click.FloatRange):

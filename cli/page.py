@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cli import console
-from spn_data.area import FRAMES, Area, InUseError
-from spn_data.errors import SpnError
+from spn_data.area import FRAMES, Area
+from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:
     from spn_data.report.verdict import Verdict

@@ -60,8 +60,8 @@ _SEEN = 0.98  # of the network's view, below which the user is told
     show_default=True,
     help="Images given to the network at once.",
 )
-@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
-@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+@options.device
+@options.threads
 @click.option("--overwrite", is_flag=True, help="Replace predicted poses in that folder.")
 @click.pass_context
 def predict(

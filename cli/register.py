@@ -53,7 +53,7 @@ from cli import options
     type=click.Path(path_type=Path, exists=True),
     help="Where videos lie now, for --all-frames.  [default: where they were]",
 )
-@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+@options.threads
 @options.seed
 @options.overwrite
 def register(video: Path | None, area_folder: Path, **chosen: Any) -> None:

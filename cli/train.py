@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -16,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cli import console, options
+from spn_data.errors import StageError
+from spn_data.files import LOCK, locked
 
 if TYPE_CHECKING:
     from spn_data.area import Area
     from spn_data.record import StageRecord
-
-_LOCK = ".lock"
 
 
 @click.command()
@@ -64,8 +63,8 @@ _LOCK = ".lock"
     show_default=True,
     help="How often the network is judged, over the whole training.",
 )
-@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
-@click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+@options.device
+@options.threads
 @options.overwrite
 def train(dataset: Path | None, area_folder: Path, **chosen: Any) -> None:
     """Train a network for the area; the same command goes on where it was stopped.
@@ -236,7 +235,7 @@ def _standing(
             )
         if leads:
             for entry in path.parent.iterdir():
-                if entry.name != _LOCK:
+                if entry.name != LOCK:
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     return None
 
@@ -251,25 +250,18 @@ def _write(path: Path, config: dict[str, Any]) -> None:
 @contextmanager
 def _held(folder: Path, leads: bool) -> Iterator[None]:
     """Only one training at a time works in a folder, which is made."""
-    from spn_data.errors import StageError
-
     if not leads:
         yield
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / _LOCK).open("w")
     except OSError as error:
         raise StageError(f"{folder} cannot be written to: {error.strerror}") from error
-    with handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise StageError(f"{folder} is in use by another spn-model train") from error
+    with locked(folder, "spn-model train"):
         try:
             yield
         finally:
-            if [entry.name for entry in folder.iterdir()] == [_LOCK]:
+            if [entry.name for entry in folder.iterdir()] == [LOCK]:
                 shutil.rmtree(folder)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -16,8 +15,8 @@ from typing import Any
 
 import tomli_w
 
-from spn_data.errors import FormatError, InputError, StageError
-from spn_data.files import write_whole
+from spn_data.errors import FormatError, InputError, InUseError, StageError
+from spn_data.files import LOCK, locked, write_whole
 from spn_data.record import (
     VERSION,
     StageRecord,
@@ -49,7 +48,6 @@ SCRATCH: dict[str, tuple[str, ...]] = {
 _FACTS = "area.toml"
 _RECORD = "stage.json"
 _STARTED = "started.json"
-_LOCK = ".lock"
 _NEXT = ".next"
 _READY = "ready"
 
@@ -100,10 +98,6 @@ class StageWork:
     def discard(self) -> None:
         """Leave nothing of it, where the work came to no result and going on would gain nothing."""
         shutil.rmtree(self.path)
-
-
-class InUseError(StageError):
-    """Raised when another process is changing the area."""
 
 
 class Area:
@@ -261,19 +255,11 @@ class Area:
         """Only one process at a time changes an area. Makes the folder; removes it if it stays empty."""
         is_new = not self.root.exists()
         _make_folder(self.root)
-        try:
-            handle = (self.root / _LOCK).open("w")
-        except OSError as error:
-            raise StageError(f"{self.root} cannot be written to: {error.strerror}") from error
-        with handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InUseError(f"{self.root} is in use by another spn-data") from error
+        with locked(self.root, "spn-data"):
             try:
                 yield
             finally:
-                if is_new and [path.name for path in self.root.iterdir()] == [_LOCK]:
+                if is_new and [path.name for path in self.root.iterdir()] == [LOCK]:
                     shutil.rmtree(self.root)
 
     def _finish_exchange(self) -> None:

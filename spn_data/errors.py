@@ -23,6 +23,10 @@ class StageError(SpnError):
     """Raised when a stage of the area is missing, stale, in use, or would be overwritten."""
 
 
+class InUseError(StageError):
+    """Raised when another process works in the folder."""
+
+
 class GeometryError(SpnError):
     """Raised when the geometry does not determine the answer: too few points, a line, no agreement."""
 

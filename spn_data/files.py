@@ -1,16 +1,20 @@
-"""Files that stand under their name only when they are complete; CSV read as strictly as it is written."""
+"""Files and folders that stand under their name only when complete; locks; CSV read as it is written."""
 
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import os
+import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from spn_data.errors import InputError, StageError
+from spn_data.errors import InputError, InUseError, StageError
+
+LOCK = ".lock"
 
 
 @contextmanager
@@ -40,6 +44,34 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """See `writing_whole`."""
     with writing_whole(path, "w" if isinstance(content, str) else "wb") as file:
         file.write(content)
+
+
+def exchange(partial: Path, target: Path) -> None:
+    """Give a complete folder its name; what stood there, if anything, goes only then."""
+    old = target.with_name(f".{target.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        target.rename(old)
+    partial.rename(target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def locked(folder: Path, program: str) -> Iterator[None]:
+    """Only one process at a time works in a folder, which exists: its file LOCK is held.
+
+    Raises InUseError, which names the program, where another does, StageError where nothing can be written.
+    """
+    try:
+        handle = (folder / LOCK).open("w")
+    except OSError as error:
+        raise StageError(f"{folder} cannot be written to: {error.strerror}") from error
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InUseError(f"{folder} is in use by another {program}") from error
+        yield
 
 
 def write_csv(path: Path, columns: Mapping[str, Iterable[object]]) -> None:

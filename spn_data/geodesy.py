@@ -68,6 +68,15 @@ class GeoOrigin:
     alt_m: float
     height_reference: HeightReference = HeightReference.ELLIPSOID
 
+    def plain(self) -> dict[str, float | str]:
+        """For JSON."""
+        return {
+            "lat_deg": self.lat_deg,
+            "lon_deg": self.lon_deg,
+            "alt_m": self.alt_m,
+            "height_reference": self.height_reference.value,
+        }
+
     def _ecef_and_axes(self) -> tuple[np.ndarray, np.ndarray]:
         lat, lon = np.deg2rad(self.lat_deg), np.deg2rad(self.lon_deg)
         origin = ecef_from_wgs84(np.array([self.lat_deg, self.lon_deg, self.alt_m]))

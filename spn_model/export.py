@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -15,7 +14,7 @@ import numpy as np
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_to_json
 from spn_data.errors import InputError, SpnError, StageError
-from spn_data.files import write_whole
+from spn_data.files import exchange, write_whole
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_data.record import content_fingerprint, write_json
@@ -128,7 +127,7 @@ def export(
             write_json(partial / DOCUMENT, document)
             write_whole(partial / CARD, model_card(checkpoint, made, facts, metrics))
             read_bundle(partial)
-            _exchange(partial, folder)
+            exchange(partial, folder)
         except OSError as error:
             raise StageError(f"{folder} cannot be written: {error.strerror}") from error
         finally:
@@ -221,16 +220,6 @@ def _graphs(folder: Path) -> dict[str, dict[str, Any]]:
         precision: {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
         for precision, path in paths.items()
     }
-
-
-def _exchange(partial: Path, folder: Path) -> None:
-    """Put a whole folder in its place; what stood there goes only then."""
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    os.replace(partial, folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _plain(value: Mapping[str, Any]) -> dict[str, Any]:

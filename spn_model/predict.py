@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.files import write_whole
+from spn_data.files import exchange, write_whole
 from spn_data.record import write_json
 from spn_data.timing import Progress
 from spn_model.checkpoint import Checkpoint
@@ -138,7 +138,7 @@ def predict(
                 **facts,
             },
         )
-        _put_in_place(partial, folder)
+        exchange(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     if stop is not None:
@@ -214,13 +214,3 @@ def _world(network: Checkpoint) -> str:
         f"units: m; axes: east north up; origin: latitude {o.lat_deg:.10f} longitude {o.lon_deg:.10f} "
         f"height {o.alt_m:.4f} above {o.height_reference.value}"
     )
-
-
-def _put_in_place(partial: Path, folder: Path) -> None:
-    """`folder` is empty, missing, or holds poses that may be replaced."""
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    partial.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)

@@ -55,19 +55,11 @@ class View:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for json.dumps; what is not known is null."""
-        place = self.origin
         return {
             "camera": None if self.camera is None else camera_to_json(self.camera),
             "size": list(self.size),
             "units": self.units,
-            "origin": None
-            if place is None
-            else {
-                "lat_deg": place.lat_deg,
-                "lon_deg": place.lon_deg,
-                "alt_m": place.alt_m,
-                "height_reference": place.height_reference.value,
-            },
+            "origin": None if self.origin is None else self.origin.plain(),
             "up_is_known": self.up_is_known,
             "dataset": self.dataset,
             "made_from": dict(self.made_from),

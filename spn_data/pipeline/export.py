@@ -25,6 +25,7 @@ from spn_data.exports.nerfstudio import FOLDER_OF_IMAGES as NERFSTUDIO_IMAGES
 from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
+from spn_data.files import exchange
 from spn_data.pipeline.images import image_path
 from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area, together
 from spn_data.record import VERSION, write_json
@@ -122,7 +123,7 @@ def export(
             _write(area, one, folder, frames, images=options.images)
         if format_name == Format.ALL:
             write_json(partial / RECORD, {"version": VERSION, "format": Format.ALL.value})
-        _put_in_place(partial, target)
+        exchange(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Exported(
@@ -221,14 +222,7 @@ def _record(area: Area, one: Format, frames: ExportedFrames) -> dict[str, Any]:
     return {
         "format": one.value,
         "units": frames.units,
-        "origin": None
-        if origin is None
-        else {
-            "lat_deg": origin.lat_deg,
-            "lon_deg": origin.lon_deg,
-            "alt_m": origin.alt_m,
-            "height_reference": origin.height_reference.value,
-        },
+        "origin": None if origin is None else origin.plain(),
         "sequences": {
             name: {
                 "frames": len(rows),
@@ -238,13 +232,3 @@ def _record(area: Area, one: Format, frames: ExportedFrames) -> dict[str, Any]:
         },
         "made_of": {stage: area.record(stage).fingerprint() for stage in area.stages()},
     }
-
-
-def _put_in_place(partial: Path, target: Path) -> None:
-    """`target` is empty, missing, or an export that may be replaced."""
-    old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if target.exists():
-        target.rename(old)
-    partial.rename(target)
-    shutil.rmtree(old, ignore_errors=True)

@@ -60,10 +60,7 @@ def write_options(folder: Path, options: SimulateOptions) -> None:
     write_json(
         folder / "origin.json",
         {
-            "lat_deg": origin.lat_deg,
-            "lon_deg": origin.lon_deg,
-            "alt_m": origin.alt_m,
-            "height_reference": str(origin.height_reference),
+            **origin.plain(),
             "abs_alt_minus_up_m": origin.alt_m - options.geoid_m,
             "rel_alt_minus_up_m": 0.0,
         },
