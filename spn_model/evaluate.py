@@ -281,15 +281,6 @@ def _estimated(
             batches.append(batch)
             done += len(of)
             progress(name, done, total)
-        parts.append(joined(batches))
+        parts.append(PoseEstimates.concatenate(batches))
     device = next(member.network.parameters()).device.type
     return parts, Cost(total, seconds, cpu, options.batch, torch.get_num_threads(), device)
-
-
-def joined(parts: Sequence[PoseEstimates]) -> PoseEstimates:
-    """One after the other."""
-    return PoseEstimates(
-        Poses.concatenate(part.poses for part in parts),
-        np.concatenate([part.covariance for part in parts]),
-        np.concatenate([part.reasons.astype(np.str_) for part in parts]),
-    )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor, distributed
 
 from spn_data.errors import InputError
@@ -87,7 +88,9 @@ def prepared(machine: Machine) -> Iterator[None]:
     torch.set_num_threads(machine.threads)
     cv2.setNumThreads(1)  # each maker of batches is one thread
     try:
-        yield
+        # NumPy's and SciPy's further threads wait busily, on cores that others compute on.
+        with threadpool_limits(1, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(before)
         cv2.setNumThreads(before_cv2)

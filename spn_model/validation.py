@@ -58,11 +58,7 @@ def judge(
         part = rows[first : first + _AT_ONCE]
         images = np.stack([image(int(row)) for row in part])
         found.append(member.estimate(images, intrinsics[part]))
-    estimates = PoseEstimates(
-        Poses.concatenate(one.poses for one in found),
-        np.concatenate([one.covariance for one in found]),
-        np.concatenate([one.reasons for one in found]),
-    )
+    estimates = PoseEstimates.concatenate(found)
     errors = frame_errors(Estimates("network", estimates.poses), poses[rows])
     position, rotation = (
         np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,30 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real drone data is not at {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="module")
+def tiny_kind() -> Iterator[None]:
+    """Recipes and checkpoints know the small network of `tests.training_world`."""
+    from spn_model.members.registry import KINDS
+    from tests.training_world import register_tiny
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
+        register_tiny()
+        yield
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """More threads only wait for each other in networks this small; weights are drawn by one seed."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

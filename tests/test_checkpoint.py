@@ -14,16 +14,11 @@ from safetensors.torch import load_file, save_file
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import FORMAT, Checkpoint, load, save
-from spn_model.members.registry import KINDS
 from spn_model.training_set import TrainingSet
 from spn_model.view import View
-from tests.training_world import CAMERA, INFO, TinyMember, register_tiny, write_field
+from tests.training_world import CAMERA, INFO, TinyMember, write_field
 
-
-@pytest.fixture(autouse=True)
-def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 
 @pytest.fixture(scope="module")

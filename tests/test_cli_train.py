@@ -18,9 +18,10 @@ from click.testing import CliRunner, Result
 from cli.model import main
 from cli.train import train
 from spn_model.checkpoint import load
-from spn_model.members.registry import KINDS
 from spn_model.training_state import COLUMNS
-from tests.training_world import register_tiny, write_field
+from tests.training_world import write_field
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 TOML = """\
 kind = "tiny"
@@ -39,12 +40,6 @@ images = 120
 batch = 6
 rate = 0.02
 """
-
-
-@pytest.fixture(autouse=True)
-def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,22 +25,15 @@ from spn_model.checkpoint import Checkpoint, load
 from spn_model.comparison_files import drawn, of_network, write_comparison
 from spn_model.dropout import dropout_estimates, has_dropout
 from spn_model.evaluate import Comparison, EvaluateOptions, Judged, compare
-from spn_model.members.registry import KINDS
 from spn_model.training_figure import read_log, training_figure
 from spn_model.training_state import COLUMNS
 from tests.judged_world import write_judged, write_network
-from tests.training_world import INFO, TinyMember, register_tiny
+from tests.training_world import INFO, TinyMember
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 WORLD = ("2-model", "3-geo")
 ALONE = EvaluateOptions(baselines=False)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _tiny() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-        register_tiny()
-        yield
 
 
 @pytest.fixture(scope="module")

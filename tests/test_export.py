@@ -31,17 +31,10 @@ from spn_model.view import View
 from tests.box_world import write_box
 from tests.bundle_world import learnt
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 FILES = {"bundle.json", "model.onnx", "model-int8.onnx", "MODEL_CARD.md"}
 OPTIONS = ExportOptions(calibration_images=4)
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """More threads only wait for each other here."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def quiet(step: str, done: int, total: int) -> None:

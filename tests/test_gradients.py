@@ -13,14 +13,13 @@ from spn_data.errors import InputError
 from spn_data.hdf5_reader import Dataset
 from spn_model.gradients import gradients
 from spn_model.machine import choose
-from spn_model.members.registry import KINDS
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train
 from spn_model.training_set import TrainingSet
 from tests.box_world import write_box
 from tests.test_train import ONE_THREAD, Follower, files, weights
-from tests.training_world import TinyMember, register_tiny, write_field
+from tests.training_world import TinyMember, write_field
 
 STAGE = Stage(name="all", images=180, batch=6, parts=3, rate=0.02)
 RECIPE = Recipe(
@@ -34,9 +33,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
+def in_parts(tiny_kind: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TinyMember, "has_parts", True)
 
 
@@ -79,16 +76,13 @@ def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(member_and_parts):
         torch.testing.assert_close(mean, (first + second) / 2)
 
 
-def test_threads_compute_the_gradient_of_one(member_and_parts):
+def test_threads_compute_the_gradient_of_one(member_and_parts, one_thread):
     """Bit for bit, time after time, though the parts differ in size and in time."""
     member, parts = member_and_parts
-    torch_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     _, alone = gradient(member, parts, 1)
     for _ in range(5):
         _, together = gradient(member, parts, 2)
         assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
-    torch.set_num_threads(torch_threads)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -12,12 +12,13 @@ from spn_data.errors import InputError
 from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import load
 from spn_model.evaluate import EvaluateOptions, compare
-from spn_model.members.registry import KINDS
 from spn_model.recipe import ALL, Recipe, Stage, read_recipe
 from spn_model.train import Data, Stopped, train
 from spn_model.training_set import TrainingSet
 from tests.test_train import ONE_THREAD, Follower, files, log
-from tests.training_world import TinyMember, register_tiny, write_field
+from tests.training_world import TinyMember, write_field
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 HELD_OUT = Stage(name="held out", images=60, batch=6, rate=0.02)
 RECIPE = Recipe(
@@ -25,12 +26,6 @@ RECIPE = Recipe(
     weights="none",
     stages=(HELD_OUT, replace(HELD_OUT, name="all", images=120, frames=ALL)),
 )
-
-
-@pytest.fixture(autouse=True)
-def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +94,7 @@ def test_evaluating_says_which_frames_a_network_was_trained_on(field, tmp_path):
     networks = {
         name: load(tmp_path / name / "checkpoint.safetensors") for name in ("all", "held out")
     }
-    found = compare(
-        field, networks, ("3-geo",), lambda *_: None, EvaluateOptions(baselines=False)
-    )
+    found = compare(field, networks, ("3-geo",), lambda *_: None, EvaluateOptions(baselines=False))
     told = [note for note in found.notes if "was trained on validation too" in note]
     assert len(told) == 1
     assert told[0].startswith("all ")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,19 +28,12 @@ from spn_data.record import write_json
 from spn_data.simulate.video_out import write_video
 from spn_model.checkpoint import Checkpoint
 from spn_model.flown import Choice, Views, find_flights, frames
-from spn_model.members.registry import KINDS
 from spn_model.predict import Predicted, PredictOptions, Stopped, predict
 from spn_model.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
 from tests.judged_world import write_judged, write_network
-from tests.training_world import CAMERA, frame, register_tiny
+from tests.training_world import CAMERA, frame
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _tiny() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-        register_tiny()
-        yield
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 
 @pytest.fixture(scope="module")

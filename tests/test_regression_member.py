@@ -23,19 +23,12 @@ from spn_model.networks.normalization import InsertedBatchNorm
 from spn_model.training_set import TrainingSet
 from tests.box_world import CAMERA, seen_by, write_box
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 STILL = {"augmentation": False, "dropout": False}
 LEARNED = {**STILL, "loss": "learned"}
 CACHED = {"freeze_trunk": True, "cached_features": 1, "dropout": False}
 NARROW = 64
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """More threads only wait for each other here."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import base64
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,11 @@ from cli.model import main
 from spn_data.area import Area
 from spn_data.pipeline.runs import read_runs
 from spn_data.report.html import render
-from spn_model.members.registry import KINDS
 from tests.judged_world import write_judged, write_network
 from tests.report_data import area as made_up_area
 from tests.test_report_browser import CHROMIUM, visit
-from tests.training_world import register_tiny
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 IMAGE = re.compile(r'<img alt="([^"]*)" width="(\d+)" src="data:image/svg\+xml;base64,([\w+/=]+)">')
 ALERT = "<script>document.title='hacked';console.log('hacked')</script>"
@@ -33,14 +33,6 @@ HOSTILE_SVG = (
     '<foreignObject width="9" height="9"><body xmlns="http://www.w3.org/1999/xhtml">'
     '<img src="x" onerror="console.log(\'hacked\')"/></body></foreignObject></svg>'
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _tiny() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-        register_tiny()
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -28,18 +28,10 @@ from spn_model.point_targets import (
 )
 from spn_model.virtual_views import ViewOptions, random_place, view_from
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SIZE = (480, 270)
 LENS = Camera.from_horizontal_fov(*SIZE, 72.0)
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """These networks are tiny here: more threads only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("size", [(480, 270), (216, 121), (63, 64), (65, 97)])

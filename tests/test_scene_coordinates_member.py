@@ -24,6 +24,8 @@ from spn_model.precision import bfloat16_is_fast
 from spn_model.training_set import TrainingSet
 from tests.box_world import CAMERA, seen_by, write_box
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 STILL = {
     "tilt_deg": 0,
     "roll_deg": 0,
@@ -37,15 +39,6 @@ STILL = {
 VIEWS = {"views_share": 0.5, "views_rise": 0.3}
 # No higher than the hall.
 HIGH = {"views_share": 1.0, "views_rise": 0.3, "views_height": 0.3}
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """More threads only wait for each other here."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

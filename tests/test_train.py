@@ -26,7 +26,6 @@ from spn_data.hdf5_schema import Role
 from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.checkpoint import load
 from spn_model.members.member import PoseEstimates
-from spn_model.members.registry import KINDS
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, TrainOptions, train
 from spn_model.training_loss import Diverged, Losses
@@ -35,7 +34,9 @@ from spn_model.training_set import TrainingSet
 from spn_model.training_state import COLUMNS, Log, Position, read_state
 from spn_model.validation import judge, spread_rows
 from spn_model.view import View
-from tests.training_world import INFO, TinyMember, frame, register_tiny, write_field
+from tests.training_world import INFO, TinyMember, frame, write_field
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 ROOT = Path(__file__).resolve().parents[1]
 ONE_THREAD = TrainOptions(seed=5, threads=1, device="cpu", precision="float32", validations=4)
@@ -65,12 +66,6 @@ class Follower:
         return self._left < 0
 
 
-@pytest.fixture(autouse=True)
-def _tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
-
-
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
@@ -92,14 +87,10 @@ def log(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def unbroken(field: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unbroken(field: Path, tiny_kind: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a whole training."""
-    before = dict(KINDS)
-    register_tiny()
     folder = tmp_path_factory.mktemp("unbroken")
     train(RECIPE, files(folder), Data(field), ONE_THREAD, Follower())
-    KINDS.clear()
-    KINDS.update(before)
     return folder
 
 
@@ -156,6 +147,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from tests.test_train import *
+from tests.training_world import register_tiny
 from spn_model import train as module
 register_tiny()
 module._SAVE_EVERY_S = 0.0
@@ -207,6 +199,7 @@ ALIKE = replace(
 SHARED = """
 import sys
 from tests.test_train import *
+from tests.training_world import register_tiny
 register_tiny()
 torch.set_num_threads(1)
 follower = Follower()

@@ -10,17 +10,14 @@ import pytest
 import torch
 
 from spn_model.machine import choose, prepared
-from spn_model.members.registry import KINDS
-from tests.training_world import register_tiny, write_field
+from tests.training_world import write_field
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TOML = 'kind = "tiny"\nweights = "none"\n[[stages]]\nimages = 1000\nbatch = 5\n'
 
 
 @pytest.fixture
-def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
-    register_tiny()
+def benchmark(tiny_kind: None, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module("training_speed")
 

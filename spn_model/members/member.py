@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -25,6 +25,15 @@ class PoseEstimates:
     poses: Poses
     covariance: np.ndarray
     reasons: np.ndarray
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[PoseEstimates]) -> PoseEstimates:
+        """One after the other; one part at least."""
+        return cls(
+            Poses.concatenate(part.poses for part in parts),
+            np.concatenate([part.covariance for part in parts]),
+            np.concatenate([part.reasons.astype(np.str_) for part in parts]),
+        )
 
 
 class Member(ABC):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Self
 
 from torch import Tensor, nn
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 Estimate = tuple[Tensor, Tensor]  # x (B, 3), q (B, 4)
 
 
-class Regressor(nn.Module):
+class Regressor(nn.Module, ABC):
     """A classification network whose end is replaced by two heads, `x` and `q`.
 
     Images are (B, 3, H, W) float, RGB, normalised with the mean and standard deviation of ImageNet; H and W
@@ -34,20 +35,20 @@ class Regressor(nn.Module):
         self.frozen = False
 
     @property
+    @abstractmethod
     def weights_name(self) -> str:
         """Name, in `spn_model.weights`, of the published weights that the trunk starts from."""
-        raise NotImplementedError
 
+    @abstractmethod
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
         """(B, ...) features of images (B, 3, H, W): those of the main estimate first.
 
         Those of auxiliary estimates follow while the network is in training mode.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def describe(self, features: tuple[Tensor, ...]) -> Tensor:
         """(B, D), what the heads `x` and `q` read, from what `trunk` gives."""
-        raise NotImplementedError
 
     def auxiliary(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
         """Further estimates that exist for training."""
