@@ -16,6 +16,7 @@ SHIPPED = Path(__file__).parent / "recipes"
 AREA, PRETRAINING = "area", "pretraining"  # data sets that a stage names without a path
 TRAINING, ALL = "training", "all"  # frames of the mapping flights that a stage trains on
 _MAX_BYTES = 100_000
+_IMAGES_PER_S = 200  # of the default network on two cores
 _MAX_STAGES = 50
 _RANGES: dict[str, tuple[float, float]] = {
     "images": (0, 10**10),
@@ -46,6 +47,12 @@ class Stage:
     weight_decay: float = 1e-4
     clip: float = 0.0  # longest gradient; 0: no limit
     options: Mapping[str, Any] = field(default_factory=dict)  # of the kind of network
+
+    @property
+    def images_about(self) -> int:
+        """Training images that it draws: its budget, or what two cores compute in its minutes."""
+        by_minutes = round(self.minutes * 60 * _IMAGES_PER_S)
+        return min(n for n in (self.images, by_minutes) if n) if self.images or by_minutes else 0
 
     def progress(self, drawn: int, seconds: float) -> float:
         """Share of the budget that is spent; 1 or more: the stage is done."""

@@ -124,7 +124,7 @@ def train(
                 record.trains_on([group.name for group in _groups_of(area, learnt)])
             member.network.to(machine.device)
             member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-            member.begin_stage(stage.options, images)
+            member.begin_stage(stage.options, images, stage.images_about)
             ranks.start_alike(list(member.network.state_dict().values()))
             optimizer = optimizer_of(recipe, stage, member)
             if state is not None:

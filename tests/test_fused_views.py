@@ -11,6 +11,7 @@ from spn_data.hdf5_reader import Dataset
 from spn_data.pose import Poses, rotations_from_angles
 from spn_model.fused_views import fused_view
 from spn_model.ground import level_ground
+from spn_model.members.member import ANY_NUMBER
 from spn_model.members.scene_examples import Examples, StageOptions
 from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, surface
 from spn_model.training_set import TrainingSet
@@ -237,7 +238,7 @@ def test_a_stage_begins_with_few_views(data):
     options = StageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
     numbers: dict[float, set[int]] = {}
     for progress in (0.0, 0.5, 0.9):
-        examples = Examples(data, options, CENTER, SPREAD, 2)
+        examples = Examples(data, options, CENTER, SPREAD, 2, ANY_NUMBER)
         drawn: list[int] = []
         examples._view = lambda n, to=drawn, of=examples: (
             to.append(n) or (data.image(0), of._surface(0))
@@ -254,7 +255,7 @@ def test_a_stage_begins_with_few_views(data):
 def test_views_are_kept_within_their_memory(data, monkeypatch):
     """Fewer are made where they would take more, of images spread over all of them."""
     monkeypatch.setattr("spn_model.members.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
-    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2)
+    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     assert examples._view_count == 10
     views = [examples._view(n) for n in range(10)]
     assert sum(i.nbytes + s.inverse_depth.nbytes for i, s in views) <= 7 * 160 * 90 * 10
@@ -263,7 +264,7 @@ def test_views_are_kept_within_their_memory(data, monkeypatch):
 def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     """After some attempts; its targets are the image's own."""
     monkeypatch.setattr("spn_model.members.scene_examples._LEAST_SHOWN", 1.1)
-    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2)
+    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     image, seen = examples._view(0)
     assert np.array_equal(image, data.image(0))
     assert seen is examples._surface(0)
@@ -275,8 +276,15 @@ def test_shares_of_high_views_are_as_told(data):
 
     def heights(**options: float) -> np.ndarray:
         stage = StageOptions(views_share=1.0, views_rise=0.0, views_side=0.0, **options)
-        examples = Examples(data, stage, CENTER, SPREAD, 2)
+        examples = Examples(data, stage, CENTER, SPREAD, 2, ANY_NUMBER)
         return np.array([examples._view(n)[1].pose.centers[0, 2] for n in range(6)])
 
     assert (heights(views_high=1.0, views_height=3.0) > highest).any()
     assert (heights(views_high=0.0) <= highest + 1e-6).all()
+
+
+@pytest.mark.parametrize(("images", "views"), [(100, 32), (6000, 50), (ANY_NUMBER, 1000)])
+def test_a_short_stage_makes_few_views(data, images, views):
+    """One for 120 images that it draws: a view takes the time of ten of them."""
+    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
+    assert examples._view_count == views

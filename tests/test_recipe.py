@@ -152,3 +152,12 @@ def test_the_rate_rises_and_falls():
     assert stage.rate_at(100, 0.5) == pytest.approx(0.2)
     assert stage.rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
     assert replace(stage, schedule="constant").rate_at(100, 0.9) == 0.4
+
+
+@pytest.mark.parametrize(
+    ("images", "minutes", "drawn"),
+    [(900, 0, 900), (0, 2, 24_000), (900, 2, 900), (50_000, 2, 24_000)],
+)
+def test_a_stage_knows_about_how_many_images_it_draws(images, minutes, drawn):
+    """Its budget, or 200 a second; the smaller of two."""
+    assert Stage(name="all", images=images, minutes=float(minutes)).images_about == drawn

@@ -381,6 +381,15 @@ def test_another_training_set_is_refused(tmp_path):
             train(RECIPE, files(tmp_path / path.stem), Data(path), ONE_THREAD, Follower())
 
 
+def test_a_kind_of_network_hears_how_long_a_stage_is(field, tmp_path, monkeypatch):
+    """The images that each stage draws."""
+    heard = []
+    begin = TinyMember.begin_stage
+    monkeypatch.setattr(TinyMember, "begin_stage", lambda *of: (heard.append(of[3]), begin(*of)))
+    train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
+    assert heard == [60, 240]
+
+
 def test_pretraining_takes_its_own_data_set(field, tmp_path):
     """The first stage sees the other data set, targets are then those of the area, layers go on."""
     other = write_field(tmp_path / "other.h5", 7, 2)

@@ -18,7 +18,7 @@ from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.pose import Poses, canonical_quats
 from spn_model.members import registry
-from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.training_set import TrainingSet
 
 CAMERA = Camera("SIMPLE_PINHOLE", 64, 48, np.array([40.0, 32.0, 24.0]))
@@ -138,7 +138,9 @@ class TinyMember(Member):
         self.network.center.copy_(centers.mean(dim=0))
         self.network.scale.copy_(centers.std(dim=0).max())
 
-    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+    def begin_stage(
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+    ) -> None:
         unknown = [name for name in stage if name not in ("frozen", "brightness", "sick_at")]
         if unknown:
             raise InputError(f"kind tiny has no option {unknown[0]!r}")

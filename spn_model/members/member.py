@@ -14,6 +14,7 @@ from spn_data.pose import Poses
 from spn_model.training_set import TrainingSet
 
 Batch = dict[str, Tensor]
+ANY_NUMBER = 10**12  # of images, where it is not known how many are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +76,12 @@ class Member(ABC):
         """
 
     @abstractmethod
-    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+    def begin_stage(
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+    ) -> None:
         """Freeze and thaw, choose loss and augmentation, as the options of a recipe's stage say.
 
+        images : that the stage will draw, about; a short one makes less in advance.
         Raises InputError for an option or a value that this kind does not know.
         """
 

@@ -15,7 +15,7 @@ from spn_data.pose import Poses
 from spn_model import weights
 from spn_model.imagenet import MEAN, STD
 from spn_model.loss import beta_weighted, laplace, reprojection, residuals
-from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.regression_examples import (
     FeatureCache,
@@ -100,7 +100,9 @@ class RegressionMember(Member):
         start_as_identity(network.regressor, self._measured(data))
         network.is_started.fill_(True)
 
-    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+    def begin_stage(
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+    ) -> None:
         chosen = from_mapping(StageOptions, stage, f"stage of {self.kind}")
         if chosen.loss == "reprojection" and not data.has_points:
             raise InputError(

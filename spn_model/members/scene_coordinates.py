@@ -16,7 +16,7 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.pose import Poses
 from spn_model.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.imagenet import MEAN, STD
-from spn_model.members.member import Batch, Member, PoseEstimates
+from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.scene_examples import Examples, StageOptions
 from spn_model.networks.scene_coordinates import (
@@ -57,7 +57,7 @@ class SceneCoordinatesMember(Member):
     def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):
         self.network = network
         self.decoding = decoding
-        self._stage = StageOptions()
+        self._stage, self._images = StageOptions(), ANY_NUMBER
         self._examples: tuple[TrainingSet, Examples] | None = None
         self._making_examples = Lock()
 
@@ -99,8 +99,11 @@ class SceneCoordinatesMember(Member):
         images = np.stack([data.image(k) for k in chosen])
         self.network.measure_features(_normalised(torch.from_numpy(images)))
 
-    def begin_stage(self, stage: Mapping[str, Any], data: TrainingSet) -> None:
+    def begin_stage(
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+    ) -> None:
         self._stage = from_mapping(StageOptions, stage, f"stage of {self.kind}")
+        self._images = images
         self.network.freeze_features(self._stage.freeze_layers)
         self._examples = None
 
@@ -122,7 +125,9 @@ class SceneCoordinatesMember(Member):
         with self._making_examples:  # once, whichever thread comes first: it may take seconds
             if self._examples is None or self._examples[0] is not data:
                 center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
-                made = Examples(data, self._stage, center, spread, self.network.shrink)
+                made = Examples(
+                    data, self._stage, center, spread, self.network.shrink, self._images
+                )
                 self._examples = (data, made)
             examples = self._examples[1]
         images, targets, known = examples.batch(rows, generator, progress)

@@ -24,6 +24,7 @@ from spn_model.virtual_views import ViewOptions, high_place, random_place, view_
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
 _VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 20 to 80 ms
+_IMAGES_A_VIEW = 120  # drawn for each view that is made, at least: it takes the time of ten of them
 _FIRST_VIEWS = 32  # at a stage's beginning: it does not wait until all are made
 _ALL_VIEWS_AT = 0.8  # progress from which on all of them are drawn
 _GOLDEN = 0.6180339887498949  # steps of it fill the circle evenly, however many
@@ -86,7 +87,7 @@ class Examples:
     """Examples of one data set, as one stage varies them; surfaces and views are kept once they are made.
 
     center (3,), spread : of the scene; shrink : factor by which the network's images are smaller than the
-    data's. What is kept is made of the data alone, whichever row comes first.
+    data's; images : that are drawn, about. What is kept is made of the data alone, whichever row comes first.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class Examples:
         center: np.ndarray,
         spread: float,
         shrink: int,
+        images: int,
     ):
         self._data, self._options, self._shrink = data, options, shrink
         self._center, self._spread = center, spread
@@ -114,7 +116,9 @@ class Examples:
         self._view_shrink = shrink if fits else 1
         surface_step = self._view_shrink if options.views_fused else step
         view_bytes = width * height * (3 / self._view_shrink**2 + 4 / surface_step**2)
-        self._view_count = min(options.views, max(1, int(_VIEW_BYTES / view_bytes)))
+        kept = max(1, int(_VIEW_BYTES / view_bytes))
+        worth = max(_FIRST_VIEWS, images // _IMAGES_A_VIEW)
+        self._view_count = min(options.views, kept, worth)
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
         self._sources: Sources | None = None
         self._looks_down = False
