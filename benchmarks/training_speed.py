@@ -41,14 +41,14 @@ from torch import nn
 
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
-from spn_model.batches import generator_of_step, rows_of_step
+from spn_model.batches import rows_of_step
 from spn_model.gradients import Gradients, gradients
 from spn_model.imagenet import MEAN, STD
 from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
 from spn_model.recipe import Stage, read_recipe
-from spn_model.train import optimizer_of, run_stage
+from spn_model.train import made_part, optimizer_of, run_stage
 from spn_model.training_record import Files, Record
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import Position
@@ -96,14 +96,11 @@ class Contest:
 
     def parts(self, k: int) -> list[Batch]:
         """The batch of step k in its parts, as the loop has it."""
-        return [self.part(k, part, self.stage.parts) for part in range(self.stage.parts)]
+        first = k * self.stage.parts
+        return [self.part(number) for number in range(first, first + self.stage.parts)]
 
-    def part(self, k: int, part: int, parts: int) -> Batch:
-        rows = rows_of_step(
-            len(self.images), self.stage.batch // parts, k, 0, 0, rank=part, world=parts
-        )
-        progress = self.stage.progress(k * self.stage.batch, 0.0)
-        made = self.member.batch(self.images, rows, generator_of_step(0, 0, k, part), progress)
+    def part(self, number: int) -> Batch:
+        made = made_part(self.member, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
         return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
 
     def step(self, gradient: Gradients, parts: list[Batch]) -> None:

@@ -26,10 +26,7 @@ class Gradients:
 
         The sum is taken in the order of the parts: it does not depend on which is ready first.
         """
-        if self._pool is None:
-            found = [self._part(batch) for batch in parts]
-        else:
-            found = list(self._pool.map(self._part, parts))
+        found = list((self._pool.map if self._pool else map)(self._part, parts))
         share = 1 / len(parts)
         for k, parameter in enumerate(self._parameters):
             given = [gradient for _, _, of in found if (gradient := of[k]) is not None]

@@ -28,7 +28,7 @@ class Machine:
     threads: int
     workers: int
     bfloat16: bool
-    cores: int = 1
+    cores: int
 
     def plain(self) -> dict[str, str | int]:
         """For the log."""

@@ -52,7 +52,7 @@ class Stage:
     def images_about(self) -> int:
         """Training images that it draws: its budget, or what two cores compute in its minutes."""
         by_minutes = round(self.minutes * 60 * _IMAGES_PER_S)
-        return min(n for n in (self.images, by_minutes) if n) if self.images or by_minutes else 0
+        return min((n for n in (self.images, by_minutes) if n), default=0)
 
     def progress(self, drawn: int, seconds: float) -> float:
         """Share of the budget that is spent; 1 or more: the stage is done."""

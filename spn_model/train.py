@@ -25,7 +25,7 @@ from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
-from spn_model.recipe import ALL, AREA, PRETRAINING, TRAINING, Recipe, Stage
+from spn_model.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
 from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
 from spn_model.training_set import TrainingSet
@@ -119,9 +119,9 @@ def train(
                 if is_new and state is None:
                     member.fit(images)
             if record is not None:
-                until_now = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
-                learnt = ALL if any(s.frames == ALL for s in until_now) else TRAINING
-                record.trains_on([group.name for group in _groups_of(area, learnt)])
+                on_area = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
+                learnt = {g.name: None for s in on_area for g in _groups_of(area, s.frames)}
+                record.trains_on(list(learnt))
             member.network.to(machine.device)
             member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
             member.begin_stage(stage.options, images, stage.images_about)
@@ -166,22 +166,15 @@ def run_stage(
     clock = Clock(at.stage_s)
     progress = stage.progress(at.step * step_images, at.stage_s)
 
-    def batch_of(number: int) -> Batch:
-        step, part = divmod(number, stage.parts)
-        part += ranks.rank * stage.parts
-        world = ranks.world * stage.parts
-        rows = rows_of_step(
-            len(images), stage.batch // stage.parts, step, seed, index, rank=part, world=world
-        )
+    def part_of(number: int) -> Batch:
         # A budget in minutes is as far as it was when the batch was begun.
-        spent = max(stage.progress(step * step_images, 0.0), progress if stage.minutes else 0.0)
-        generator = generator_of_step(seed, index, step, part)
-        return _pinned(member.batch(images, rows, generator, min(spent, 1.0)), machine)
+        spent = progress if stage.minutes else 0.0
+        return _pinned(made_part(member, images, stage, index, number, seed, ranks, spent), machine)
 
     logged = saved = time.perf_counter()
     shown, save_s = at.shown, 0.0
     with (
-        batches_ahead(batch_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
+        batches_ahead(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
         gradients(member, parameters, stage.parts, machine) as gradient,
     ):
         waited_s = at.wait_s
@@ -229,6 +222,29 @@ def run_stage(
             saved = logged if is_saved else saved
 
 
+def made_part(
+    member: Member,
+    images: TrainingSet,
+    stage: Stage,
+    index: int,
+    number: int,
+    seed: int,
+    ranks: Ranks,
+    spent: float,
+) -> Batch:
+    """One part of a batch of the `index`-th stage; `number` counts the parts of all steps.
+
+    spent : share of the stage's minutes.
+    """
+    step, part = divmod(number, stage.parts)
+    part, world = part + ranks.rank * stage.parts, ranks.world * stage.parts
+    rows = rows_of_step(
+        len(images), stage.batch // stage.parts, step, seed, index, rank=part, world=world
+    )
+    spent = max(stage.progress(step * stage.batch * ranks.world, 0.0), spent)
+    return member.batch(images, rows, generator_of_step(seed, index, step, part), min(spent, 1.0))
+
+
 @contextmanager
 def _telling_what_is_kept(at: Position) -> Iterator[None]:
     """Raises StageError where the loss diverges."""
@@ -263,9 +279,7 @@ def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:
     """That a stage trains on."""
     groups = [_training_group(dataset)]
     if frames == ALL:
-        size = groups[0].image_size
-        found = dataset.of_role(Role.VALIDATION)
-        groups += [group for group in found if len(group) and group.image_size == size]
+        groups += [group for group in dataset.of_role(Role.VALIDATION) if len(group)]
     return groups
 
 

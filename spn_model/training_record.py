@@ -124,8 +124,8 @@ class Record:
         )
 
     def trains_on(self, groups: Sequence[str]) -> None:
-        """Before a stage: names of the area's groups that it trains on. Those judge no longer."""
-        self._learnt = sorted({*self._learnt, *groups})
+        """Before a stage: names of the groups that it or an earlier one learns: they judge no longer."""
+        self._learnt = list(groups)
         left = [j for j in self.judged if j.event == "training" or j.group.name not in self._learnt]
         if len(left) == len(self.judged):
             return

@@ -34,8 +34,11 @@ class TrainingSet:
                 raise InputError(
                     f"group {group.name} holds no images: there is nothing to train on"
                 )
-            if group.role is Role.TEST or group.image_size != groups[0].image_size:
-                raise ValueError(f"group {group.name} cannot be trained on with {groups[0].name}")
+            if group.image_size != groups[0].image_size:
+                raise InputError(
+                    f"images of {group.name} are of another size than those of {groups[0].name}: both "
+                    "cannot be trained on together"
+                )
         self._rows = [(group, k) for group in groups for k in range(len(group))]
         self.up_is_known = up_is_known
         self.size: tuple[int, int] = groups[0].image_size or (0, 0)
