@@ -35,8 +35,7 @@ class Machine:
         on_card = self.device.type == "cuda"
         return {
             "device": torch.cuda.get_device_name(self.device) if on_card else str(self.device),
-            "threads": self.threads,
-            "workers": self.workers,
+            "threads": self.cores,
             "precision": "bfloat16" if self.bfloat16 else "float32",
             "torch": torch.__version__,
         }

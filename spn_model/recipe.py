@@ -15,6 +15,8 @@ from spn_data.errors import InputError
 SHIPPED = Path(__file__).parent / "recipes"
 AREA, PRETRAINING = "area", "pretraining"  # data sets that a stage names without a path
 TRAINING, ALL = "training", "all"  # frames of the mapping flights that a stage trains on
+OPTIMIZERS = ("adamw", "sgd", "muon")
+SCHEDULES = ("cosine", "linear", "constant")
 _MAX_BYTES = 100_000
 _IMAGES_PER_S = 200  # of the default network on two cores
 _MAX_STAGES = 50
@@ -42,7 +44,7 @@ class Stage:
     batch: int = 8  # training images drawn for one step, of each process
     parts: int = 1  # of a batch, computed beside each other; their losses count alike
     rate: float = 1e-3  # of learning, at its highest
-    schedule: str = "cosine"  # falls to 0 along a cosine; or constant
+    schedule: str = "cosine"  # falls to 0 along a cosine; or linear, constant
     warmup_steps: int = 50  # over which the rate rises
     weight_decay: float = 1e-4
     clip: float = 0.0  # longest gradient; 0: no limit
@@ -64,6 +66,8 @@ class Stage:
         rate = self.rate * min(1.0, (step + 1) / max(self.warmup_steps, 1))
         if self.schedule == "cosine":
             rate *= 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+        elif self.schedule == "linear":
+            rate *= max(0.0, 1 - progress)
         return rate
 
 
@@ -79,7 +83,7 @@ class Recipe:
     stages: tuple[Stage, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
     weights: str = "published"
-    optimizer: str = "adamw"  # or sgd
+    optimizer: str = "adamw"  # or sgd, muon
     momentum: float = 0.9  # of sgd
 
     def plain(self) -> dict[str, Any]:
@@ -147,9 +151,10 @@ class _Reader:
             raise self._wrong("kind", 'kind is missing, as in kind = "regression"')
         defaults = {"kind": "", "options": {}, "weights": "", "optimizer": "", "momentum": 0.0}
         values = self._values(table, defaults, "a recipe")
-        if values.get("optimizer", "adamw") not in ("adamw", "sgd"):
+        if values.get("optimizer", "adamw") not in OPTIMIZERS:
             raise self._wrong(
-                "optimizer", f"optimizer is {values['optimizer']!r}, needs to be adamw or sgd"
+                "optimizer",
+                f"optimizer is {values['optimizer']!r}, needs to be one of {', '.join(OPTIMIZERS)}",
             )
         if not 0 <= values.get("momentum", 0.9) < 1:
             raise self._wrong(
@@ -168,8 +173,8 @@ class _Reader:
         defaults = {f.name: f.default for f in Stage.__dataclass_fields__.values()}
         defaults |= {"name": "", "options": {}}
         values = self._values({"name": f"stage {k + 1}", **table}, defaults, "a stage", k)
-        if values.get("schedule", "cosine") not in ("cosine", "constant"):
-            told = f"schedule is {values['schedule']!r}, needs to be cosine or constant"
+        if values.get("schedule", "cosine") not in SCHEDULES:
+            told = f"schedule is {values['schedule']!r}, needs to be one of {', '.join(SCHEDULES)}"
             raise self._wrong("schedule", told, k)
         if values.get("frames", TRAINING) not in (TRAINING, ALL):
             told = f"frames is {values['frames']!r}, needs to be {TRAINING} or {ALL}"

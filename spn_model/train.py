@@ -25,6 +25,7 @@ from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
+from spn_model.muon import Muon
 from spn_model.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
 from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
@@ -293,6 +294,8 @@ def optimizer_of(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Op
         return torch.optim.SGD(
             groups, rate, momentum=recipe.momentum, weight_decay=decay, fused=True
         )
+    if recipe.optimizer == "muon":
+        return Muon(groups, rate, decay, torch.bfloat16 if member.bfloat16 else torch.float32)
     return torch.optim.AdamW(groups, rate, weight_decay=decay, fused=True)
 
 

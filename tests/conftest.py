@@ -31,6 +31,14 @@ def tiny_kind() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of the coloured field of `tests.training_world`."""
+    from tests.training_world import write_field
+
+    return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
+
+
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """More threads only wait for each other in networks this small; weights are drawn by one seed."""

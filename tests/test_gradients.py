@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,18 +17,12 @@ from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train
 from spn_model.training_set import TrainingSet
 from tests.box_world import write_box
-from tests.test_train import ONE_THREAD, Follower, files, weights
-from tests.training_world import TinyMember, write_field
+from tests.training_world import ONE_THREAD, Follower, TinyMember, files, weights
 
 STAGE = Stage(name="all", images=180, batch=6, parts=3, rate=0.02)
 RECIPE = Recipe(
     kind="tiny", weights="none", options={"dropout": 0.0, "normalised": False}, stages=(STAGE,)
 )
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
 
 
 @pytest.fixture

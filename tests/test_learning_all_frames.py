@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from spn_model.evaluate import EvaluateOptions, compare
 from spn_model.recipe import ALL, Recipe, Stage, read_recipe
 from spn_model.train import Data, Stopped, train
 from spn_model.training_set import TrainingSet
-from tests.test_train import ONE_THREAD, Follower, files, log
-from tests.training_world import TinyMember, write_field
+from tests.training_world import ONE_THREAD, Follower, TinyMember, files, log
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
@@ -26,11 +24,6 @@ RECIPE = Recipe(
     weights="none",
     stages=(HELD_OUT, replace(HELD_OUT, name="all", images=120, frames=ALL)),
 )
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
 
 
 @pytest.fixture

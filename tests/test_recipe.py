@@ -66,14 +66,14 @@ def test_a_recipe_is_read_whole(tmp_path):
         ('momentum = 0.8', "momentun = 0.8", ":4: 'momentun' is no key of a recipe"),
         ("momentum = 0.8", "momentum = 1.0", ":4: momentum is 1.0, needs to lie in"),
         ("momentum = 0.8", 'momentum = "0.8"', ":4: momentum is '0.8', needs a number"),
-        ('"sgd"', '"adam"', ":3: optimizer is 'adam', needs to be adamw or sgd"),
+        ('"sgd"', '"adam"', ":3: optimizer is 'adam', needs to be one of adamw, sgd, muon"),
         ("batch = 4", "batch = 4.5", ":10: batch is 4.5, needs a whole number"),
         ("batch = 4", "batch = true", ":10: batch is True, needs a whole number"),
         ("batch = 4", "batch = 0", ":10: batch is 0, needs to lie from 1 to"),
         ("batch = 4", "batch = 4\nparts = 3", ":11: parts is 3, needs to divide the batch of 4"),
         ("rate = 1", "rate = nan", ":11: rate is nan, needs to lie from 0 to 100"),
         ("rate = 1", "speed = 1", ":11: 'speed' is no key of a stage"),
-        ('"constant"', '"linear"', ":19: schedule is 'linear'"),
+        ('"constant"', '"linea"', ":19: schedule is 'linea', needs to be one of cosine, linear, constant"),
         ('"none"', "1", ":2: weights is 1, needs a text"),
         ("[stages.options]", "[stages.option]", ":13: 'option' is no key of a stage"),
         ("images = 900", "minutes = 900", ":7: all stages need a budget: all images, or all min"),
@@ -152,6 +152,8 @@ def test_the_rate_rises_and_falls():
     assert stage.rate_at(100, 0.5) == pytest.approx(0.2)
     assert stage.rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
     assert replace(stage, schedule="constant").rate_at(100, 0.9) == 0.4
+    straight = replace(stage, schedule="linear")
+    assert [straight.rate_at(100, at) for at in (0, 0.25, 1.0, 1.1)] == pytest.approx([0.4, 0.3, 0, 0])
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,19 +24,28 @@ from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_ste
 from spn_model.checkpoint import load
 from spn_model.members.member import PoseEstimates
 from spn_model.recipe import Recipe, Stage
-from spn_model.train import Data, Stopped, TrainOptions, train
+from spn_model.train import Data, Stopped, train
 from spn_model.training_loss import Diverged, Losses
-from spn_model.training_record import Files, Record, judged_frames
+from spn_model.training_record import Record, judged_frames
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import COLUMNS, Log, Position, read_state
 from spn_model.validation import judge, spread_rows
 from spn_model.view import View
-from tests.training_world import INFO, TinyMember, frame, write_field
+from tests.training_world import (
+    INFO,
+    ONE_THREAD,
+    Follower,
+    TinyMember,
+    files,
+    frame,
+    log,
+    weights,
+    write_field,
+)
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
 ROOT = Path(__file__).resolve().parents[1]
-ONE_THREAD = TrainOptions(seed=5, threads=1, device="cpu", precision="float32", validations=4)
 FREEZE = {"frozen": True, "brightness": 0.05}
 RECIPE = Recipe(
     kind="tiny",
@@ -49,41 +55,6 @@ RECIPE = Recipe(
         Stage(name="all", images=240, batch=6, rate=0.02, options={"brightness": 0.05}),
     ),
 )
-
-
-class Follower:
-    """Keeps the rows; wants a stop after some steps."""
-
-    def __init__(self, stop_after: int = 10**9):
-        self.rows: list[Mapping[str, Any]] = []
-        self._left = stop_after
-
-    def row(self, values: Mapping[str, Any]) -> None:
-        self.rows.append(dict(values))
-
-    def wants_stop(self) -> bool:
-        self._left -= 1
-        return self._left < 0
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
-
-
-def files(folder: Path) -> Files:
-    folder.mkdir(exist_ok=True)
-    names = ("checkpoint.safetensors", "last.safetensors", "state.safetensors", "log.csv")
-    return Files(*(folder / name for name in names))
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return load(path).member.network.state_dict()
-
-
-def log(folder: Path) -> list[dict[str, str]]:
-    with (folder / "log.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")

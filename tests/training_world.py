@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -17,8 +18,11 @@ from spn_data.geodesy import GeoOrigin, HeightReference
 from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.pose import Poses, canonical_quats
+from spn_model.checkpoint import load
 from spn_model.members import registry
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
+from spn_model.train import TrainOptions
+from spn_model.training_record import Files
 from spn_model.training_set import TrainingSet
 
 CAMERA = Camera("SIMPLE_PINHOLE", 64, 48, np.array([40.0, 32.0, 24.0]))
@@ -30,6 +34,7 @@ INFO = DatasetInfo(
     fingerprints={"3-geo": "0123456789abcdef"},
 )
 HEIGHT_M, PX_PER_M = 10.0, 4.0
+ONE_THREAD = TrainOptions(seed=5, threads=1, device="cpu", precision="float32", validations=4)
 
 
 def field_image() -> np.ndarray:
@@ -193,3 +198,33 @@ class TinyMember(Member):
 def register_tiny() -> None:
     """Let recipes and checkpoints of this process know the kind."""
     registry.KINDS["tiny"] = (__name__, "TinyMember")
+
+
+class Follower:
+    """Keeps the rows; wants a stop after some steps."""
+
+    def __init__(self, stop_after: int = 10**9):
+        self.rows: list[Mapping[str, Any]] = []
+        self._left = stop_after
+
+    def row(self, values: Mapping[str, Any]) -> None:
+        self.rows.append(dict(values))
+
+    def wants_stop(self) -> bool:
+        self._left -= 1
+        return self._left < 0
+
+
+def files(folder: Path) -> Files:
+    folder.mkdir(exist_ok=True)
+    names = ("checkpoint.safetensors", "last.safetensors", "state.safetensors", "log.csv")
+    return Files(*(folder / name for name in names))
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return load(path).member.network.state_dict()
+
+
+def log(folder: Path) -> list[dict[str, str]]:
+    with (folder / "log.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
