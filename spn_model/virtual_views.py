@@ -11,6 +11,10 @@ from spn_data.pose import Poses, rotations_from_vectors
 from spn_model.point_targets import Surface, cell_centers
 
 _NEAREST = 0.5  # depth, in metres, before which nothing is drawn
+_STEEP_DEG = (
+    30.0,
+    90.0,
+)  # below level that a high view looks: places beside training images show the rest
 _PITCH_DEG = 5.0  # around a drawn pitch: places that are looked at alike
 _SAME_SURFACE = 1.05  # ratio of depths up to which two samples of a pixel are mixed
 _SEAM_PX = 6.0  # by more, what neighbouring cells show lies on different surfaces
@@ -56,7 +60,8 @@ def high_place(
     """(1,) pose of a level camera above the scene, which looks down at one of its places (P, 3).
 
     It stands beside one of the training images' centers (N, 3), as high as half of them at least, and looks
-    level or straight down as often as anything between, as far as the scene has places there. z is up.
+    down by 30 degrees as often as straight down or anything between, as far as the scene has places there.
+    z is up.
     Raises ValueError where nothing of the scene lies below.
     """
     center = centers[generator.integers(len(centers))].copy()
@@ -68,7 +73,7 @@ def high_place(
     if not len(toward):
         raise ValueError("nothing of the scene lies below its training images")
     pitch = np.degrees(np.arctan2(-toward[:, 2], np.hypot(toward[:, 0], toward[:, 1])))
-    off = np.abs(pitch - generator.uniform(0, 90))
+    off = np.abs(pitch - generator.uniform(*_STEEP_DEG))
     toward = toward[off <= max(_PITCH_DEG, off.min())]
     forward = toward[generator.integers(len(toward))]
     forward = forward / np.linalg.norm(forward)

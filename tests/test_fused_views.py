@@ -204,7 +204,7 @@ def test_a_scene_without_level_ground_has_none():
 
 
 def test_high_places_look_down_at_the_scene(data, sources):
-    """Level cameras above the middle training image, within the options, at all pitches."""
+    """Level cameras above the middle training image, within the options, at all pitches from 30°."""
     centers, scene = data.poses.centers, sources.samples
     options = ViewOptions(side_m=1.5, height_m=6.0)
     rng = np.random.default_rng(0)
@@ -218,7 +218,8 @@ def test_high_places_look_down_at_the_scene(data, sources):
     assert (rotations[:, 1, 2] <= 0).all()  # the image's upper edge is up
     assert np.linalg.det(rotations) == pytest.approx(1)
     pitch = np.degrees(np.arcsin(-rotations[:, 2, 2]))
-    assert np.histogram(pitch, [0, 30, 60, 90])[0].min() > 30
+    assert pitch.min() > 20  # where places lie there
+    assert np.histogram(pitch, [25, 50, 70, 90])[0].min() > 30
 
 
 def test_a_camera_may_look_straight_down():

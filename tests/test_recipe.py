@@ -153,7 +153,9 @@ def test_the_rate_rises_and_falls():
     assert stage.rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
     assert replace(stage, schedule="constant").rate_at(100, 0.9) == 0.4
     straight = replace(stage, schedule="linear")
-    assert [straight.rate_at(100, at) for at in (0, 0.25, 1.0, 1.1)] == pytest.approx([0.4, 0.3, 0, 0])
+    assert [straight.rate_at(100, at) for at in (0, 0.25, 1.0, 1.1)] == pytest.approx(
+        [0.4, 0.3, 0, 0]
+    )
 
 
 @pytest.mark.parametrize(
