@@ -22,6 +22,7 @@ _SHOWN = 12  # rows of the live table
 _NAMES = {
     "validation": "validation",
     "held out": "validation, before it was learnt too",
+    "views": "rendered views that are not trained on",
     "training": "training images",
 }
 

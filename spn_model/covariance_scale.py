@@ -18,9 +18,9 @@ def measured_scale(estimates: PoseEstimates, truth: Poses) -> float:
 
     The median of the errors' squared Mahalanobis distances becomes that of chi-squared with 6 degrees of
     freedom: half of the frames lie within the ellipsoid that should hold half of them. The median, because a
-    few wrong poses have distances without bound. After training, `Member.set_covariance_scale` takes the
-    factor from the validation images: of training images a network knows too much. Raises GeometryError
-    where fewer than 10 frames have a pose and a covariance.
+    few wrong poses have distances without bound. `Member.set_covariance_scale` takes the factor from images
+    that training does not draw, for a network knows too much of the others. Raises GeometryError where fewer
+    than 10 frames have a pose and a covariance.
     """
     known = np.isfinite(estimates.poses.centers).all(axis=1)
     errors = np.full((len(known), DOF), np.nan)
@@ -33,7 +33,7 @@ def measured_scale(estimates: PoseEstimates, truth: Poses) -> float:
     squared = squared[np.isfinite(squared)]
     if len(squared) < LEAST_FRAMES:
         raise GeometryError(
-            f"{len(squared)} validation images have a pose with a covariance, need {LEAST_FRAMES} to "
+            f"{len(squared)} images have a pose with a covariance, need {LEAST_FRAMES} to "
             "measure how large covariances are"
         )
     return float(np.median(squared) / chdtri(DOF, 0.5))

@@ -122,7 +122,7 @@ def train(
             if record is not None:
                 on_area = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
                 learnt = {g.name: None for s in on_area for g in _groups_of(area, s.frames)}
-                record.trains_on(list(learnt))
+                record.trains_on(list(learnt), images)
             member.network.to(machine.device)
             member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
             member.begin_stage(stage.options, images, stage.images_about)

@@ -15,7 +15,11 @@ from spn_model.svg import COLOURS, INK, SOFT, Panel
 from spn_model.training_state import COLUMNS
 
 _MOST_POINTS = 400  # of one line; of more, an even choice is drawn
-_EVENTS = {"validation": ("validation frames", COLOURS[1]), "training": ("training images", SOFT)}
+_EVENTS = {
+    "validation": ("validation frames", COLOURS[1]),
+    "views": ("rendered views", COLOURS[2]),
+    "training": ("training images", SOFT),
+}
 _MAX_BYTES = 200_000_000
 
 

@@ -18,13 +18,18 @@ from spn_data.hdf5_schema import Role
 from spn_model import checkpoint
 from spn_model.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.members.member import Member
+from spn_model.training_set import TrainingSet
 from spn_model.training_state import Log, Position, save_state
-from spn_model.validation import Errors, judge, spread_rows
+from spn_model.validation import Errors, Frames, judge, spread_rows
 from spn_model.view import View
 
 # A later network is kept where its score is at most this times the best one: rates fall towards the end, and
 # validation frames are few and of one or two places.
 _WORSE = 1.25
+_VIEWS = 64  # that judge, at most; one is rendered in about 80 ms
+# By what covariances are scaled, the first that there is. After a few minutes hardly a validation frame is
+# found, for training shows little of their places: errors there tell nothing of places that it shows.
+_SCALING = ("views", "validation")
 _SHOWN_SHARE = 0.5  # of a validation frame's map points, seen by training images too
 
 
@@ -43,7 +48,8 @@ class Watch(Protocol):
 
     def row(self, values: Mapping[str, Any]) -> None:
         """A row of the log, by column: event "steps" (figures of the steps since the last one),
-        "validation" or "training" (errors on validation frames, and on images that are trained on)."""
+        "validation", "views" or "training" (errors on validation frames, on views that training never
+        draws, and on images that are trained on)."""
 
     def wants_stop(self) -> bool:
         """Asked at each step: True saves the state and ends the training."""
@@ -51,20 +57,20 @@ class Watch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Frames that a member is judged by: some rows of a group."""
+    """Frames that a member is judged by: some rows of a group of a name, or views, of none."""
 
     event: str
-    group: DatasetGroup
+    frames: Frames
     rows: np.ndarray
+    group: str = ""
 
-    def errors(self, member: Member) -> Errors:
-        """Of the member's estimates. Validation frames also tell how large its covariances have to be."""
-        group = self.group
-        errors, found = judge(member, group.image, group.intrinsics, group.poses, self.rows)
-        if self.event == "validation":
+    def errors(self, member: Member, *, scales: bool) -> Errors:
+        """Of the member's estimates; scales : they also tell how large its covariances have to be."""
+        errors, found = judge(member, self.frames, self.rows)
+        if scales:
             # Too few frames with a pose: covariances stay as they are.
             with suppress(GeometryError):
-                factor = measured_scale(found, group.poses[self.rows])
+                factor = measured_scale(found, self.frames.poses[self.rows])
                 member.set_covariance_scale(min(max(factor, 1e-6), 1e6))
         return errors
 
@@ -76,8 +82,11 @@ def judged_frames(
     judged = []
     for group in [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size][:1]:
         rows = _shown_to_training(group, training)
-        judged.append(Judged("validation", group, rows[spread_rows(len(rows), frames)]))
-    return [*judged, Judged("training", training, spread_rows(len(training), sample))]
+        judged.append(Judged("validation", group, rows[spread_rows(len(rows), frames)], group.name))
+    return [
+        *judged,
+        Judged("training", training, spread_rows(len(training), sample), training.name),
+    ]
 
 
 def _shown_to_training(group: DatasetGroup, training: DatasetGroup) -> np.ndarray:
@@ -107,6 +116,7 @@ class Record:
     position: Position
     facts: dict[str, Any]
     _learnt: list[str] = field(default_factory=list)
+    _images: TrainingSet | None = None
     _log: Log = field(init=False)
 
     def __post_init__(self) -> None:
@@ -123,21 +133,38 @@ class Record:
             {**{k: figures[k] for k in own}, "rate": rate, "figures": others},
         )
 
-    def trains_on(self, groups: Sequence[str]) -> None:
-        """Before a stage: names of the groups that it or an earlier one learns: they judge no longer."""
-        self._learnt = list(groups)
-        left = [j for j in self.judged if j.event == "training" or j.group.name not in self._learnt]
+    def trains_on(self, groups: Sequence[str], images: TrainingSet) -> None:
+        """Before a stage: names of the groups that it or an earlier one learns: they judge no longer.
+
+        images : that it trains on. What it renders of them judges too.
+        """
+        self._learnt, self._images = list(groups), images
+        self.judged = [judged for judged in self.judged if judged.event != "views"]
+        left = [j for j in self.judged if j.event == "training" or j.group not in self._learnt]
         if len(left) == len(self.judged):
             return
         self.judged, latest = left, self.position.latest
         if "validation" in latest:
             latest["held out"] = latest.pop("validation")
 
+    def _with_views(self) -> list[Judged]:
+        """What judges, with the stage's views, which are rendered when first asked for."""
+        if self._images is not None:
+            views = self.member.unseen_views(self._images, _VIEWS)
+            if views is not None:
+                rows = np.arange(len(views.poses))
+                self.judged = [Judged("views", views, rows), *self.judged]
+            self._images = None
+        return self.judged
+
     def validate(self, stage: str, progress: float) -> None:
         """Judge, and keep the network where it is among the best so far, or where nothing can tell."""
         at = self.position
         began = time.perf_counter()
-        found = {one.event: one.errors(self.member) for one in self.judged}
+        judged = self._with_views()
+        events = [one.event for one in judged]
+        by = next((event for event in _SCALING if event in events), None)
+        found = {one.event: one.errors(self.member, scales=one.event == by) for one in judged}
         at.validate_s += time.perf_counter() - began
         for event, errors in found.items():
             plain = errors.plain()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +12,21 @@ from spn_model.members.member import Member, PoseEstimates
 from spn_model.metrics import Estimates, frame_errors, quantile
 
 _AT_ONCE = 8  # images given to `estimate`
+
+
+class Frames(Protocol):
+    """Images with poses: a group of a data set, or rendered views."""
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """(N, 3, 3)."""
+
+    @property
+    def poses(self) -> Poses:
+        """The true ones (N)."""
+
+    def image(self, row: int) -> np.ndarray:
+        """(H, W, 3) uint8 RGB."""
 
 
 @dataclass(frozen=True)
@@ -41,25 +55,17 @@ def spread_rows(count: int, limit: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
 
 
-def judge(
-    member: Member,
-    image: Callable[[int], np.ndarray],
-    intrinsics: np.ndarray,
-    poses: Poses,
-    rows: np.ndarray,
-) -> tuple[Errors, PoseEstimates]:
-    """The member's estimates of these rows, and their errors; `image` gives the (H, W, 3) RGB of one.
-
-    The network is left in eval mode.
-    """
+def judge(member: Member, frames: Frames, rows: np.ndarray) -> tuple[Errors, PoseEstimates]:
+    """The member's estimates of these rows, and their errors. The network is left in eval mode."""
     member.network.eval()
+    intrinsics = frames.intrinsics
     found = []
     for first in range(0, len(rows), _AT_ONCE):
         part = rows[first : first + _AT_ONCE]
-        images = np.stack([image(int(row)) for row in part])
+        images = np.stack([frames.image(int(row)) for row in part])
         found.append(member.estimate(images, intrinsics[part]))
     estimates = PoseEstimates.concatenate(found)
-    errors = frame_errors(Estimates("network", estimates.poses), poses[rows])
+    errors = frame_errors(Estimates("network", estimates.poses), frames.poses[rows])
     position, rotation = (
         np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)
     )

@@ -266,9 +266,34 @@ def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     """After some attempts; its targets are the image's own."""
     monkeypatch.setattr("spn_model.members.scene_examples._LEAST_SHOWN", 1.1)
     examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
-    image, seen = examples._view(0)
+    assert examples._view(0) is None
+    image, seen = examples._training_image(0)
     assert np.array_equal(image, data.image(0))
     assert seen is examples._surface(0)
+    assert examples.unseen_views(3) is None
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
+    """Each is what a camera at its pose sees; none is among those that batches are drawn from."""
+    options = StageOptions(views_share=1.0, views=8)
+    examples = Examples(data, options, CENTER, SPREAD, shrink, ANY_NUMBER)
+    views = examples.unseen_views(5)
+    assert len(views.poses) == len(views.small) == 5
+    drawn = Poses.concatenate(examples._view(n)[1].pose for n in range(8)).centers
+    apart = np.linalg.norm(views.poses.centers[:, None] - drawn, axis=2)
+    assert apart.min() > 0.01
+    for k in range(5):
+        image = views.image(k)
+        assert image.shape[1::-1] == data.size
+        assert np.array_equal(image[::shrink, ::shrink], views.small[k])
+        assert views.intrinsics[k] == pytest.approx(CAMERA.matrix)
+        true, _ = seen_by(views.poses[k : k + 1])
+        off = np.abs(image.astype(float) - true).mean(axis=2)
+        assert np.median(off) < 12
+        wrong, _ = seen_by(views.poses[k - 1 :][:1])
+        assert np.median(np.abs(image.astype(float) - wrong).mean(axis=2)) > 2 * np.median(off)
+    assert Examples(data, StageOptions(), CENTER, SPREAD, 2, ANY_NUMBER).unseen_views(5) is None
 
 
 def test_shares_of_high_views_are_as_told(data):

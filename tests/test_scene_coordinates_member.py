@@ -313,7 +313,7 @@ def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
     found.poses.centers[9:20] = np.nan
     assert measured_scale(found, true) == pytest.approx(4, rel=0.2)
     few = PoseEstimates(found.poses[:19], covariance[:19], found.reasons[:19])
-    with pytest.raises(GeometryError, match="9 validation images"):
+    with pytest.raises(GeometryError, match="9 images"):
         measured_scale(few, true[:19])
 
 

@@ -20,8 +20,10 @@ from spn_data.errors import FormatError, InputError, StageError
 from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
+from spn_data.pose import Poses
 from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.checkpoint import load
+from spn_model.covariance_scale import measured_scale
 from spn_model.members.member import PoseEstimates
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train
@@ -29,6 +31,7 @@ from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Record, judged_frames
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import COLUMNS, Log, Position, read_state
+from spn_model.unseen_views import UnseenViews
 from spn_model.validation import judge, spread_rows
 from spn_model.view import View
 from tests.training_world import (
@@ -77,9 +80,7 @@ def test_a_training_learns_where_the_camera_is(field, tmp_path):
     assert found.facts["kept"] == facts["kept"]
     with Dataset(field) as dataset:
         group = dataset.groups["validation"]
-        errors, _ = judge(
-            found.member, group.image, group.intrinsics, group.poses, np.arange(len(group))
-        )
+        errors, _ = judge(found.member, group, np.arange(len(group)))
     assert errors.median_m == pytest.approx(facts["kept"]["validation"]["median_m"], rel=1e-5)
 
 
@@ -278,6 +279,34 @@ def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
     assert medians[1] > 1.5 * medians[0]
     assert medians[0] < medians[2] < 1.05 * medians[0]
     assert kept == [1, 1, 3]
+
+
+def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monkeypatch):
+    """Where a stage renders views, they fit these, not the validation frames; each stage has its own."""
+    stages = []
+
+    def views(self: TinyMember, data: TrainingSet, count: int) -> UnseenViews:
+        stages.append(len(data))
+        shown = 12
+        poses = data.poses[:shown]
+        moved = Poses(poses.centers + 30.0, poses.quats_wxyz)
+        return UnseenViews(moved, data.intrinsics[:shown], [data.image(k) for k in range(shown)], 1)
+
+    monkeypatch.setattr(TinyMember, "unseen_views", views)
+    field = write_field(tmp_path / "dataset.h5", validation=12)
+    facts = train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
+    judged = [row["stage"] for row in log(tmp_path) if row["event"] == "views"]
+    assert judged == ["head", "all", "all", "all"]
+    assert len(stages) == 2
+    assert facts["latest"]["views"]["frames"] == 12
+    last = load(tmp_path / "last.safetensors").member
+    with Dataset(field) as dataset:
+        shown = views(last, TrainingSet(dataset.groups["train"]), 64)
+        assert measured_scale(judge(last, shown, np.arange(12))[1], shown.poses) == pytest.approx(1)
+        rows = np.arange(12)
+        validation = dataset.groups["validation"]
+        of_validation = measured_scale(judge(last, validation, rows)[1], validation.poses[rows])
+    assert not 0.5 < of_validation < 2
 
 
 def test_frames_of_places_that_no_training_image_shows_do_not_judge(tmp_path):

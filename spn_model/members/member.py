@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from spn_data.pose import Poses
 from spn_model.training_set import TrainingSet
+from spn_model.unseen_views import UnseenViews
 
 Batch = dict[str, Tensor]
 ANY_NUMBER = 10**12  # of images, where it is not known how many are drawn
@@ -106,6 +107,13 @@ class Member(ABC):
     @abstractmethod
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
         """Poses of images (B, H, W, 3) uint8 RGB without distortion, K (B, 3, 3). In eval mode."""
+
+    def unseen_views(self, data: TrainingSet, count: int) -> UnseenViews | None:
+        """Up to `count` images like those that the stage renders of its data, none of which it ever draws.
+
+        None where the stage renders none.
+        """
+        return None
 
     @abstractmethod
     def set_covariance_scale(self, factor: float) -> None:

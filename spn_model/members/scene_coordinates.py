@@ -25,6 +25,7 @@ from spn_model.networks.scene_coordinates import (
 )
 from spn_model.tensors import load_pretrained, read_tensors
 from spn_model.training_set import TrainingSet
+from spn_model.unseen_views import UnseenViews
 from spn_model.weights import find
 
 _MEASURED = 16  # training images, spread evenly, by which features are normalised
@@ -122,6 +123,17 @@ class SceneCoordinatesMember(Member):
 
         See `Examples.batch`: all images have one zoom, and smaller ones are more than the rows.
         """
+        images, targets, known = self._examples_of(data).batch(rows, generator, progress)
+        return {
+            "images": torch.from_numpy(images),
+            "targets": torch.from_numpy(targets),
+            "known": torch.from_numpy(known),
+        }
+
+    def unseen_views(self, data: TrainingSet, count: int) -> UnseenViews | None:
+        return self._examples_of(data).unseen_views(count)
+
+    def _examples_of(self, data: TrainingSet) -> Examples:
         with self._making_examples:  # once, whichever thread comes first: it may take seconds
             if self._examples is None or self._examples[0] is not data:
                 center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
@@ -129,13 +141,7 @@ class SceneCoordinatesMember(Member):
                     data, self._stage, center, spread, self.network.shrink, self._images
                 )
                 self._examples = (data, made)
-            examples = self._examples[1]
-        images, targets, known = examples.batch(rows, generator, progress)
-        return {
-            "images": torch.from_numpy(images),
-            "targets": torch.from_numpy(targets),
-            "known": torch.from_numpy(known),
-        }
+            return self._examples[1]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Laplace likelihood, and cross entropy of the parts of the scene.

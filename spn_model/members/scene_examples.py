@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.pose import Poses
 from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
 from spn_model.fused_views import fused_view
 from spn_model.networks.scene_coordinates import (
@@ -18,12 +19,14 @@ from spn_model.networks.scene_coordinates import (
 )
 from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, cell_targets, surface
 from spn_model.training_set import TrainingSet
+from spn_model.unseen_views import UnseenViews
 from spn_model.view_sources import Sources
 from spn_model.virtual_views import ViewOptions, high_place, random_place, view_from
 
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
 _VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 20 to 80 ms
+_MOST_VIEWS = 1_000_000  # whose numbers training draws; those beyond judge
 _IMAGES_A_VIEW = 120  # drawn for each view that is made, at least: it takes the time of ten of them
 _FIRST_VIEWS = 32  # at a stage's beginning: it does not wait until all are made
 _ALL_VIEWS_AT = 0.8  # progress from which on all of them are drawn
@@ -70,7 +73,7 @@ class StageOptions:
             ("size_max", self.size_min, 10),
             ("ramp_share", 0, 1),
             ("views_share", 0, 1),
-            ("views", 1, 1_000_000),
+            ("views", 1, _MOST_VIEWS),
             ("views_rise", 0, 10),
             ("views_side", 0, 10),
             ("views_high", 0, 1),
@@ -208,7 +211,7 @@ class Examples:
         if generator.random() < self._options.views_share:
             number = int(generator.integers(self._views_at(progress)))
             if number not in self._views:
-                self._views[number] = self._view(number)
+                self._views[number] = self._view(number) or self._training_image(number)
             return self._views[number]
         return self._image(row), self._surface(row) if self._options.surfaces else None
 
@@ -237,11 +240,37 @@ class Examples:
         share = min(1.0, progress / _ALL_VIEWS_AT)
         return min(self._view_count, max(_FIRST_VIEWS, round(self._view_count * share)))
 
-    def _view(self, number: int) -> tuple[np.ndarray, Surface]:
-        row = int(number * _GOLDEN % 1 * len(self._data))
+    def unseen_views(self, count: int) -> UnseenViews | None:
+        """Up to `count` views that no batch has; None where the stage renders none."""
+        if not self._options.views_share:
+            return None
+        numbers = range(_MOST_VIEWS, _MOST_VIEWS + count)
+        made = [view for view in map(self._view, numbers) if view is not None]
+        if not made:
+            return None
+        enlarged = self._view_shrink
+        larger = np.diag([enlarged, enlarged, 1.0])
+        return UnseenViews(
+            Poses.concatenate(seen.pose for _, seen in made),
+            np.stack([larger @ seen.matrix for _, seen in made]),
+            [image for image, _ in made],
+            enlarged,
+        )
+
+    def _row_of_view(self, number: int) -> int:
+        return int(number * _GOLDEN % 1 * len(self._data))
+
+    def _training_image(self, number: int) -> tuple[np.ndarray, Surface]:
+        """In place of a view that cannot be made."""
+        row = self._row_of_view(number)
+        return self._image(row), self._surface(row)
+
+    def _view(self, number: int) -> tuple[np.ndarray, Surface] | None:
+        """None where it would show too little."""
+        row = self._row_of_view(number)
         seen = self._surface(row)
         if not np.isfinite(seen.inverse_depth).any():
-            return self._image(row), seen
+            return None
         # A view is the same whenever it is made: a batch depends on its arguments alone.
         generator = np.random.default_rng(number)
         if self._sources is None:
@@ -266,7 +295,7 @@ class Examples:
             )
             if np.isfinite(fused.inverse_depth).mean() > _LEAST_SHOWN:
                 return image, fused
-        return self._image(row), seen
+        return None
 
     def _moved(
         self, row: int, seen: Surface, generator: np.random.Generator
