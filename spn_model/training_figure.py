@@ -106,11 +106,12 @@ def training_figure(log: TrainingLog, *, unit: str = "m") -> str:
             parts.append(svg.line(ends, INK, dash="2 4"))
         for course, colour in courses:
             parts += [_line(panel, course, colour), _marks(panel, course, colour, column > 0)]
-    parts.append(svg.legend(62, 318, [("loss of steps", COLOURS[0]), *_EVENTS.values()]))
+    judged = [shown for event, shown in _EVENTS.items() if len(log.errors[event][0].values)]
+    parts.append(svg.legend(62, 318, [("loss of steps", COLOURS[0]), *judged]))
     if len(log.stages) > 1:
         words = "; ".join(f"{name} from {began:.1f} min" for name, began in log.stages)
         parts.append(svg.text(374, 318, f"Dotted: stages ({words}).", colour=SOFT))
-    return svg.document(1000, 366, heading, parts)
+    return svg.document(1000, 384, heading, parts)
 
 
 def _line(panel: Panel, course: Course, colour: str) -> str:

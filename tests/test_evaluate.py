@@ -351,7 +351,10 @@ def test_the_course_of_a_training_is_drawn(tmp_path):
     figure = training_figure(log)
     assert "training: 1.0 minutes, 80 images" in figure
     assert "all from 0.5 min" in figure
-    assert figure.count("<circle") == 3 + 2  # the legend's, and one validation in two panels
+    assert figure.count("<circle") == 2 + 2  # the legend's, and one validation in two panels
+    assert "rendered views" not in figure
+    shown = [*LOG, {**LOG[1], "event": "views"}]
+    assert "rendered views" in training_figure(read_log(write_log(tmp_path / "log.csv", shown)))
 
 
 @pytest.mark.parametrize("cell", ["train_s", "images", "loss"])
