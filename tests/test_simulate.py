@@ -179,7 +179,7 @@ def test_impossible_options_are_refused_in_one_line() -> None:
         ({"fps": 0.0}, "fps, area factor and length factor must be above zero"),
         ({"blur_share": 1.5}, "blur share 1.5 lies outside 0 to 1"),
         ({"time_offset_s": -9.0}, "time offset -9.0 s is beyond 5 s either way"),
-        ({"area_factor": 17.0}, "area factor 17.0 is beyond 16"),
+        ({"area_factor": 17.0, "texels_per_m": 50.0}, "area factor 17.0 is beyond 16 at 50 texels"),
     ):
         with pytest.raises(InputError, match=re.escape(message)):
             replace(TINY, **change)  # type: ignore[arg-type]

@@ -263,3 +263,19 @@ def test_rolling_shutter_reads_each_row_at_its_own_time() -> None:
         moved = max(moved, float(np.abs(pixel - start).max()))
         assert np.abs(found_corners(image, pixel) - pixel).max() < 0.15
     assert moved > 1.5
+
+
+def test_houses_leave_all_else_where_it_is() -> None:
+    """Twelve a hectare on 2.2 hectares, each with a part of the roofs' picture of its own."""
+    options = SceneOptions(texels_per_m=12.0, seed=3, area_factor=16.0)
+    without, with_houses = (
+        build_place(replace(options, houses_per_hectare=n)) for n in (0.0, 12.0)
+    )
+    for one, other in zip(without.faces, with_houses.faces, strict=False):
+        assert one.texture == other.texture
+        assert np.array_equal(one.origin, other.origin)
+    roofs = [face for face in with_houses.faces if face.texture == "house-roofs"]
+    assert len(roofs) == round(12 * 39 * 36 * 16 / 1e4)
+    assert len(with_houses.faces) == len(without.faces) + 5 * len(roofs)
+    assert len({face.region for face in roofs}) == len(roofs)
+    assert all(0 <= edge <= 1 for face in roofs for edge in face.region)

@@ -72,6 +72,7 @@ class SimulateOptions:
     origin: GeoOrigin = field(default_factory=lambda: GeoOrigin(49.015422, 8.425117, 163.2))
     geoid_m: float = 48.3  # of mean sea level, which abs_alt counts from, above the ellipsoid
     texels_per_m: float = 140.0  # resolution of the painted surfaces
+    houses_per_hectare: float = 0.0  # on the courtyard's ground
     crf: int = 18  # H.264 quality; lower is better
 
     def __post_init__(self) -> None:
@@ -85,13 +86,19 @@ class SimulateOptions:
             raise InputError(f"blur share {self.blur_share} lies outside 0 to 1")
         if abs(self.time_offset_s) > 5:
             raise InputError(f"time offset {self.time_offset_s} s is beyond 5 s either way")
-        if self.area_factor > 16:
-            raise InputError(f"area factor {self.area_factor} is beyond 16")
+        # The ground is one picture, of so many texels at most.
+        if self.area_factor > 16 and self.texels_per_m > 170 / self.area_factor**0.5:
+            raise InputError(
+                f"area factor {self.area_factor} is beyond 16 at {self.texels_per_m:g} texels a metre"
+            )
 
     @property
     def scene(self) -> SceneOptions:
         return SceneOptions(
-            area_factor=self.area_factor, texels_per_m=self.texels_per_m, seed=self.seed
+            area_factor=self.area_factor,
+            texels_per_m=self.texels_per_m,
+            houses_per_hectare=self.houses_per_hectare,
+            seed=self.seed,
         )
 
 

@@ -21,6 +21,7 @@ class SceneOptions:
     height_m: float = 18.0  # of the facades
     area_factor: float = 1.0  # times the ground area; the height stays
     texels_per_m: float = 140.0  # of facades and ground
+    houses_per_hectare: float = 0.0  # on the ground, for flights that look down on a large area
     seed: int = 1  # of everything painted and placed
 
     @property
@@ -55,6 +56,7 @@ def build_place(options: SceneOptions) -> Place:
     builder.surroundings()
     builder.roof_things()
     builder.courtyard_things()
+    builder.houses()
     return Place(
         tuple(builder.faces),
         builder.canvases,
@@ -233,3 +235,21 @@ class _Courtyard(Builder):
         ):
             x, y = x * sx, y * sy
             self.box((x - 0.28, y - 0.28, 0.0), (x + 0.28, y + 0.28, 0.95), "bin", "concrete")
+
+    def houses(self) -> None:
+        """Houses strewn over the courtyard, each with a roof of its own."""
+        hx, hy = self.options.half_m
+        count = round(self.options.houses_per_hectare * 4 * hx * hy / 1e4)
+        if count == 0:
+            return
+        rng = np.random.default_rng([self.options.seed, 78])  # all else stays where it is
+        sheet_m = 90.0
+        self.canvas("house-roofs", "roof", (sheet_m, sheet_m), self.options.texels_per_m)
+        for _ in range(count):
+            x, y = rng.uniform(-1, 1, 2) * (hx - 10, hy - 10)
+            w, d = rng.uniform(4, 7, 2)
+            h = rng.uniform(3, 9)
+            self.box((x - w, y - d, 0.0), (x + w, y + d, h), "house", "house-roofs")
+            s, t = rng.uniform(0, 1 - 2 * np.array([w, d]) / sheet_m)
+            region = (s, t, s + 2 * w / sheet_m, t + 2 * d / sheet_m)
+            self.faces[-1] = replace(self.faces[-1], region=region)
