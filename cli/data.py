@@ -73,6 +73,7 @@ def main(verbose: bool) -> None:
     help="Longer side in pixels on which features are found.",
 )
 @options.threads
+@options.cluster
 @options.seed
 @options.georegistration
 def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen: Any) -> None:

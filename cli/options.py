@@ -31,6 +31,12 @@ seed = click.option(
     help="Of everything random.",
 )
 threads = click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+cluster = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    default="",
+    help="Dask scheduler whose workers find features and matches, as in tcp://10.0.0.5:8786.",
+)
 device = click.option(
     "--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."
 )

@@ -32,6 +32,7 @@ def run(
     max_features: int,
     max_image_size: int,
     threads: int | None,
+    cluster: str,
     seed: int,
     **geo: Any,
 ) -> None:
@@ -49,6 +50,7 @@ def run(
             features=FeatureOptions(max_features=max_features, max_image_size_px=max_image_size),
             engine=engine,
             threads=threads or os.cpu_count() or 1,
+            cluster=cluster,
             seed=seed,
         ),
         geo=None if given == GeoStageOptions() else given,

@@ -54,6 +54,7 @@ from cli import options
     help="Where videos lie now, for --all-frames.  [default: where they were]",
 )
 @options.threads
+@options.cluster
 @options.seed
 @options.overwrite
 def register(video: Path | None, area_folder: Path, **chosen: Any) -> None:
@@ -83,6 +84,7 @@ def run(
     any_telemetry: bool,
     video_folder: Path | None,
     threads: int | None,
+    cluster: str,
     seed: int,
     overwrite: bool,
 ) -> None:
@@ -90,6 +92,7 @@ def run(
 
     from cli import page, show
     from spn_data.area import EVALUATION, GEO
+    from spn_data.cluster import dispatch_to
     from spn_data.pipeline.dense import densify, sequences_with_video
     from spn_data.pipeline.register import RegisterStageOptions
     from spn_data.pipeline.register import register as stage
@@ -116,7 +119,13 @@ def run(
                     any_telemetry=any_telemetry,
                 )
                 record = stage(
-                    area, video, name, wanted, live.progress, workers=workers, overwrite=overwrite
+                    area,
+                    video,
+                    name,
+                    wanted,
+                    live.progress,
+                    dispatch=dispatch_to(cluster, workers),
+                    overwrite=overwrite,
                 )
                 live.made(record, before)
                 names = [record.stage.removeprefix(f"{EVALUATION}/")]

@@ -23,6 +23,8 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOOK_S = 0.2  # how often a waiting process looks whether it is to stop
 
 Batch = tuple[str, tuple[Any, ...]]
+# Calls a function for each batch and hands each result on: run_batches here, run_on_cluster elsewhere.
+Dispatch = Callable[[Callable[..., Any], Iterable[Batch], Callable[[Any], None]], None]
 
 
 class WorkerDiedError(SpnError):
@@ -38,9 +40,9 @@ class WorkerDiedError(SpnError):
 def run_batches(
     function: Callable[..., Any],
     batches: Iterable[Batch],
+    on_result: Callable[[Any], None],
     *,
     workers: int,
-    on_result: Callable[[Any], None],
 ) -> None:
     """Call function(*arguments) for each (label, arguments) and hand each result to on_result, here.
 
