@@ -1,7 +1,8 @@
-"""Features and verified matches of frames, computed in worker processes into one database."""
+"""Features and verified matches of frames, computed by workers into one database."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from spn_data.errors import InputError
 from spn_data.features import FeatureOptions, Features, extract
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions, appearance_vocabulary, choose_pairs, describe_appearance
-from spn_data.parallel import run_batches
+from spn_data.parallel import Dispatch
 from spn_data.timing import Progress
 
 
@@ -41,7 +42,7 @@ def extract_missing(
     database: MapDatabase,
     frames: FramesToMap,
     options: FeatureOptions,
-    workers: int,
+    dispatch: Dispatch,
     progress: Progress,
 ) -> None:
     """Features of the frames that have none in the database yet."""
@@ -64,7 +65,7 @@ def extract_missing(
         done += 1
         progress("features", done, len(frames.names))
 
-    run_batches(extract_from_bytes, batches(), workers=workers, on_result=store)
+    dispatch(extract_from_bytes, batches(), store)
 
 
 def extract_from_bytes(
@@ -83,13 +84,23 @@ def extract_from_bytes(
     return name, extract(gray, use, options)
 
 
+_FRAMES_OF_VOCABULARY = 200  # whose descriptors its words are drawn from
+
+
 def pairs_of(
     database: MapDatabase, frames: FramesToMap, options: PairOptions
 ) -> list[tuple[int, int]]:
     """Pairs of positions in `frames` to match."""
-    described = [database.read_features(name).descriptors for name in frames.names]
+    # All descriptors at once would be half a megabyte a frame.
+    telling = frames.names[:: math.ceil(len(frames.names) / _FRAMES_OF_VOCABULARY)]
+    described = [database.read_features(name).descriptors for name in telling]
     vocabulary = appearance_vocabulary(described, options)
-    appearance = np.stack([describe_appearance(d, vocabulary) for d in described])
+    appearance = np.stack(
+        [
+            describe_appearance(database.read_features(name).descriptors, vocabulary)
+            for name in frames.names
+        ]
+    )
     return choose_pairs(frames.sequences, frames.positions_m, appearance, options)
 
 
@@ -101,7 +112,7 @@ def match_missing(
     frames: FramesToMap,
     pairs: list[tuple[int, int]],
     options: MatchOptions,
-    workers: int,
+    dispatch: Dispatch,
     progress: Progress,
 ) -> None:
     """Match and verify the pairs that the database does not hold yet."""
@@ -133,4 +144,4 @@ def match_missing(
         done += len(result)
         progress("matching", done, len(pairs))
 
-    run_batches(match_pairs, batches(), workers=workers, on_result=store)
+    dispatch(match_pairs, batches(), store)

@@ -15,10 +15,21 @@ class MatchOptions:
     max_distance: float = 0.7  # of unit descriptors
     max_error_px: float = 4.0  # epipolar error of an inlier
     min_inliers: int = 15  # of a verified pair
+    strongest: int = 1024  # features of each image that tell whether two of them overlap
+    telling_matches: int = 30  # of these, from which on they do
+    least_share: float = (
+        0.36  # of these that fit one epipolar geometry, below which two images do not
+    )
+    guided_share: float = 0.6  # from which on the others are sought along epipolar lines
+    guided_px: float = 6.0  # to either side of a line
+    guided_step: int = 8  # every such feature elsewhere is compared as well
+    guided_ratio: float = (
+        0.7  # in the place of max_ratio there: fewer others give as few wrong matches
+    )
     seed: int = 0
 
 
-_ROWS = 256  # rows of the similarity matrix at a time: they stay in the processor's cache
+_ROWS = 64  # rows of the similarity matrix at a time: they stay in the processor's cache
 
 
 def match_descriptors(
@@ -42,6 +53,21 @@ def match_descriptors(
         first[block] = similarity[rows, nearest[block]]
         similarity[rows, nearest[block]] = -1.0
         second[block] = similarity.max(axis=1)
+    return mutual_matches(nearest, first, second, best_of_b, options)
+
+
+def mutual_matches(
+    nearest: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
+    best_of_b: np.ndarray,
+    options: MatchOptions,
+) -> np.ndarray:
+    """Matches (M, 2) uint32 of features in a whose nearest in b has them as its nearest too.
+
+    nearest : (N,) rows of b; first, second : (N,) similarities of the nearest and of the next, whose ratio
+    of distances is tested; best_of_b : (K,) highest similarity of each row of b.
+    """
     distance_sq, second_sq = 2 - 2 * first, 2 - 2 * second
     good = (
         (first == best_of_b[nearest])

@@ -16,19 +16,24 @@ from spn_data.matching import unit_descriptors
 class PairOptions:
     """How pairs are chosen."""
 
-    overlap: int = 6  # following frames of the same sequence
-    far_steps: int = 2  # further ones at 2, 4, ... times the overlap
-    spatial_neighbors: int = 8  # nearest frames by GNSS
+    overlap: int = 2  # following frames of the same sequence
+    far_steps: int = 3  # further ones at 2, 4, ... times the overlap
+    spatial_neighbors: int = 5  # nearest frames by GNSS that lie not just before or behind
     spatial_max_m: float = 60.0  # beyond which no frame is a neighbour
-    appearance_neighbors: int = 6  # most similar frames that time does not pair already
+    appearance_neighbors: int = 4  # most similar frames that time does not pair already
     words: int = 64  # of the vocabulary that appearance is described with
     seed: int = 0
+
+    @property
+    def farthest_step(self) -> int:
+        """Between frames of a sequence that time pairs."""
+        return int(self.overlap * 2**self.far_steps)
 
     def wider(self) -> PairOptions:
         """Three times as many neighbours of each kind."""
         return replace(
             self,
-            overlap=self.overlap * 3,
+            overlap=self.overlap * 3 + self.far_steps * 2,
             spatial_neighbors=self.spatial_neighbors * 3,
             appearance_neighbors=self.appearance_neighbors * 3,
         )
@@ -47,7 +52,7 @@ def choose_pairs(
     """
     return sorted(
         sequence_pairs(sequences, options)
-        | spatial_pairs(positions_m, options)
+        | spatial_pairs(sequences, positions_m, options)
         | (set() if appearance is None else appearance_pairs(sequences, appearance, options))
     )
 
@@ -66,19 +71,30 @@ def sequence_pairs(sequences: np.ndarray, options: PairOptions) -> set[tuple[int
     return pairs
 
 
-def spatial_pairs(positions_m: np.ndarray, options: PairOptions) -> set[tuple[int, int]]:
-    """Nearest frames by position, over all sequences."""
+def spatial_pairs(
+    sequences: np.ndarray, positions_m: np.ndarray, options: PairOptions
+) -> set[tuple[int, int]]:
+    """Nearest frames by position, over all sequences; within one, of those on another part of the path.
+
+    On another part is what lies nearer than half the way that was flown in between: a neighbouring line, a
+    place seen again. What lies straight on is paired by time.
+    """
     known = np.flatnonzero(np.isfinite(positions_m).all(axis=1))
     if len(known) < 2 or options.spatial_neighbors == 0:
         return set()
-    tree = cKDTree(positions_m[known])
-    k = min(options.spatial_neighbors + 1, len(known))
-    distance_m, neighbor = tree.query(positions_m[known], k=k)
+    places, of_place = positions_m[known], sequences[known]
+    k = min(options.spatial_neighbors + 2 * options.farthest_step + 1, len(known))
+    distance_m, neighbor = cKDTree(places).query(places, k=k)
+    step_m = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1)
+    flown_m = np.cumsum(step_m)
     pairs = set()
     for i in range(len(known)):
-        for d, j in zip(distance_m[i], neighbor[i], strict=True):
-            if j != i and d <= options.spatial_max_m:
-                pairs.add(_ordered(int(known[i]), int(known[j])))
+        others, away_m = neighbor[i], distance_m[i]
+        straight_on = away_m > 0.5 * np.abs(flown_m[others] - flown_m[i])
+        wanted = (others != i) & (away_m <= options.spatial_max_m)
+        wanted &= (of_place[others] != of_place[i]) | ~straight_on
+        for j in others[wanted][: options.spatial_neighbors].tolist():
+            pairs.add(_ordered(int(known[i]), int(known[j])))
     return pairs
 
 
@@ -89,7 +105,7 @@ def appearance_pairs(
     n = len(appearance)
     similarity = appearance @ appearance.T
     order = np.arange(n)
-    near = (np.abs(order[:, None] - order[None]) <= options.overlap) & (
+    near = (np.abs(order[:, None] - order[None]) <= options.farthest_step // 2) & (
         sequences[:, None] == sequences[None]
     )
     similarity[near] = -np.inf

@@ -10,7 +10,7 @@ import pytest
 from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping
+from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.model import (
     count_registered,
     read_observations,
@@ -118,12 +118,96 @@ def test_a_death_of_the_mapper_is_told_with_the_end_of_its_log(tmp_path: Path) -
         run_mapping(job(tmp_path, tmp_path), log=tmp_path / "log", progress=lambda _: None)
 
 
+def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -> None:
+    """First those that two pairs have, then the strongest; of images with few of them, all."""
+    rng = np.random.default_rng(0)
+    camera = Camera.from_horizontal_fov(800, 600, 70)
+    matches = {
+        (1, 2): np.stack([rng.permutation(500), rng.permutation(500)], axis=1)[:400],
+        (2, 3): np.stack([np.arange(480, 500), np.arange(460, 480)], axis=1),  # few, and weak
+    }
+    with MapDatabase.open(tmp_path / "database.db") as database:
+        images = [DatabaseImage(f"{k}.jpg", "a") for k in "123"]
+        database.add_images(images, {"a": (camera, True)})
+        for image in images:
+            points = rng.uniform(0, 600, (500, 4)).astype(np.float32)
+            database.write_features(image.name, Features(points, np.zeros((500, 128), np.uint8)))
+        for ids, pairs in matches.items():
+            pairs = pairs.astype(np.uint32)
+            database.write_pair(VerifiedPair(ids, pairs, pairs, 3, None, np.eye(3), None))
+        for _ in range(2):  # the second replaces the first
+            database.write_thinned(tmp_path / "thin.db", features=100)
+        features = database.read_features("2.jpg").keypoints
+    with MapDatabase.open(tmp_path / "thin.db") as thin:
+        assert thin.ids == {"1.jpg": 1, "2.jpg": 2, "3.jpg": 3}
+        assert {tuple(pair) for pair in thin.read_inliers("2.jpg", "3.jpg").tolist()} >= {
+            tuple(pair) for pair in matches[2, 3].tolist() if pair[0] in matches[1, 2][:, 1]
+        }
+        kept = {tuple(pair) for pair in thin.read_inliers("1.jpg", "2.jpg").tolist()}
+        a, b = matches[1, 2].T
+        twice = sorted(set(b.tolist()) & set(range(480, 500)))
+        once = sorted(set(b.tolist()) - set(twice))
+        alone = sorted(set(range(480, 500)) - set(twice))  # of the weak pair
+        of_second = [*twice, *sorted([*once, *alone])[: 100 - len(twice)]]
+        of_first = sorted(a.tolist())[:100]
+        strong = np.isin(a, of_first) & np.isin(b, of_second)
+        assert kept == {tuple(pair) for pair in matches[1, 2][strong].tolist()}
+        assert 15 < len(kept) < 40
+        native = pycolmap.Database.open(tmp_path / "thin.db")
+        assert np.array_equal(native.read_keypoints(2)[:, :2], features[:, :2])
+        native.close()
+
+
+def test_a_database_without_an_image_has_all_of_the_others(
+    synthetic: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    """Neither features nor pairs of that one, which can get others; bytes of all else as they were."""
+    with MapDatabase.open(synthetic[0] / "database.db") as whole:
+        bare, *others = sorted(whole.ids)
+        for _ in range(2):  # the second replaces the first
+            whole.write_without(tmp_path / "bare.db", [bare])
+        expected = {k: n for k, n in whole.verified_pairs().items() if bare not in k}
+        with MapDatabase.open(tmp_path / "bare.db") as made:
+            assert made.ids == whole.ids
+            assert made.verified_pairs() == expected
+            assert made.num_pairs() == len(others) * (len(others) - 1) // 2
+            assert all(
+                np.array_equal(made.read_keypoints(k), whole.read_keypoints(k)) for k in others
+            )
+            for a, b in expected:
+                assert np.array_equal(made.read_inliers(a, b), whole.read_inliers(a, b))
+            assert made.num_keypoints(bare) == 0
+            assert not made.has_features(bare)
+            features = Features(np.ones((9, 4), np.float32), np.zeros((9, 128), np.uint8))
+            made.write_features(bare, features)
+            assert made.num_keypoints(bare) == 9
+    assert [file.name for file in tmp_path.iterdir()] == ["bare.db"]
+
+
+def test_poses_from_a_thinned_database_get_the_points_of_all_matches(
+    synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
+) -> None:
+    folder, _ = synthetic
+    with MapDatabase.open(folder / "database.db") as database:
+        database.write_thinned(tmp_path / "database.db", features=200)
+    log = tmp_path / "log"
+    (few,) = run_mapping(job(tmp_path, tmp_path), log=log, progress=lambda _: None)
+    triangulate(few, tmp_path / "all", database=folder / "database.db", log=log)
+    thin, full, expected = read_scene(few), read_scene(tmp_path / "all"), read_scene(mapped)
+    assert full.names == thin.names == expected.names
+    assert np.array_equal(full.poses.centers, thin.poses.centers)
+    observed = expected.track_lengths.sum()
+    assert thin.track_lengths.sum() < 0.8 * observed
+    assert full.track_lengths.sum() >= 0.99 * observed
+
+
 def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
     synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
 ) -> None:
     done = refine(
         mapped,
         tmp_path / "refined",
+        images=tmp_path,
         camera_model="OPENCV",
         refine_principal_point=False,
         threads=1,
@@ -166,6 +250,7 @@ def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
     done = refine(
         tmp_path / "wrong",
         tmp_path / "refined",
+        images=tmp_path,
         camera_model="RADIAL",
         refine_principal_point=False,
         threads=1,

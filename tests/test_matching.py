@@ -128,6 +128,25 @@ def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -
     assert len(pair.inliers) == 0
 
 
+def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:
+    """The others are not compared: there are fewer matches than all features would give."""
+    a, b, camera = scene_pair(np.random.default_rng(3), outliers=1500, n=1500)
+    images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
+    (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
+    assert 900 < len(pair.matches) <= 1024
+    assert len(pair.inliers) == 0
+
+
+def test_of_images_that_overlap_the_features_on_wrong_lines_are_not_even_matched() -> None:
+    """A fifth of 1500 lies elsewhere: most are gone before verification, and all true ones stay."""
+    a, b, camera = scene_pair(np.random.default_rng(4), outliers=300, n=1500)
+    images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
+    (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
+    assert (pair.matches[:, 0] < 300).sum() < 30
+    assert (pair.inliers[:, 0] >= 300).sum() > 1170
+    assert (pair.inliers[:, 0] < 300).sum() <= 20
+
+
 def test_the_same_pair_is_verified_the_same_way_anywhere() -> None:
     a, b, camera = scene_pair(np.random.default_rng(2), outliers=150)
     images = {k: ImageForMatching(f, camera, False) for k, f in ((1, a), (2, b))}

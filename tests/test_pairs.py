@@ -33,8 +33,19 @@ def test_neighbours_in_space_are_found_across_sequences_and_unknown_positions_pa
     None
 ):
     positions = np.array([[0.0, 0, 0], [100, 0, 0], [1, 0, 0], [np.nan, 0, 0]])
-    pairs = spatial_pairs(positions, PairOptions(spatial_neighbors=3, spatial_max_m=60.0))
-    assert pairs == {(0, 2)}
+    options = PairOptions(spatial_neighbors=3, spatial_max_m=60.0)
+    assert spatial_pairs(np.array(["a", "b", "c", "d"]), positions, options) == {(0, 2)}
+
+
+def test_of_one_flight_neighbouring_lines_are_paired_and_what_lies_straight_on_is_not() -> None:
+    """Two lines of five photos, 20 m apart and flown to and fro: photo k lies beside photo 9 - k."""
+    east = np.array([0.0, 30, 60, 90, 120])
+    lines = [np.stack([e, np.full(5, n)], axis=1) for e, n in ((east, 0.0), (east[::-1], 20.0))]
+    positions = np.column_stack([np.concatenate(lines), np.full(10, 50.0)])
+    options = PairOptions(spatial_neighbors=1, spatial_max_m=60.0)
+    found = spatial_pairs(np.array(["a"] * 10), positions, options)
+    assert found >= {(0, 9), (1, 8), (2, 7), (3, 6)}  # (4, 5) follow each other
+    assert all(i < 5 <= j for i, j in found)
 
 
 def test_pairs_are_sorted_unique_and_ordered() -> None:
@@ -52,7 +63,7 @@ def test_a_place_seen_again_is_found_by_appearance() -> None:
     first = [rng.gamma(0.5, 40, size=(300, 128)).clip(0, 255) for _ in range(20)]
     again = [np.clip(d[:200] + rng.normal(0, 4, size=(200, 128)), 0, 255) for d in first]
     descriptors = [d.astype(np.uint8) for d in [*first, *again]]
-    options = PairOptions(overlap=3, appearance_neighbors=1, words=16)
+    options = PairOptions(overlap=3, far_steps=1, appearance_neighbors=1, words=16)
     vocabulary = appearance_vocabulary(descriptors, options)
     appearance = np.stack([describe_appearance(d, vocabulary) for d in descriptors])
     pairs = appearance_pairs(np.array(["a"] * 40), appearance, options)

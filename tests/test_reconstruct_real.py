@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,17 @@ def reconstruct(source: Path, area: Path) -> Area:
 def test_photos_of_a_beach_become_one_georeferenced_model(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """18 photos 40 m above the ground, with gimbal angles; weak texture makes the retries work."""
+    """18 photos 40 m above the ground, with gimbal angles; the one with least texture needs more features."""
     area = reconstruct(shared_data / "photos-dji-xmp", tmp_path / "area")
     model, geo = area.record(MODEL).counts, area.record(GEO).counts
     assert model["registered"] == model["frames"] == 18
     assert 0.1 < model["mean_error_px"] < 0.6
+    notes = area.record(MODEL).notes
+    assert "more features in the missing frames registered 1 more" in notes
+    with (area.folder(MODEL) / "registration.csv").open(encoding="utf-8") as file:
+        features = [int(row["keypoints"]) for row in csv.DictReader(file)]
+    assert features.count(4096) == 17
+    assert max(features) == 8192
     assert "gimbal" in geo["observations"]
     assert 0.05 < geo["horizontal_rmse_m"] < 1.0
     assert geo["outliers"] == 0

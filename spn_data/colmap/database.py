@@ -75,12 +75,16 @@ class MapDatabase:
 
     def _add_camera(self, camera: Camera, focal_is_known: bool) -> int:
         camera_id = self._native.num_cameras() + 1
-        native = native_camera(camera, camera_id=camera_id, focal_is_known=focal_is_known)
+        self._write_camera(
+            native_camera(camera, camera_id=camera_id, focal_is_known=focal_is_known)
+        )
+        return camera_id
+
+    def _write_camera(self, native: pycolmap.Camera) -> None:
         self._native.write_camera(native, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=camera_id)
+        rig = pycolmap.Rig(rig_id=native.camera_id)
         rig.add_ref_sensor(native.sensor_id)
         self._native.write_rig(rig, use_rig_id=True)
-        return camera_id
 
     def _add_image(self, name: str, camera_id: int) -> int:
         image_id = self._native.num_images() + 1
@@ -110,9 +114,14 @@ class MapDatabase:
     def read_features(self, name: str) -> Features:
         image_id = self.ids[name]
         return Features(
-            np.asarray(self._native.read_keypoints(image_id), np.float32).reshape(-1, 4),
+            self.read_keypoints(name),
             np.asarray(self._native.read_descriptors(image_id).data, np.uint8).reshape(-1, 128),
         )
+
+    def read_keypoints(self, name: str) -> np.ndarray:
+        """(K, 4) as in Features."""
+        keypoints = np.asarray(self._native.read_keypoints(self.ids[name]), np.float32)
+        return keypoints if keypoints.size else np.zeros((0, 4), np.float32)
 
     def num_keypoints(self, name: str) -> int:
         return int(self._native.num_keypoints_for_image(self.ids[name]))
@@ -141,6 +150,71 @@ class MapDatabase:
             return np.zeros((0, 2), np.int64)
         matches = self._native.read_two_view_geometry(*pair).inlier_matches
         return np.asarray(matches, dtype=np.int64).reshape(-1, 2)
+
+    def write_thinned(self, target: Path, features: int) -> None:
+        """A database with the verified matches among the telling `features` of each image alone.
+
+        Those tell that most pairs match. What repeats, as windows do, matches in one wrong pair or another,
+        so that wrong pairs lose more than right ones; images that match little keep all. Images, cameras and
+        indices of features are the same; a file that lies at `target` is replaced. Raises StageError where
+        the disk is full.
+        """
+        source = self._native
+        pairs = [(self.ids[a], self.ids[b], n) for (a, b), n in self.verified_pairs().items()]
+        matched = {
+            image_id: np.zeros(source.num_keypoints_for_image(image_id), np.int64)
+            for image_id in self.ids.values()
+        }
+        for first, second, _ in pairs:
+            matches = source.read_two_view_geometry(first, second).inlier_matches
+            matched[first][matches[:, 0]] += 1
+            matched[second][matches[:, 1]] += 1
+        kept = {image_id: np.zeros(len(count), bool) for image_id, count in matched.items()}
+        for image_id, count in matched.items():  # the stronger of equal ones
+            kept[image_id][np.argsort(-count, kind="stable")[:features]] = True
+        size = sum(8 * n for *_, n in pairs) + sum(16 * len(k) for k in kept.values())
+        with self._write_images(target, size) as thin:
+            for image_id in self.ids.values():
+                thin.write_keypoints(image_id, source.read_keypoints(image_id))
+            for first, second, _ in pairs:
+                geometry = source.read_two_view_geometry(first, second)
+                matches = geometry.inlier_matches
+                both = kept[first][matches[:, 0]] & kept[second][matches[:, 1]]
+                geometry.inlier_matches = matches[both]
+                thin.write_two_view_geometry(first, second, geometry)
+
+    def write_without(self, target: Path, names: Sequence[str]) -> None:
+        """A copy in which these images have no features and no pairs.
+
+        A file that lies at `target` is replaced. Raises StageError where the disk is full.
+        """
+        source, bare = self._native, {self.ids[name] for name in names}
+        with self._write_images(target, self._path.stat().st_size) as made:
+            for image_id in set(self.ids.values()) - bare:
+                made.write_keypoints(image_id, source.read_keypoints(image_id))
+                made.write_descriptors(image_id, source.read_descriptors(image_id))
+            for pair_id in source.read_num_matches()[0]:
+                pair = pycolmap.pair_id_to_image_pair(pair_id)
+                if bare.isdisjoint(pair):
+                    made.write_matches(*pair, source.read_matches(*pair))
+                    made.write_two_view_geometry(*pair, source.read_two_view_geometry(*pair))
+
+    @contextmanager
+    def _write_images(self, target: Path, size: int) -> Iterator[pycolmap.Database]:
+        """A new database of about `size` bytes with the same cameras and images, for the rest of it."""
+        _check_room(target, size)
+        part = target.with_name(target.name + ".part")
+        part.unlink(missing_ok=True)
+        with (
+            MapDatabase.open(part) as made,
+            pycolmap.DatabaseTransaction(made._native),
+        ):
+            for camera in self._native.read_all_cameras():
+                made._write_camera(camera)
+            for name, image_id in sorted(self.ids.items(), key=lambda item: item[1]):
+                made._add_image(name, self._native.read_image(image_id).camera_id)
+            yield made._native
+        part.replace(target)
 
     def num_pairs(self) -> int:
         """Pairs tried, verified or not."""

@@ -5,6 +5,7 @@ The functions above `main` run in the parent and know no pycolmap objects, those
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,18 +14,13 @@ from typing import Any
 from spn_data import child
 from spn_data.errors import FormatError
 
-_CONVERGED = 1e-5  # relative decrease of the cost
-# Deviations at which Cauchy's loss begins to bend: 95 % efficient for normal errors (Holland & Welsch
-# 1977, "Robust regression using iteratively reweighted least-squares").
-_CAUCHY = 2.385
-
 
 @dataclass(frozen=True, kw_only=True)
 class MappingJob:
     """One run of COLMAP's mapper over a database."""
 
     database: str
-    images: str  # folder, for the points' colours
+    images: str  # folder
     output: str  # an existing folder; sub-models are written to model-0, model-1, ... in it
     snapshots: str  # an existing folder
     engine: str = "incremental"  # or "global"
@@ -67,21 +63,37 @@ def latest_snapshot(snapshots: Path) -> Path | None:
     return None
 
 
+def triangulate(source: Path, target: Path, *, database: Path, log: Path) -> None:
+    """The model in `source` with the points of all matches in `database`, its poses as they are."""
+    job = {
+        "task": "triangulate",
+        "source": str(source),
+        "target": str(target),
+        "database": str(database),
+    }
+    child.run_child(__name__, job, log=log, on_event=lambda _: None)
+
+
 def refine(
     source: Path,
     target: Path,
     *,
+    images: Path,
     camera_model: str,
     refine_principal_point: bool,
     threads: int,
     log: Path,
 ) -> dict[str, Any]:
-    """Last bundle adjustments over a whole model, with a fuller camera; returns what it did."""
+    """Last bundle adjustments over a whole model, with a fuller camera; returns what it did.
+
+    images : their folder, for the points' colours.
+    """
     result: dict[str, Any] = {}
     job = {
         "task": "refine",
         "source": str(source),
         "target": str(target),
+        "images": str(images),
         "camera_model": camera_model,
         "refine_principal_point": refine_principal_point,
         "threads": threads,
@@ -95,6 +107,8 @@ def main() -> None:
     task = job.pop("task")
     if task == "map":
         _map(MappingJob(**job))
+    elif task == "triangulate":
+        _triangulate(**job)
     elif task == "refine":
         _refine(**job)
     else:
@@ -131,6 +145,7 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
         snapshot_frames_freq=job.snapshot_every,
     )
     options.min_model_size = job.min_model_size
+    options.extract_colors = False  # `refine` does, once
     # 127 degrees wide: shorter focal lengths only fit the noise of a weak geometry.
     for part in (options, options.mapper, options.triangulation):
         part.min_focal_length_ratio = 0.25
@@ -140,8 +155,10 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
         options.mapper.abs_pose_refine_extra_params = False
     # A last bundle adjustment follows in `refine`: those on the way need not be many, nor converge.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.35
-    options.ba_global_max_refinements = 2
+    options.ba_global_frames_freq = options.ba_global_points_freq = 1_000_000_000
+    options.ba_global_max_refinements = 1
     options.ba_global_max_num_iterations = 30
+    options.ba_global_function_tolerance = 1e-4
     registered = 0
     if job.start_from:
         registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
@@ -169,34 +186,45 @@ def _map_incrementally(job: MappingJob) -> dict[int, Any]:
     return models
 
 
+def _triangulate(source: str, target: str, database: str) -> None:
+    from spn_data.colmap import pycolmap
+    from spn_data.colmap.model import write_native
+
+    model = pycolmap.Reconstruction(source)
+    with contextlib.closing(pycolmap.Database.open(database)) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    mapper = pycolmap.IncrementalMapper(cache)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    mapper.begin_reconstruction(model)
+    for image_id in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(options, image_id)
+    mapper.complete_and_merge_tracks(options)
+    mapper.filter_points(pycolmap.IncrementalMapperOptions())
+    mapper.end_reconstruction(False)
+    write_native(model, Path(target))
+
+
 def _refine(
-    source: str, target: str, camera_model: str, refine_principal_point: bool, threads: int
+    source: str,
+    target: str,
+    images: str,
+    camera_model: str,
+    refine_principal_point: bool,
+    threads: int,
 ) -> None:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.clean import (
-        drop_out_of_view,
-        drop_outliers,
-        drop_without_depth,
-        residual_sigma_px,
-    )
+    from spn_data.colmap.adjust import adjust
+    from spn_data.colmap.clean import drop_without_depth
     from spn_data.colmap.model import upgrade_camera, write_native
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
         upgrade_camera(camera, camera_model)
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=refine_principal_point)
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.function_tolerance = _CONVERGED
     before = model.compute_mean_reprojection_error()
-    dropped = drop_out_of_view(model)
-    pycolmap.bundle_adjustment(model, options)
-    dropped += drop_out_of_view(model) + drop_outliers(model)
-    # What is left of wrong matches shall not bend the model either.
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _CAUCHY * residual_sigma_px(model)
-    pycolmap.bundle_adjustment(model, options)
+    dropped = adjust(model, refine_principal_point=refine_principal_point, threads=threads)
     dropped += drop_without_depth(model)
     model.update_point_3d_errors()
+    model.extract_colors_for_all_images(images, threads)
     write_native(model, Path(target))
     after = model.compute_mean_reprojection_error()
     child.send({"error_before_px": before, "error_px": after, "dropped": dropped})

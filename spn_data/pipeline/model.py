@@ -42,7 +42,7 @@ def build_model(
 
     extend : the area whose features and matches are taken over, if they were made with the same options.
     """
-    made_of = {k: v for k, v in asdict(options).items() if k != "threads"}
+    made_of = {k: v for k, v in asdict(options).items() if k not in ("threads", "cluster")}
     work = area.begin(MODEL, made_of, {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work

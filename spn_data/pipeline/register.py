@@ -16,6 +16,7 @@ from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
 from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
 from spn_data.map_hash import map_hash
+from spn_data.parallel import Dispatch
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
 from spn_data.pipeline.images import STORED
@@ -61,7 +62,7 @@ def register(
     options: RegisterStageOptions,
     progress: Progress,
     *,
-    workers: int,
+    dispatch: Dispatch,
     overwrite: bool = False,
 ) -> StageRecord:
     """Register the frames of one video, or folder of photos, as an evaluation sequence.
@@ -77,7 +78,7 @@ def register(
     work = area.begin(stage, made_with, inputs, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
-    record = _register(area, work, source, given, options, progress, workers)
+    record = _register(area, work, source, given, options, progress, dispatch)
     known = {**area.facts.evaluation, source.sequence: area.place_of(video)}
     area.write_facts(Facts(sources=area.facts.sources, evaluation=known))
     return record
@@ -90,7 +91,7 @@ def _register(
     given: Camera | None,
     options: RegisterStageOptions,
     progress: Progress,
-    workers: int,
+    dispatch: Dispatch,
 ) -> StageRecord:
     stopwatch = Stopwatch()
     before = {stage: map_hash(area.folder(stage)) for stage in (MODEL, GEO) if area.has(stage)}
@@ -121,7 +122,7 @@ def _register(
         area.folder(MODEL),
         options.register,
         progress,
-        workers=workers,
+        dispatch=dispatch,
         stopwatch=stopwatch,
     )
     labels = labels_of(chosen, found)

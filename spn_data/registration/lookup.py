@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.colmap.database import MapDatabase
 from spn_data.files import writing_whole
 from spn_data.matching import MatchOptions, match_descriptors
-from spn_data.parallel import run_batches
+from spn_data.parallel import Dispatch
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
 from spn_data.registration.options import RegisterOptions
 from spn_data.timing import Progress
@@ -50,7 +50,7 @@ def look_up_missing(
     frozen: FrozenMap,
     folder: Path,
     options: RegisterOptions,
-    workers: int,
+    dispatch: Dispatch,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Putative matches of every frame by name; those found before lie in `folder`, a file each."""
@@ -79,5 +79,5 @@ def look_up_missing(
         done += len(result)
         progress("map matches", done, len(names))
 
-    run_batches(_look_up_batch, batches(), workers=workers, on_result=store)
+    dispatch(_look_up_batch, batches(), store)
     return {name: np.load(files[name], allow_pickle=False) for name in names}

@@ -14,6 +14,7 @@ from spn_data.labels import Labels, SeenPoints
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, sequence_pairs
+from spn_data.parallel import Dispatch
 from spn_data.registration.checks import gather_evidence, judge
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
@@ -52,7 +53,7 @@ def register_sequence(
     options: RegisterOptions,
     progress: Progress,
     *,
-    workers: int,
+    dispatch: Dispatch,
     stopwatch: Stopwatch,
 ) -> Registered:
     """Poses of N frames of one lens. The map's files are only read.
@@ -69,13 +70,13 @@ def register_sequence(
             to_match.start_cameras,
         )
         with stopwatch.step("features"):
-            extract_missing(database, to_match, options.features, workers, progress)
+            extract_missing(database, to_match, options.features, dispatch, progress)
         with stopwatch.step("neighbours"):
-            match_missing(database, to_match, near, options.matching, workers, progress)
+            match_missing(database, to_match, near, options.matching, dispatch, progress)
         with FrozenMap.open(map_folder, map_folder / DATABASE) as frozen:
             with stopwatch.step("map"):
                 putative = look_up_missing(
-                    names, database, frozen, folder / _MATCHES, options, workers, progress
+                    names, database, frozen, folder / _MATCHES, options, dispatch, progress
                 )
             scene, observations, points = frozen.scene, frozen.observations, frozen.points
         pixels = [

@@ -1,0 +1,75 @@
+"""Whether a model contradicts what its images show together: parts glued at a wrong place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.model import Scene
+
+_FITS_PX = 12.0  # epipolar error of a match; a wrong pose leaves a few hundredths of them below it
+_SHARE = 0.5  # of a pair's matches that must fit
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two images that match well, of whose matches the model's poses explain less than half."""
+
+    images: tuple[str, str]
+    matches: int
+    share: float  # that fits
+
+
+def contradictions(database: MapDatabase, scene: Scene) -> list[Contradiction]:
+    """Of the pairs of registered images that have the median number of matches or more; worst first.
+
+    Wrong pairs, which a right model contradicts, have few matches: facades of equal windows give a quarter
+    of the median. Between parts that lie wrongly to each other it is the best pairs that are contradicted.
+    """
+    row = {name: k for k, name in enumerate(scene.names)}
+    verified = database.verified_pairs()
+    pairs = {pair: n for pair, n in verified.items() if pair[0] in row and pair[1] in row}
+    if not pairs:
+        return []
+    telling = float(np.median(list(pairs.values())))
+    rays: dict[str, np.ndarray] = {}
+    found = []
+    for (a, b), n in sorted(pairs.items()):
+        if n < telling:
+            continue
+        for name in (a, b):
+            if name not in rays:
+                rays[name] = _rays(database, scene, name, row[name])
+        matches = database.read_inliers(a, b)
+        off = _epipolar_errors(
+            rays[a][matches[:, 0]], rays[b][matches[:, 1]], _essential(scene, row[a], row[b])
+        )
+        focal = np.mean([scene.cameras[int(scene.camera_ids[row[i]])].focal_px for i in (a, b)])
+        share = float(np.mean(off * focal < _FITS_PX))
+        if share < _SHARE:
+            found.append(Contradiction((a, b), n, share))
+    return sorted(found, key=lambda one: -one.matches)
+
+
+def _rays(database: MapDatabase, scene: Scene, name: str, k: int) -> np.ndarray:
+    """(K, 3) of all features of an image, third coordinate one."""
+    pixels = database.read_keypoints(name)[:, :2].astype(np.float64)
+    rays = scene.cameras[int(scene.camera_ids[k])].unproject(pixels)
+    return np.column_stack([rays, np.ones(len(rays))])
+
+
+def _essential(scene: Scene, a: int, b: int) -> np.ndarray:
+    """(3, 3), x_b' E x_a = 0."""
+    rotation_a, rotation_b = scene.poses.rotations[a], scene.poses.rotations[b]
+    x, y, z = rotation_b @ (scene.poses.centers[a] - scene.poses.centers[b])
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(across @ rotation_b @ rotation_a.T)
+
+
+def _epipolar_errors(a: np.ndarray, b: np.ndarray, essential: np.ndarray) -> np.ndarray:
+    """Sampson's first-order distance (K,) of matches (K, 3), (K, 3), in units of the focal length."""
+    in_b, in_a = a @ essential.T, b @ essential
+    squares = (in_b[:, :2] ** 2).sum(axis=1) + (in_a[:, :2] ** 2).sum(axis=1)
+    return np.abs((b * in_b).sum(axis=1)) / np.sqrt(np.maximum(squares, 1e-24))

@@ -1,0 +1,77 @@
+"""Models whose parts lie wrongly to each other are told from right ones, on data with exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spn_data.colmap import pycolmap
+from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.model import Scene, scene_of
+from spn_data.contradiction import contradictions
+from spn_data.pose import Poses, rotations_from_vectors
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
+    """A database of 20 images and 300 points, all of which match, and the true scene."""
+    path = tmp_path_factory.mktemp("synthetic") / "database.db"
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=20, num_points3D=300
+    )
+    with pycolmap.Database.open(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+    return path, scene_of(truth)
+
+
+def turned(scene: Scene, rows: np.ndarray) -> Scene:
+    """With some cameras turned by 20 degrees about the origin, as one rigid part."""
+    turn = rotations_from_vectors(np.array([[0.0, 0.0, np.deg2rad(20)]]))[0]
+    centers, rotations = scene.poses.centers.copy(), scene.poses.rotations.copy()
+    centers[rows], rotations[rows] = centers[rows] @ turn.T, rotations[rows] @ turn.T
+    return replace(scene, poses=Poses.from_rotations(centers, rotations))
+
+
+def test_a_right_model_is_not_contradicted(synthetic: tuple[Path, Scene]) -> None:
+    path, scene = synthetic
+    with MapDatabase.open(path) as database:
+        assert len(database.verified_pairs()) > 100
+        assert contradictions(database, scene) == []
+
+
+def test_pairs_across_two_parts_that_lie_wrongly_contradict_them(
+    synthetic: tuple[Path, Scene],
+) -> None:
+    """All pairs across, none within a part, most matches first."""
+    path, scene = synthetic
+    part = np.arange(7)
+    with MapDatabase.open(path) as database:
+        found = contradictions(database, turned(scene, part))
+    assert len(found) > 20
+    inside = {scene.names[k] for k in part}
+    assert all((one.images[0] in inside) != (one.images[1] in inside) for one in found)
+    assert all(one.share < 0.5 for one in found)
+    counts = [one.matches for one in found]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_pairs_with_few_matches_do_not_contradict(
+    synthetic: tuple[Path, Scene], tmp_path: Path
+) -> None:
+    """Chance matches of a wrong pair, as repeated windows give, say nothing against a right model."""
+    path, scene = synthetic
+    (tmp_path / "database.db").write_bytes(path.read_bytes())
+    rng = np.random.default_rng(0)
+    with pycolmap.Database.open(tmp_path / "database.db") as native:
+        first, second = (i.image_id for i in native.read_all_images()[:2])
+        geometry = native.read_two_view_geometry(first, second)
+        geometry.inlier_matches = rng.permutation(300)[:120].reshape(-1, 2).astype(np.uint32)
+        native.delete_two_view_geometry(first, second)
+        native.write_two_view_geometry(first, second, geometry)
+    with MapDatabase.open(tmp_path / "database.db") as database:
+        assert 60 in database.verified_pairs().values()
+        assert contradictions(database, scene) == []
