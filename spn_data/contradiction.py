@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene
+from spn_data.epipolar import essential_matrix, sampson_errors
 
 _FITS_PX = 12.0  # epipolar error of a match; a wrong pose leaves a few hundredths of them below it
 _SHARE = 0.5  # of a pair's matches that must fit
@@ -43,9 +44,8 @@ def contradictions(database: MapDatabase, scene: Scene) -> list[Contradiction]:
             if name not in rays:
                 rays[name] = _rays(database, scene, name, row[name])
         matches = database.read_inliers(a, b)
-        off = _epipolar_errors(
-            rays[a][matches[:, 0]], rays[b][matches[:, 1]], _essential(scene, row[a], row[b])
-        )
+        essential = essential_matrix(scene.poses, row[a], row[b])
+        off = sampson_errors(rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential)
         focal = np.mean([scene.cameras[int(scene.camera_ids[row[i]])].focal_px for i in (a, b)])
         share = float(np.mean(off * focal < _FITS_PX))
         if share < _SHARE:
@@ -54,22 +54,6 @@ def contradictions(database: MapDatabase, scene: Scene) -> list[Contradiction]:
 
 
 def _rays(database: MapDatabase, scene: Scene, name: str, k: int) -> np.ndarray:
-    """(K, 3) of all features of an image, third coordinate one."""
+    """(K, 2) of all features of an image, on the plane at distance one."""
     pixels = database.read_keypoints(name)[:, :2].astype(np.float64)
-    rays = scene.cameras[int(scene.camera_ids[k])].unproject(pixels)
-    return np.column_stack([rays, np.ones(len(rays))])
-
-
-def _essential(scene: Scene, a: int, b: int) -> np.ndarray:
-    """(3, 3), x_b' E x_a = 0."""
-    rotation_a, rotation_b = scene.poses.rotations[a], scene.poses.rotations[b]
-    x, y, z = rotation_b @ (scene.poses.centers[a] - scene.poses.centers[b])
-    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(across @ rotation_b @ rotation_a.T)
-
-
-def _epipolar_errors(a: np.ndarray, b: np.ndarray, essential: np.ndarray) -> np.ndarray:
-    """Sampson's first-order distance (K,) of matches (K, 3), (K, 3), in units of the focal length."""
-    in_b, in_a = a @ essential.T, b @ essential
-    squares = (in_b[:, :2] ** 2).sum(axis=1) + (in_a[:, :2] ** 2).sum(axis=1)
-    return np.abs((b * in_b).sum(axis=1)) / np.sqrt(np.maximum(squares, 1e-24))
+    return scene.cameras[int(scene.camera_ids[k])].unproject(pixels)

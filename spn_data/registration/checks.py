@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.colmap.resection import resect
+from spn_data.epipolar import essential_matrix, sampson_errors
 from spn_data.labels import sigmas
 from spn_data.map_points import covered_share
 from spn_data.pose import Poses, rotation_errors_deg
@@ -175,21 +176,10 @@ def _epipolar_share(
     max_error_px: float,
 ) -> float:
     camera = solution.camera
-    rotations, centers = solution.poses.rotations, solution.poses.centers
-    relative = rotations[j] @ rotations[i].T
-    baseline = rotations[j] @ (centers[i] - centers[j])
-    bx, by, bz = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
-    essential = np.array([[0, -bz, by], [bz, 0, -bx], [-by, bx, 0]]) @ relative
-    a = _homogeneous(camera.unproject(sequence.pixels[i][matches[:, 0]]))
-    b = _homogeneous(camera.unproject(sequence.pixels[j][matches[:, 1]]))
-    line_b, line_a = a @ essential.T, b @ essential
-    slope = (line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1)
-    error = np.abs((b * line_b).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-30))
+    a = camera.unproject(sequence.pixels[i][matches[:, 0]])
+    b = camera.unproject(sequence.pixels[j][matches[:, 1]])
+    error = sampson_errors(a, b, essential_matrix(solution.poses, i, j))
     return float((error * np.mean(camera.focal_px) <= max_error_px).mean())
-
-
-def _homogeneous(xy: np.ndarray) -> np.ndarray:
-    return np.column_stack([xy, np.ones(len(xy))])
 
 
 @dataclass(frozen=True, eq=False)
