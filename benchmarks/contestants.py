@@ -45,7 +45,8 @@ class Result:
 
 def run_ours(frames: FramesToMap, job: Job, stopwatch: Stopwatch) -> tuple[Path, tuple[str, ...]]:
     """Our reconstruction with its default options."""
-    from spn_data.reconstruct import ReconstructOptions, reconstruct
+    from spn_data.attempts import ReconstructOptions
+    from spn_data.reconstruct import reconstruct
 
     options = ReconstructOptions(threads=job.threads, seed=job.seed)
     made = reconstruct(frames, Path(job.work), options, lambda *_: None, stopwatch)

@@ -1,4 +1,4 @@
-"""Whether a model contradicts what its images show together: parts glued at a wrong place."""
+"""Whether a model contradicts what its images show together, or what is known of its lenses."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene
+from spn_data.correspondences import FramesToMap
 from spn_data.epipolar import essential_matrix, sampson_errors
 
 _FITS_PX = 12.0  # epipolar error of a match; a wrong pose leaves a few hundredths of them below it
@@ -57,3 +58,34 @@ def _rays(database: MapDatabase, scene: Scene, name: str, k: int) -> np.ndarray:
     """(K, 2) of all features of an image, on the plane at distance one."""
     pixels = database.read_keypoints(name)[:, :2].astype(np.float64)
     return scene.cameras[int(scene.camera_ids[k])].unproject(pixels)
+
+
+@dataclass(frozen=True)
+class FocalChange:
+    """A lens whose focal length was known, and came out otherwise."""
+
+    camera: str
+    said_px: float
+    found_px: float
+
+    @property
+    def ratio(self) -> float:
+        """Of the longer to the shorter one."""
+        return max(self.found_px / self.said_px, self.said_px / self.found_px)
+
+
+def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[FocalChange]:
+    """Lenses of known focal length that came out by more than `ratio` longer or shorter; worst first.
+
+    Far longer and far off, what a flight shows looks the same but for perspective: a weak geometry lets
+    adjustments drift there, without a large error or a pair that tells.
+    """
+    key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
+    lenses = {key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)}
+    changes = []
+    for key, camera_id in lenses.items():
+        start, known = frames.start_cameras[key]
+        change = FocalChange(key, start.focal_px[0], scene.cameras[camera_id].focal_px[0])
+        if known and change.ratio > ratio:
+            changes.append(change)
+    return sorted(changes, key=lambda one: -one.ratio)

@@ -16,7 +16,7 @@ from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
 from spn_data.errors import InputError
 from spn_data.features import FeatureOptions, Features, extract
 from spn_data.matching import MatchOptions
-from spn_data.pairs import PairOptions, appearance_vocabulary, choose_pairs, describe_appearance
+from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
 from spn_data.parallel import Dispatch
 from spn_data.timing import Progress
 
@@ -87,21 +87,18 @@ def extract_from_bytes(
 _FRAMES_OF_VOCABULARY = 200  # whose descriptors its words are drawn from
 
 
-def pairs_of(
-    database: MapDatabase, frames: FramesToMap, options: PairOptions
-) -> list[tuple[int, int]]:
-    """Pairs of positions in `frames` to match."""
+def appearance_of(database: MapDatabase, frames: FramesToMap, options: PairOptions) -> np.ndarray:
+    """(N, D) of the frames, in words made of these very frames."""
     # All descriptors at once would be half a megabyte a frame.
     telling = frames.names[:: math.ceil(len(frames.names) / _FRAMES_OF_VOCABULARY)]
     described = [database.read_features(name).descriptors for name in telling]
     vocabulary = appearance_vocabulary(described, options)
-    appearance = np.stack(
+    return np.stack(
         [
             describe_appearance(database.read_features(name).descriptors, vocabulary)
             for name in frames.names
         ]
     )
-    return choose_pairs(frames.sequences, frames.positions_m, appearance, options)
 
 
 _PAIRS_A_BATCH = 16

@@ -8,7 +8,7 @@ from spn_data.pose import Poses
 
 
 def essential_matrix(poses: Poses, a: int, b: int) -> np.ndarray:
-    """(3, 3), x_b' E x_a = 0 for rays in the camera frames of two of the poses; its baseline has length one."""
+    """(3, 3), x_b' E x_a = 0 for rays in the camera frames of two poses; its baseline has length one."""
     rotations, centers = poses.rotations, poses.centers
     baseline = rotations[b] @ (centers[a] - centers[b])
     x, y, z = baseline / max(float(np.linalg.norm(baseline)), 1e-12)

@@ -3,114 +3,41 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spn_data.cluster import dispatch_to
+import numpy as np
+
+from spn_data.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.model import Scene, count_registered, read_scene
-from spn_data.contradiction import Contradiction, contradictions
-from spn_data.correspondences import FramesToMap, extract_missing, match_missing, pairs_of
+from spn_data.contradiction import Contradiction, FocalChange, contradictions, focal_changes
+from spn_data.correspondences import FramesToMap, appearance_of, extract_missing, match_missing
 from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
 from spn_data.features import FeatureOptions
 from spn_data.files import write_whole
-from spn_data.matching import MatchOptions
-from spn_data.pairs import PairOptions
-from spn_data.parallel import Dispatch
+from spn_data.pairs import PairOptions, choose_pairs
 from spn_data.timing import Progress, Stopwatch
 
-
-@dataclass(frozen=True, kw_only=True)
-class ReconstructOptions:
-    """How a model is made from frames."""
-
-    features: FeatureOptions = field(default_factory=FeatureOptions)
-    pairs: PairOptions = field(default_factory=PairOptions)
-    matching: MatchOptions = field(default_factory=MatchOptions)
-    engine: str = "incremental"  # or "global"
-    thinned_features: int = (
-        512  # of each image, those matched most, from which poses are found first
-    )
-    camera_model: str = "RADIAL"  # of the last bundle adjustments
-    refine_principal_point: bool = False
-    threads: int = 2  # of the mapper, and worker processes before it
-    cluster: str = (
-        ""  # address of a Dask scheduler, whose workers find features and matches instead
-    )
-    seed: int = 0
-    enough_share: float = 0.95  # registered, below which all is tried again with more features
-    usable_share: float = 0.1  # registered, below which there is no model
-
-    @property
-    def dispatch(self) -> Dispatch:
-        """Who computes features and matches."""
-        return dispatch_to(self.cluster, self.threads)
+_DRIFTED = 1.5  # ratio of focal lengths; a video cropped for stabilisation has 1.1 to 1.4
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """One rung of the ladder of retries."""
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What every step of a reconstruction works on."""
 
-    name: str
-    why: str
-    database: str
-    features: FeatureOptions
-    pairs: PairOptions
-    missing_features: FeatureOptions  # of the few frames that are left out all the same
-    hold_intrinsics: bool = False
-    thinned: bool = False  # poses from the features that match most, then points from all
+    frames: FramesToMap
+    work: Path
+    options: ReconstructOptions
+    progress: Progress
+    stopwatch: Stopwatch
 
-
-@dataclass(frozen=True)
-class _Chance:
-    """What is tried for the frames that a model leaves out."""
-
-    name: str
-    what: str
-    database: str
-    features: FeatureOptions
-
-
-def attempts(options: ReconstructOptions) -> list[Attempt]:
-    """As the options are; with intrinsics that cannot drift; and with more features on wider pairs.
-
-    Poses from all features take four times as long and come out the same: only where that fails are all used.
-    """
-    features, pairs = options.features, options.pairs
-    more = replace(
-        features,
-        max_features=features.max_features * 2,
-        contrast_threshold=features.contrast_threshold / 2,
-    )
-    incremental = options.engine == "incremental"
-    first = Attempt("first", "", "database.db", features, pairs, more, thinned=incremental)
-    ladder = [first]
-    if incremental:
-        why = "intrinsics held until the end"
-        ladder.append(replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False))
-    why = "more features, wider pairs"
-    return [*ladder, Attempt("dense", why, "database-dense.db", more, pairs.wider(), more)]
-
-
-_FEW_SHARE = 0.2  # left out, above which it is not for the features of some frames
-
-
-def _chances(attempt: Attempt, missing_share: float) -> list[_Chance]:
-    """Wider pairs, and then more features too where few are missing."""
-    again = _Chance(
-        "again", "wider pairs for the missing frames", attempt.database, attempt.features
-    )
-    if missing_share > _FEW_SHARE or attempt.missing_features == attempt.features:
-        return [again]
-    closer = _Chance(
-        "closer",
-        "more features in the missing frames",
-        f"database-{attempt.name}-closer.db",
-        attempt.missing_features,
-    )
-    return [again, closer]
+    def named(self, name: str) -> _Run:
+        """Steps under a name of their own, so that a second round is not taken for the first."""
+        told = self.progress
+        return replace(self, progress=lambda step, *counts: told(f"{step} ({name})", *counts))
 
 
 @dataclass(frozen=True)
@@ -176,51 +103,16 @@ def reconstruct(
 
     Raises StageError where fewer than three images, or less than `usable_share` of them, register.
     """
+    run = _Run(frames, work, options, progress, stopwatch)
     best: _Candidate | None = None
     story: list[str] = []
     for attempt in attempts(options):
-        told = progress if attempt.name == "first" else _named(progress, attempt.name)
-        with MapDatabase.open(work / attempt.database) as database:
-            images = [
-                DatabaseImage(name, str(key))
-                for name, key in zip(frames.names, frames.cameras, strict=True)
-            ]
-            database.add_images(images, frames.start_cameras)
-            with stopwatch.step("features"):
-                extract_missing(database, frames, attempt.features, options.dispatch, told)
-            with stopwatch.step("pairs"):
-                pairs = pairs_of(database, frames, attempt.pairs)
-            with stopwatch.step("matching"):
-                match_missing(database, frames, pairs, options.matching, options.dispatch, told)
-        with stopwatch.step("mapping"):
-            models = _map(work, attempt, frames, options, told)
-        submodels = tuple(count_registered(model) for model in models)
-        registered, model = (submodels[0], models[0]) if models else (0, None)
-        if model is not None and attempt.thinned:
-            with stopwatch.step("mapping"):
-                model = _with_all_points(work, attempt, model)
-        story.append(_tell(attempt, submodels, len(frames.names)))
-        if model is None:
+        found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, story)
+        if found is None:
             continue
-        kept = attempt.database
-        for chance in _chances(attempt, 1 - registered / len(frames.names)):
-            if not 2 < registered < len(frames.names):
-                break
-            grown = _grow(
-                work, attempt, chance, frames, model, options, _named(told, chance.name), stopwatch
-            )
-            gained = count_registered(grown) - registered
-            if gained > 0:
-                story.append(f"{chance.what} registered {gained} more")
-                registered, model, kept = registered + gained, grown, chance.database
-        with MapDatabase.open(work / kept) as database:
-            wrong = contradictions(database, read_scene(model))
-        if wrong:
-            story.append(_tell_contradictions(wrong))
-        found = _Candidate(not wrong, registered, model, kept, submodels)
         if best is None or found.rank > best.rank:
             best = found
-        if found.sound and registered >= options.enough_share * len(frames.names):
+        if found.sound and found.registered >= options.enough_share * len(frames.names):
             break
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
         raise StageError(_no_model(work, frames, 0 if best is None else best.registered, story))
@@ -242,91 +134,133 @@ def reconstruct(
     )
 
 
+def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
+    """What an attempt gives, with the chances of the frames that it leaves out; the story goes on."""
+    frames, work, stopwatch = run.frames, run.work, run.stopwatch
+    n = len(frames.names)
+    with MapDatabase.open(work / attempt.database) as database:
+        images = [
+            DatabaseImage(name, str(key))
+            for name, key in zip(frames.names, frames.cameras, strict=True)
+        ]
+        database.add_images(images, frames.start_cameras)
+        _extract(run, database, attempt.features)
+        with stopwatch.step("pairs"):
+            appearance = appearance_of(database, frames, attempt.pairs)
+            pairs = _pairs(frames, appearance, attempt.pairs)
+        _match(run, database, pairs)
+    models = _map(run, attempt)
+    submodels = tuple(count_registered(model) for model in models)
+    story.append(_tell(attempt, submodels, n))
+    if not models:
+        return None
+    model, registered, kept = models[0], submodels[0], attempt.database
+    if attempt.thinned:
+        model = _with_all_points(run, attempt, model)
+    if registered > 2:
+        with stopwatch.step("pairs"):
+            wider = _pairs(frames, appearance, attempt.pairs.wider())
+        for chance in chances(attempt):
+            if not 0 < n - registered <= chance.most_missing * n:
+                break
+            grown = _grow(run.named(chance.name), attempt, chance, wider, model)
+            gained = count_registered(grown) - registered
+            if gained > 0:
+                story.append(f"{chance.what} registered {gained} more")
+                registered, model, kept = registered + gained, grown, chance.database
+    scene = read_scene(model)
+    with MapDatabase.open(work / kept) as database:
+        wrong = contradictions(database, scene)
+    drifted = focal_changes(scene, frames, _DRIFTED)
+    if wrong:
+        story.append(_tell_contradictions(wrong))
+    if drifted:
+        story.append(_tell_drift(drifted))
+    return _Candidate(not (wrong or drifted), registered, model, kept, submodels)
+
+
+def _extract(run: _Run, database: MapDatabase, features: FeatureOptions) -> None:
+    with run.stopwatch.step("features"):
+        extract_missing(database, run.frames, features, run.options.dispatch, run.progress)
+
+
+def _pairs(
+    frames: FramesToMap, appearance: np.ndarray, options: PairOptions
+) -> list[tuple[int, int]]:
+    return choose_pairs(frames.sequences, frames.positions_m, appearance, options)
+
+
+def _match(run: _Run, database: MapDatabase, pairs: list[tuple[int, int]]) -> None:
+    options = run.options
+    with run.stopwatch.step("matching"):
+        match_missing(database, run.frames, pairs, options.matching, options.dispatch, run.progress)
+
+
 def _map(
-    work: Path,
-    attempt: Attempt,
-    frames: FramesToMap,
-    options: ReconstructOptions,
-    progress: Progress,
-    chance: _Chance | None = None,
-    start_from: Path | None = None,
+    run: _Run, attempt: Attempt, chance: Chance | None = None, start_from: Path | None = None
 ) -> list[Path]:
     """Sub-models, most images first; an interrupted run goes on from its last snapshot."""
-    folder = work / "-".join(["mapping", attempt.name, *([chance.name] if chance else [])])
+    folder = run.work / "-".join(["mapping", attempt.name, *([chance.name] if chance else [])])
     done = folder / "models.json"
     if done.exists():
         return [folder / "models" / name for name in json.loads(done.read_text())]
     for name in ("models", "snapshots"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     snapshot = latest_snapshot(folder / "snapshots") or start_from
-    n = len(frames.names)
-    database = work / (chance or attempt).database
-    # What these left out has its chance with all features.
-    if attempt.thinned and chance is None:
-        database = folder / "thinned.db"
-        with MapDatabase.open(work / attempt.database) as whole:
-            whole.write_thinned(database, options.thinned_features)
-    job = MappingJob(
-        database=str(database),
-        images=str(frames.folder),
-        output=str(folder / "models"),
-        snapshots=str(folder / "snapshots"),
-        engine=options.engine,
-        threads=options.threads,
-        seed=options.seed,
-        snapshot_every=max(3, n // 10),
-        min_model_size=10 if n >= 30 else 3,
-        hold_intrinsics=attempt.hold_intrinsics,
-        start_from="" if snapshot is None else str(snapshot),
-    )
-    models = run_mapping(
-        job,
-        log=work / "mapping.log",
-        progress=lambda registered: progress("mapping", min(registered, n), n),
-    )
+    n = len(run.frames.names)
+    with run.stopwatch.step("mapping"):
+        database = run.work / (chance or attempt).database
+        # What these left out has its chance with all features.
+        if attempt.thinned and chance is None:
+            thinned = folder / "thinned.db"
+            with MapDatabase.open(database) as whole:
+                whole.write_thinned(thinned, run.options.thinned_features)
+            database = thinned
+        job = MappingJob(
+            database=str(database),
+            images=str(run.frames.folder),
+            output=str(folder / "models"),
+            snapshots=str(folder / "snapshots"),
+            engine=run.options.engine,
+            threads=run.options.threads,
+            seed=run.options.seed,
+            snapshot_every=max(3, n // 10),
+            min_model_size=10 if n >= 30 else 3,
+            hold_intrinsics=attempt.hold_intrinsics,
+            start_from="" if snapshot is None else str(snapshot),
+        )
+        models = run_mapping(
+            job,
+            log=run.work / "mapping.log",
+            progress=lambda registered: run.progress("mapping", min(registered, n), n),
+        )
     write_whole(done, json.dumps([model.name for model in models]))
     return models
 
 
-def _with_all_points(work: Path, attempt: Attempt, model: Path) -> Path:
+def _with_all_points(run: _Run, attempt: Attempt, model: Path) -> Path:
     """The model from the features that match most, with the points of all."""
-    target = work / f"mapping-{attempt.name}" / "all-points"
-    triangulate(model, target, database=work / attempt.database, log=work / "mapping.log")
+    target = run.work / f"mapping-{attempt.name}" / "all-points"
+    with run.stopwatch.step("mapping"):
+        triangulate(
+            model, target, database=run.work / attempt.database, log=run.work / "mapping.log"
+        )
     return target
 
 
 def _grow(
-    work: Path,
-    attempt: Attempt,
-    chance: _Chance,
-    frames: FramesToMap,
-    model: Path,
-    options: ReconstructOptions,
-    progress: Progress,
-    stopwatch: Stopwatch,
+    run: _Run, attempt: Attempt, chance: Chance, pairs: list[tuple[int, int]], model: Path
 ) -> Path:
     """The model, grown by frames that a chance connects: sub-models join it that way too."""
-    registered = set(read_scene(model).names)
-    missing = [name for name in frames.names if name not in registered]
-    if not (work / chance.database).exists():
-        with MapDatabase.open(work / attempt.database) as database:
-            database.write_without(work / chance.database, missing)
-    with MapDatabase.open(work / chance.database) as database:
-        with stopwatch.step("features"):
-            extract_missing(database, frames, chance.features, options.dispatch, progress)
-        with stopwatch.step("pairs"):
-            pairs = pairs_of(database, frames, attempt.pairs.wider())
-        for_missing = [
-            (i, j)
-            for i, j in pairs
-            if frames.names[i] not in registered or frames.names[j] not in registered
-        ]
-        with stopwatch.step("matching"):
-            match_missing(
-                database, frames, for_missing, options.matching, options.dispatch, progress
-            )
-    with stopwatch.step("mapping"):
-        models = _map(work, attempt, frames, options, progress, chance, start_from=model)
+    names = run.frames.names
+    missing = set(names) - set(read_scene(model).names)
+    if not (run.work / chance.database).exists():
+        with MapDatabase.open(run.work / attempt.database) as database:
+            database.write_without(run.work / chance.database, sorted(missing))
+    with MapDatabase.open(run.work / chance.database) as database:
+        _extract(run, database, chance.features)
+        _match(run, database, [p for p in pairs if not missing.isdisjoint(names[k] for k in p)])
+    models = _map(run, attempt, chance, start_from=model)
     return max([model, *models], key=count_registered)
 
 
@@ -348,11 +282,6 @@ def _refine(
     return target
 
 
-def _named(progress: Progress, name: str) -> Progress:
-    """Steps under a name of their own, so that a second round is not taken for the first."""
-    return lambda step, done, total: progress(f"{step} ({name})", done, total)
-
-
 def _tell(attempt: Attempt, submodels: tuple[int, ...], n: int) -> str:
     how = f"{attempt.name} attempt{f' ({attempt.why})' if attempt.why else ''}"
     if not submodels:
@@ -368,6 +297,13 @@ def _tell_contradictions(wrong: list[Contradiction]) -> str:
         f"parts of it lie wrongly to each other: {worst.images[0]} and {worst.images[1]} share "
         f"{worst.matches} matches, of which its poses explain {worst.share:.0%}{others}"
     )
+
+
+def _tell_drift(drifted: list[FocalChange]) -> str:
+    lenses = ", ".join(
+        f"of {one.camera} from {one.said_px:.0f} to {one.found_px:.0f} px" for one in drifted
+    )
+    return f"its focal lengths drifted: {lenses}"
 
 
 def _no_model(work: Path, frames: FramesToMap, registered: int, story: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Models whose parts lie wrongly to each other are told from right ones, on data with exact truth."""
+"""Wrong models are told from right ones, on data with exact truth."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene, scene_of
-from spn_data.contradiction import contradictions
+from spn_data.contradiction import contradictions, focal_changes
+from spn_data.correspondences import FramesToMap
 from spn_data.pose import Poses, rotations_from_vectors
 
 
@@ -75,3 +77,26 @@ def test_pairs_with_few_matches_do_not_contradict(
     with MapDatabase.open(tmp_path / "database.db") as database:
         assert 60 in database.verified_pairs().values()
         assert contradictions(database, scene) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "known", "told"),
+    [(1.0, True, 0), (1.4, True, 0), (3.5, True, 1), (0.3, True, 1), (3.5, False, 0)],
+)
+def test_a_known_focal_length_that_comes_out_far_off_speaks_against_a_model(
+    synthetic: tuple[Path, Scene], factor: float, known: bool, told: int
+) -> None:
+    """Longer or shorter; a guessed one may come out as it will."""
+    _, scene = synthetic
+    (camera,) = scene.cameras.values()
+    start = Camera("SIMPLE_PINHOLE", 100, 100, np.array([camera.focal_px[0] / factor, 50, 50]))
+    n = len(scene.names)
+    keys, nowhere = np.array(["lens"] * n), np.full((n, 3), np.nan)
+    frames = FramesToMap(
+        Path(), tuple(scene.names), keys, keys, nowhere, {"lens": (start, known)}, {}
+    )
+    changes = focal_changes(scene, frames, 1.5)
+    assert len(changes) == told
+    for change in changes:
+        assert change.ratio == pytest.approx(max(factor, 1 / factor))
+        assert change.found_px / change.said_px == pytest.approx(factor)

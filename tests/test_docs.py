@@ -13,8 +13,8 @@ import pytest
 
 from spn_data import errors
 from spn_data.area import STAGES
+from spn_data.attempts import ReconstructOptions
 from spn_data.diagnosis import FrameRegistration
-from spn_data.reconstruct import ReconstructOptions
 from spn_data.record import StageRecord
 from spn_data.selection import SelectionOptions
 

@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import FRAMES, MODEL, Area, StageWork
+from spn_data.attempts import ReconstructOptions
 from spn_data.camera import Camera
 from spn_data.camera_file import camera_from_json
 from spn_data.colmap.model import Scene, read_observations
+from spn_data.contradiction import focal_changes
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
 from spn_data.files import read_csv, write_csv
 from spn_data.frames import Frames, read_frames
 from spn_data.geodesy import GeoOrigin
-from spn_data.reconstruct import ReconstructOptions, ReconstructResult, reconstruct
+from spn_data.reconstruct import ReconstructResult, reconstruct
 from spn_data.record import StageRecord, read_json
 from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.timing import Progress, Stopwatch
@@ -128,26 +130,18 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
-_FOCAL_SURPRISE = 0.1  # relative change of a focal length that was known
+_FOCAL_SURPRISE = 1.1  # ratio to a focal length that was known
 
 
 def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
     """A word where a focal length came out far from what it was said to be."""
-    remarks = []
-    key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
-    for key, i in {
-        key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)
-    }.items():
-        start, known = frames.start_cameras[key]
-        found_px, said_px = scene.cameras[i].focal_px[0], start.focal_px[0]
-        if known and abs(found_px / said_px - 1) > _FOCAL_SURPRISE:
-            remarks.append(
-                f"camera {key}: the focal length came out at {found_px:.0f} px, "
-                f"{found_px / said_px - 1:+.0%} from the {said_px:.0f} px that were given. A flight at one "
-                "height that looks one way hardly determines it, and heights are off by as much; or the "
-                "video is cropped. --camera settles it"
-            )
-    return remarks
+    return [
+        f"camera {change.camera}: the focal length came out at {change.found_px:.0f} px, "
+        f"{change.found_px / change.said_px - 1:+.0%} from the {change.said_px:.0f} px that were given. A "
+        "flight at one height that looks one way hardly determines it, and heights are off by as much; or "
+        "the video is cropped. --camera settles it"
+        for change in focal_changes(scene, frames, _FOCAL_SURPRISE)
+    ]
 
 
 def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[ShutterDiagnosis, ...]:
