@@ -9,10 +9,11 @@ from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust
 from spn_data.colmap.model import scene_of
-from spn_data.pose import Similarity, rotations_from_vectors
+from spn_data.pose import Poses, Similarity, rotations_from_vectors
+from tests.native_world import native_model
 
 _LINES, _PER_LINE, _STEP_M, _APART_M, _HEIGHT_M = 4, 40, 7.5, 14.0, 45.0
-_CAMERA = Camera("RADIAL", 960, 540, (660.0, 480.0, 270.0, -0.05, 0.015))
+_CAMERA = Camera("RADIAL", 960, 540, np.array([660.0, 480.0, 270.0, -0.05, 0.015]))
 
 
 def survey(sag_m: float, wrong: int = 0) -> tuple[pycolmap.Reconstruction, np.ndarray]:
@@ -31,40 +32,27 @@ def survey(sag_m: float, wrong: int = 0) -> tuple[pycolmap.Reconstruction, np.nd
         lift = sag_m * (2 * positions[:, 0] / length - 1) ** 2
         return positions + np.stack([0 * lift, 0 * lift, lift], axis=1)
 
-    model = pycolmap.Reconstruction()
-    native = pycolmap.Camera(
-        model=_CAMERA.model, width=960, height=540, params=_CAMERA.params, camera_id=1
-    )
-    model.add_camera(native)
-    rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(native.sensor_id)
-    model.add_rig(rig)
     tracks: list[list[tuple[int, int]]] = [[] for _ in points]
     down = np.diag([1.0, -1.0, -1.0])
-    for i, (center, at) in enumerate(zip(centers, bent(centers), strict=True)):
-        pixels = _CAMERA.project((points - center) @ down.T)
-        inside = np.flatnonzero(((pixels > 0) & (pixels < (960, 540))).all(axis=1))
+    pixels, rotations = [], []
+    for i, center in enumerate(centers):
+        projected = _CAMERA.project((points - center) @ down.T)
+        inside = np.flatnonzero(((projected > 0) & (projected < (960, 540))).all(axis=1))
         seen = rng.choice(inside, min(len(inside), 150), replace=False)
-        measured = pixels[seen] + rng.normal(0, 0.3, (len(seen), 2))
-        image = pycolmap.Image(name=f"{i:03d}.jpg", camera_id=1, image_id=i + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in measured])
+        measured = projected[seen] + rng.normal(0, 0.3, (len(seen), 2))
+        pixels.append(measured)
         slope = 4 * sag_m / length * (2 * center[0] / length - 1)
-        rotation = down @ rotations_from_vectors(np.array([[0.0, slope, 0.0]]))[0]
-        frame = pycolmap.Frame(frame_id=i + 1, rig_id=1)
-        frame.add_data_id(image.data_id)
-        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ at)
-        model.add_frame(frame)
-        image.frame_id = i + 1
-        model.add_image(image)
-        model.register_frame(i + 1)
+        rotations.append(down @ rotations_from_vectors(np.array([[0.0, slope, 0.0]]))[0])
         for row, point in enumerate(seen.tolist()):
-            tracks[point].append((i + 1, row))
-    for point, track in zip(bent(points), tracks, strict=True):
-        if len(track) > 1:
-            native_track = pycolmap.Track()
-            for element in track:
-                native_track.add_element(*element)
-            model.add_point3D(point, native_track)
+            tracks[point].append((i, row))
+    model = native_model(
+        {1: _CAMERA},
+        [1] * len(k),
+        [f"{i:03d}.jpg" for i in range(len(k))],
+        Poses.from_rotations(bent(centers), np.stack(rotations)),
+        pixels,
+        [pair for pair in zip(bent(points), tracks, strict=True) if len(pair[1]) > 1],
+    )
     for image_id in rng.choice(np.arange(1, len(k) + 1), wrong).tolist():
         image = model.images[image_id]
         row = int(rng.choice(image.get_observation_point2D_idxs()))

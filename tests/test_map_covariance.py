@@ -30,6 +30,7 @@ from spn_data.pose import (
     rotations_from_angles,
     rotations_from_vectors,
 )
+from tests.native_world import native_model
 
 INDEPENDENT = MapCovarianceOptions(clustered=False)
 
@@ -84,29 +85,21 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
 
 def adjusted(scene: Scene, seen: Observations, pixels: np.ndarray) -> Small:
     """COLMAP's bundle adjustment of measurements, from the scene as it is."""
-    model = pycolmap.Reconstruction()
-    for camera_id, camera in scene.cameras.items():
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                model=camera.model,
-                width=camera.width,
-                height=camera.height,
-                params=camera.params,
-                camera_id=camera_id,
-            )
-        )
-    quats, translations = scene.poses.to_cam_from_world()
-    tracks = [pycolmap.Track() for _ in scene.points]
-    for k, name in enumerate(scene.names):
+    tracks: list[list[tuple[int, int]]] = [[] for _ in scene.points]
+    measured = []
+    for k in range(len(scene.names)):
         rows = np.flatnonzero(seen.image_idx == k)
-        image = pycolmap.Image(name=name, camera_id=int(scene.camera_ids[k]), image_id=k + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[rows]])
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quats[k]), translations[k])
-        model.add_image_with_trivial_frame(image, pose)
+        measured.append(pixels[rows])
         for position, point in enumerate(seen.point_idx[rows].tolist()):
-            tracks[point].add_element(k + 1, position)
-    for xyz, track in zip(scene.points, tracks, strict=True):
-        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+            tracks[point].append((k, position))
+    model = native_model(
+        scene.cameras,
+        scene.camera_ids.tolist(),
+        scene.names,
+        scene.poses,
+        measured,
+        zip(scene.points, tracks, strict=True),
+    )
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.num_threads = 1
     pycolmap.bundle_adjustment(model, options)

@@ -23,6 +23,7 @@ from spn_data.shutter import (
     world_twists,
 )
 from spn_data.simulate import preset, simulate_paths
+from tests.native_world import native_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,19 +75,14 @@ def film(tmp: Path, seed: int, flaws: Flaws, frames: int = 38, iterations: int =
     camera, truth = path.camera, path.motion.poses(time_s)
     size = np.array([camera.width, camera.height])
     points = box_of_points(rng, 4000)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="OPENCV",
-            width=camera.width,
-            height=camera.height,
-            params=[*camera.focal_px, *camera.matrix[:2, 2], *camera.opencv_distortion],
-            camera_id=1,
-        )
+    lens = Camera(
+        "OPENCV",
+        camera.width,
+        camera.height,
+        np.array([*camera.focal_px, *camera.matrix[:2, 2], *camera.opencv_distortion]),
     )
-    quats, translations = truth.to_cam_from_world()
     tracks: dict[int, list[tuple[int, int]]] = {}
-    moved = []
+    moved, seen_in = [], []
     for k in range(frames):
         zoom = 1 + flaws.zoom_jitter * rng.standard_normal()
         zoom += flaws.zoom_drift * (k / (frames - 1) - 0.5)
@@ -103,20 +99,16 @@ def film(tmp: Path, seed: int, flaws: Flaws, frames: int = 38, iterations: int =
         measured = pixels[inside] + flaws.noise_px * rng.standard_normal((len(inside), 2))
         wrong = rng.random(len(inside)) < flaws.wrong_share
         measured[wrong] += rng.uniform(-4, 4, (int(wrong.sum()), 2))
-        image = pycolmap.Image(name=f"flight1/{k:04d}.jpg", camera_id=1, image_id=k + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in measured])
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quats[k]), translations[k])
-        model.add_image_with_trivial_frame(image, pose)
+        seen_in.append(measured)
         for position, index in enumerate(inside.tolist()):
-            tracks.setdefault(index, []).append((k + 1, position))
-    for index, elements in tracks.items():
-        if len(elements) < 3:
-            continue
-        track = pycolmap.Track()
-        for image_id, position in elements:
-            track.add_element(image_id, position)
-        start = points[index] + rng.normal(0, 0.02, 3)
-        model.add_point3D(start, track, np.zeros(3, np.uint8))
+            tracks.setdefault(index, []).append((k, position))
+    starts = [
+        (points[index] + rng.normal(0, 0.02, 3), track)
+        for index, track in tracks.items()
+        if len(track) >= 3
+    ]
+    names = [f"flight1/{k:04d}.jpg" for k in range(frames)]
+    model = native_model({1: lens}, [1] * frames, names, truth, seen_in, starts)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = iterations

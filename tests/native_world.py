@@ -1,0 +1,44 @@
+"""COLMAP models made of exact cameras, poses, points and measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from spn_data.camera import Camera
+from spn_data.colmap import pycolmap
+from spn_data.colmap.verify import native_camera
+from spn_data.pose import Poses
+
+
+def native_model(
+    cameras: dict[int, Camera],
+    camera_ids: Sequence[int],
+    names: Sequence[str],
+    poses: Poses,
+    pixels: Sequence[np.ndarray],
+    points: Iterable[tuple[np.ndarray, Iterable[tuple[int, int]]]],
+) -> pycolmap.Reconstruction:
+    """A model of N images, whose ids count from one, all posed.
+
+    pixels : N arrays (K, 2); points : position (3,) and track of each, in pairs of the image's and the
+    measurement's row.
+    """
+    model = pycolmap.Reconstruction()
+    for camera_id, camera in cameras.items():
+        model.add_camera_with_trivial_rig(
+            native_camera(camera, camera_id=camera_id, focal_is_known=True)
+        )
+    quats, translations = poses.to_cam_from_world()
+    for k, name in enumerate(names):
+        image = pycolmap.Image(name=name, camera_id=int(camera_ids[k]), image_id=k + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[k]])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quats[k]), translations[k])
+        model.add_image_with_trivial_frame(image, pose)
+    for xyz, elements in points:
+        track = pycolmap.Track()
+        for k, row in elements:
+            track.add_element(k + 1, row)
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    return model
