@@ -30,20 +30,36 @@ _UNCHANGED = 3e-5  # of all
 
 def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, threads: int) -> int:
     """Refine cameras, poses and points in place; how many measurements were found wrong and deleted."""
-    dropped = drop_out_of_view(native)
-    few = _with_long_tracks(native)
-    options = _options(threads, _FIRST_SCALE_PX, _CONVERGED)
-    options.refine_principal_point = refine_principal_point
-    pycolmap.bundle_adjustment(few, options)
-    _take_cameras(native, few)
-    del few
-    _adjust_points(native, threads)
-    dropped += drop_out_of_view(native) + drop_outliers(native)
+    straighten(native, threads=threads, refine_principal_point=refine_principal_point)
+    dropped = drop_out_of_view(native) + drop_outliers(native)
     # What is left of wrong matches shall not bend the model either.
     options = _options(threads, _CAUCHY * residual_sigma_px(native), _UNCHANGED)
     options.refine_principal_point = refine_principal_point
     pycolmap.bundle_adjustment(native, options)
     return dropped
+
+
+def straighten(
+    native: pycolmap.Reconstruction,
+    *,
+    threads: int,
+    refine_intrinsics: bool = True,
+    refine_principal_point: bool = False,
+    decrease: float = _CONVERGED,
+) -> None:
+    """Refine cameras and poses in place by the longest tracks alone, and then points.
+
+    decrease : of the cost, relative, at which cameras are as they shall be.
+    """
+    few = _with_long_tracks(native)
+    drop_out_of_view(few)
+    options = _options(threads, _FIRST_SCALE_PX, decrease)
+    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+    options.refine_principal_point = refine_principal_point
+    pycolmap.bundle_adjustment(few, options)
+    _take_cameras(native, few)
+    del few
+    _adjust_points(native, threads)
 
 
 def _options(threads: int, scale_px: float, decrease: float) -> pycolmap.BundleAdjustmentOptions:

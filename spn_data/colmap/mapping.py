@@ -117,6 +117,7 @@ def main() -> None:
 
 def _map(job: MappingJob) -> None:
     from spn_data.colmap import pycolmap
+    from spn_data.colmap.incremental import map_incrementally
     from spn_data.colmap.model import write_native
 
     pycolmap.set_random_seed(job.seed)
@@ -125,7 +126,7 @@ def _map(job: MappingJob) -> None:
         options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=job.seed)
         models = pycolmap.global_mapping(job.database, job.images, job.output, options)
     else:
-        models = _map_incrementally(job)
+        models = map_incrementally(job)
     # The mapper's own names depend on whether it went on from a model.
     folders = []
     for rank, i in enumerate(sorted(models, key=lambda i: (-models[i].num_reg_images(), i))):
@@ -133,57 +134,6 @@ def _map(job: MappingJob) -> None:
         write_native(models[i], folder)
         folders.append(str(folder))
     child.send({"models": folders})
-
-
-def _map_incrementally(job: MappingJob) -> dict[int, Any]:
-    from spn_data.colmap import pycolmap
-
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=job.threads,
-        random_seed=job.seed,
-        snapshot_path=job.snapshots,
-        snapshot_frames_freq=job.snapshot_every,
-    )
-    options.min_model_size = job.min_model_size
-    options.extract_colors = False  # `refine` does, once
-    # 127 degrees wide: shorter focal lengths only fit the noise of a weak geometry.
-    for part in (options, options.mapper, options.triangulation):
-        part.min_focal_length_ratio = 0.25
-    if job.hold_intrinsics:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = False
-        options.mapper.abs_pose_refine_extra_params = False
-    # A last bundle adjustment follows in `refine`: those on the way need not be many, nor converge.
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.35
-    options.ba_global_frames_freq = options.ba_global_points_freq = 1_000_000_000
-    options.ba_global_max_refinements = 1
-    options.ba_global_max_num_iterations = 30
-    options.ba_global_function_tolerance = 1e-4
-    registered = 0
-    if job.start_from:
-        registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
-
-    # The mapper announces an initial pair also where it goes on from a model.
-    initial = 0 if job.start_from else 2
-
-    def count(new: int) -> None:
-        nonlocal registered
-        registered += new
-        child.send({"registered": registered})
-
-    token = pycolmap.CancellationToken()
-    with child.interrupts(token.cancel):
-        models: dict[int, Any] = pycolmap.incremental_mapping(
-            job.database,
-            job.images,
-            job.output,
-            options,
-            input_path=job.start_from,
-            initial_image_pair_callback=lambda: count(initial),
-            next_image_callback=lambda: count(1),
-            cancellation_token=token,
-        )
-    return models
 
 
 def _triangulate(source: str, target: str, database: str) -> None:
