@@ -8,6 +8,7 @@ import pytest
 from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust
+from spn_data.colmap.clean import drop_out_of_view
 from spn_data.colmap.model import scene_of
 from spn_data.pose import Poses, Similarity, rotations_from_vectors
 from tests.native_world import native_model
@@ -95,3 +96,31 @@ def test_wrong_measurements_are_found_in_a_bent_survey(unbent_m: float) -> None:
     dropped = adjust(model, refine_principal_point=False, threads=2)
     assert 270 < dropped < 600
     assert error_m(model, centers) < 1.3 * unbent_m
+
+
+def test_a_step_that_leaves_all_behind_the_cameras_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What lies there costs nothing: an undamped step has ended there, at no cost at all."""
+    adjustment, radii = pycolmap.bundle_adjustment, []
+
+    def overshoot_first(
+        model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+    ) -> None:
+        radii.append(options.ceres.solver_options.initial_trust_region_radius)
+        if len(radii) > 1:
+            adjustment(model, options)
+            return
+        for frame in model.frames.values():
+            pose = frame.rig_from_world
+            frame.rig_from_world = pycolmap.Rigid3d(
+                pose.rotation, pose.translation - [0, 0, 3 * _HEIGHT_M]
+            )
+
+    monkeypatch.setattr(pycolmap, "bundle_adjustment", overshoot_first)
+    model, _ = survey(3.0)
+    adjust(model, refine_principal_point=False, threads=2)
+    assert radii[0] > radii[1] == 1e4
+    assert drop_out_of_view(model) == 0
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 0.4

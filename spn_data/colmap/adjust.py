@@ -17,6 +17,7 @@ _DAMPED = 1e4  # for points alone: undamped, those that near rays meet in are th
 # COLMAP's limit is 1,000; beyond, it solves inexactly what a bent model needs exactly.
 _MOST_IMAGES_SOLVED_EXACTLY = 20_000
 _ITERATIONS = 300
+_TURNED_OVER = 0.05  # of the measurements, out of view
 # Deviations at which Cauchy's loss begins to bend: 95 % efficient for normal errors (Holland & Welsch
 # 1977, "Robust regression using iteratively reweighted least-squares").
 _CAUCHY = 2.385
@@ -51,13 +52,18 @@ def straighten(
 
     decrease : of the cost, relative, at which cameras are as they shall be.
     """
-    few = _with_long_tracks(native)
-    drop_out_of_view(few)
-    options = _options(threads, _FIRST_SCALE_PX, decrease)
-    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
-    options.refine_principal_point = refine_principal_point
-    pycolmap.bundle_adjustment(few, options)
-    _take_cameras(native, few)
+    for radius in (_LONG_STEPS, _DAMPED):
+        few = _with_long_tracks(native)
+        drop_out_of_view(few)
+        options = _options(threads, _FIRST_SCALE_PX, decrease)
+        options.ceres.solver_options.initial_trust_region_radius = radius
+        options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+        options.refine_principal_point = refine_principal_point
+        pycolmap.bundle_adjustment(few, options)
+        # What lies behind a camera costs nothing: a step too long may end with all of it there.
+        if drop_out_of_view(few) < _TURNED_OVER * few.compute_num_observations():
+            _take_cameras(native, few)
+            break
     del few
     _adjust_points(native, threads)
 

@@ -126,12 +126,8 @@ def _map_large(
             adjusted = images
             mapper.complete_and_merge_tracks(options.get_triangulation())
             mapper.retriangulate(options.get_triangulation())
-            straighten(
-                model,
-                threads=job.threads,
-                refine_intrinsics=not job.hold_intrinsics,
-                decrease=_CLOSE,
-            )
+            # By now lenses are known, and one distortion term alone would bend what is straight.
+            straighten(model, threads=job.threads, refine_intrinsics=False, decrease=_CLOSE)
             mapper.filter_points(options.get_mapper())
 
     callbacks = pycolmap.IncrementalPipelineCallback
