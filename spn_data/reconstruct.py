@@ -116,8 +116,7 @@ def reconstruct(
             break
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
         raise StageError(_no_model(work, frames, 0 if best is None else best.registered, story))
-    with stopwatch.step("refinement"):
-        refined = _refine(work, best.model, frames.folder, options, progress)
+    refined = _refine(run, best.model, story)
     with MapDatabase.open(work / best.database) as database:
         registrations = diagnose(database, frames, refined)
         verified = len(database.verified_pairs())
@@ -264,21 +263,27 @@ def _grow(
     return max([model, *models], key=count_registered)
 
 
-def _refine(
-    work: Path, model: Path, images: Path, options: ReconstructOptions, progress: Progress
-) -> Path:
-    target = work / "refined"
-    progress("refinement", 0, 1)
-    refine(
-        model,
-        target,
-        images=images,
-        camera_model=options.camera_model,
-        refine_principal_point=options.refine_principal_point,
-        threads=options.threads,
-        log=work / "mapping.log",
-    )
-    progress("refinement", 1, 1)
+def _refine(run: _Run, model: Path, story: list[str]) -> Path:
+    target, frames, options = run.work / "refined", run.frames, run.options
+    run.progress("refinement", 0, 1)
+    known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
+    with run.stopwatch.step("refinement"):
+        done = refine(
+            model,
+            target,
+            images=frames.folder,
+            positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
+            camera_model=options.camera_model,
+            refine_principal_point=options.refine_principal_point,
+            threads=options.threads,
+            log=run.work / "mapping.log",
+        )
+    run.progress("refinement", 1, 1)
+    if done["bend_m"] > 0:
+        story.append(
+            f"it was bent by {done['bend_m']:.1f} m, in the median: the flight's positions took that out "
+            "before the last adjustment"
+        )
     return target
 
 

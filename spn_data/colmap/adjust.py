@@ -31,8 +31,9 @@ _UNCHANGED = 3e-5  # of all
 
 def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, threads: int) -> int:
     """Refine cameras, poses and points in place; how many measurements were found wrong and deleted."""
+    dropped = drop_out_of_view(native)
     straighten(native, threads=threads, refine_principal_point=refine_principal_point)
-    dropped = drop_out_of_view(native) + drop_outliers(native)
+    dropped += drop_out_of_view(native) + drop_outliers(native)
     # What is left of wrong matches shall not bend the model either.
     options = _options(threads, _CAUCHY * residual_sigma_px(native), _UNCHANGED)
     options.refine_principal_point = refine_principal_point
@@ -54,7 +55,6 @@ def straighten(
     """
     for radius in (_LONG_STEPS, _DAMPED):
         few = _with_long_tracks(native)
-        drop_out_of_view(few)
         options = _options(threads, _FIRST_SCALE_PX, decrease)
         options.ceres.solver_options.initial_trust_region_radius = radius
         options.refine_focal_length = options.refine_extra_params = refine_intrinsics

@@ -6,7 +6,7 @@ The functions above `main` run in the parent and know no pycolmap objects, those
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,7 @@ def refine(
     target: Path,
     *,
     images: Path,
+    positions: Mapping[str, Sequence[float]],
     camera_model: str,
     refine_principal_point: bool,
     threads: int,
@@ -86,7 +87,7 @@ def refine(
 ) -> dict[str, Any]:
     """Last bundle adjustments over a whole model, with a fuller camera; returns what it did.
 
-    images : their folder, for the points' colours.
+    images : their folder, for the points' colours; positions : in metres, of those that have one.
     """
     result: dict[str, Any] = {}
     job = {
@@ -94,6 +95,7 @@ def refine(
         "source": str(source),
         "target": str(target),
         "images": str(images),
+        "positions": {name: list(position) for name, position in positions.items()},
         "camera_model": camera_model,
         "refine_principal_point": refine_principal_point,
         "threads": threads,
@@ -158,6 +160,7 @@ def _refine(
     source: str,
     target: str,
     images: str,
+    positions: dict[str, list[float]],
     camera_model: str,
     refine_principal_point: bool,
     threads: int,
@@ -166,18 +169,20 @@ def _refine(
     from spn_data.colmap.adjust import adjust
     from spn_data.colmap.clean import drop_without_depth
     from spn_data.colmap.model import upgrade_camera, write_native
+    from spn_data.colmap.unbend import unbend
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
         upgrade_camera(camera, camera_model)
     before = model.compute_mean_reprojection_error()
+    bend_m = unbend(model, positions)
     dropped = adjust(model, refine_principal_point=refine_principal_point, threads=threads)
     dropped += drop_without_depth(model)
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(images, threads)
     write_native(model, Path(target))
     after = model.compute_mean_reprojection_error()
-    child.send({"error_before_px": before, "error_px": after, "dropped": dropped})
+    child.send({"error_before_px": before, "error_px": after, "dropped": dropped, "bend_m": bend_m})
 
 
 if __name__ == "__main__":
