@@ -11,7 +11,9 @@ from spn_data.colmap.model import Scene
 from spn_data.correspondences import FramesToMap
 from spn_data.epipolar import essential_matrix, sampson_errors
 
-_FITS_PX = 12.0  # epipolar error of a match; a wrong pose leaves a few hundredths of them below it
+# Epipolar error of a match in focal lengths, 12 px of a drone's video; a wrong pose leaves a few hundredths
+# of them below it.
+_FITS = 0.0136
 _SHARE = 0.5  # of a pair's matches that must fit
 
 
@@ -47,8 +49,7 @@ def contradictions(database: MapDatabase, scene: Scene) -> list[Contradiction]:
         matches = database.read_inliers(a, b)
         essential = essential_matrix(scene.poses, row[a], row[b])
         off = sampson_errors(rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential)
-        focal = np.mean([scene.cameras[int(scene.camera_ids[row[i]])].focal_px for i in (a, b)])
-        share = float(np.mean(off * focal < _FITS_PX))
+        share = float(np.mean(off < _FITS))
         if share < _SHARE:
             found.append(Contradiction((a, b), n, share))
     return sorted(found, key=lambda one: -one.matches)

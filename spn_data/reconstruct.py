@@ -11,6 +11,7 @@ import numpy as np
 from spn_data.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
+from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import Scene, count_registered, read_scene
 from spn_data.contradiction import Contradiction, FocalChange, contradictions, focal_changes
 from spn_data.correspondences import FramesToMap, appearance_of, extract_missing, match_missing
@@ -153,19 +154,23 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
     story.append(_tell(attempt, submodels, n))
     if not models:
         return None
-    model, registered, kept = models[0], submodels[0], attempt.database
+    model, kept = models[0], attempt.database
     if attempt.thinned:
         model = _with_all_points(run, attempt, model)
+    model = _without_misplaced(run, kept, model, story)
+    registered = count_registered(model)
     if registered > 2:
         with stopwatch.step("pairs"):
             wider = _pairs(frames, appearance, attempt.pairs.wider())
         for chance in chances(attempt):
             if not 0 < n - registered <= chance.most_missing * n:
                 break
+            told: list[str] = []
             grown = _grow(run.named(chance.name), attempt, chance, wider, model)
+            grown = _without_misplaced(run, chance.database, grown, told)
             gained = count_registered(grown) - registered
             if gained > 0:
-                story.append(f"{chance.what} registered {gained} more")
+                story += [*told, f"{chance.what} registered {gained} more"]
                 registered, model, kept = registered + gained, grown, chance.database
     scene = read_scene(model)
     with MapDatabase.open(work / kept) as database:
@@ -228,6 +233,7 @@ def _map(
             hold_intrinsics=attempt.hold_intrinsics,
             start_from="" if snapshot is None else str(snapshot),
         )
+        run.progress("mapping", 0 if snapshot is None else count_registered(snapshot), n)
         models = run_mapping(
             job,
             log=run.work / "mapping.log",
@@ -261,6 +267,21 @@ def _grow(
         _match(run, database, [p for p in pairs if not missing.isdisjoint(names[k] for k in p)])
     models = _map(run, attempt, chance, start_from=model)
     return max([model, *models], key=count_registered)
+
+
+def _without_misplaced(run: _Run, database: str, model: Path, story: list[str]) -> Path:
+    with run.stopwatch.step("mapping"):
+        with MapDatabase.open(run.work / database) as opened:
+            matches = opened.verified_pairs()
+        target = model.with_name(f"{model.name}-placed")
+        wrong = drop_misplaced(model, target, matches)
+    if not wrong:
+        return model
+    story.append(
+        f"{len(wrong)} of them taken out again, that match others and show next to nothing of the model from "
+        f"where they lay ({', '.join(wrong[:3])}{', ...' if len(wrong) > 3 else ''})"
+    )
+    return target
 
 
 def _refine(run: _Run, model: Path, story: list[str]) -> Path:
