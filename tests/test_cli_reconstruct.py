@@ -6,6 +6,7 @@ import importlib.util
 import shutil
 import sqlite3
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -15,7 +16,7 @@ from click.testing import CliRunner, Result
 import spn_data.reconstruct
 from cli.data import main
 from spn_data.area import FRAMES, GEO, MODEL, Area
-from spn_data.colmap.model import read_scene
+from spn_data.colmap.model import load_native, read_scene, write_native
 from spn_data.contradiction import Contradiction, FocalChange
 from spn_data.frames import read_frames
 from spn_data.record import read_json
@@ -258,3 +259,30 @@ def test_a_model_that_is_contradicted_is_made_again(
     assert notes.count(words) == (3 if stays else 1)
     assert any(note.startswith("steady attempt") for note in notes)
     assert any(note.startswith("dense attempt") for note in notes) == stays
+
+
+@pytest.mark.slow
+def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
+    flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a wrong pose would be, the first time that it is looked for."""
+    name, judged = "flight1/000008.jpg", []
+    drop: Callable[..., list[str]] = spn_data.reconstruct.drop_misplaced
+
+    def drop_one(source: Path, target: Path, matches: dict[tuple[str, str], int]) -> list[str]:
+        judged.append(drop(source, target, matches))
+        if len(judged) > 1:
+            return judged[-1]
+        model = load_native(source)
+        frame_id = next(i.frame_id for i in model.images.values() if i.name == name)
+        model.deregister_frame(frame_id)
+        write_native(model, target)
+        return [name]
+
+    monkeypatch.setattr(spn_data.reconstruct, "drop_misplaced", drop_one)
+    result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
+    assert result.exit_code == 0, result.output
+    assert judged == [[], []]
+    area = Area(tmp_path / "area")
+    assert any(name in note and "taken out again" in note for note in area.record(MODEL).notes)
+    assert name in read_scene(area.folder(MODEL)).names
