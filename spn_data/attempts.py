@@ -19,15 +19,11 @@ class ReconstructOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     engine: str = "incremental"  # or "global"
-    thinned_features: int = (
-        512  # of each image, those matched most, from which poses are found first
-    )
+    thinned_features: int = 512  # of each image, matched most: from which poses are found first
     camera_model: str = "RADIAL"  # of the last bundle adjustments
     refine_principal_point: bool = False
     threads: int = 2  # of the mapper, and worker processes before it
-    cluster: str = (
-        ""  # address of a Dask scheduler, whose workers find features and matches instead
-    )
+    cluster: str = ""  # address of a Dask scheduler, whose workers find features and matches
     seed: int = 0
     enough_share: float = 0.95  # registered, below which all is tried again with more features
     usable_share: float = 0.1  # registered, below which there is no model

@@ -14,9 +14,7 @@ class FeatureOptions:
 
     max_features: int = 4096  # strongest kept per image
     max_image_size_px: int = 1600  # the longer side is reduced to this before detection
-    contrast_threshold: float = (
-        0.02  # OpenCV's; 0.02 finds what COLMAP's peak threshold 0.0067 does
-    )
+    contrast_threshold: float = 0.02  # OpenCV's; finds what COLMAP's peak threshold 0.0067 does
     edge_threshold: float = 10.0  # ratio of principal curvatures above which a point is an edge
 
 

@@ -17,15 +17,11 @@ class MatchOptions:
     min_inliers: int = 15  # of a verified pair
     strongest: int = 1024  # features of each image that tell whether two of them overlap
     telling_matches: int = 30  # of these, from which on they do
-    least_share: float = (
-        0.36  # of these that fit one epipolar geometry, below which two images do not
-    )
+    least_share: float = 0.36  # of these that fit one epipolar geometry, below which they do not
     guided_share: float = 0.6  # from which on the others are sought along epipolar lines
     guided_px: float = 6.0  # to either side of a line
     guided_step: int = 8  # every such feature elsewhere is compared as well
-    guided_ratio: float = (
-        0.7  # in the place of max_ratio there: fewer others give as few wrong matches
-    )
+    guided_ratio: float = 0.7  # in place of max_ratio there: fewer others give as few wrong ones
     seed: int = 0
 
 
