@@ -4,7 +4,7 @@
 
 For each number, a simulated survey looks down from 45 m on an area that is proportionally larger: parallel
 lines 14 m apart, a frame every 7.5 m, 12 houses a hectare, 960x540 pixels. Flights and frames are kept in
-FOLDER, and used again by the next run; 3,000 frames take half an hour to render and as long to reconstruct
+FOLDER, and used again by the next run; 3,000 frames take minutes to render and half an hour to reconstruct
 on two cores. Counted is what `reconstruct.py` counts, child processes included.
 """
 

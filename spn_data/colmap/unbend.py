@@ -18,9 +18,7 @@ from spn_data.errors import GeometryError
 from spn_data.pose import Similarity
 
 _FEWEST = 1000  # positions; smaller models are adjusted as well without
-_LEAST_M = (
-    3.0  # median displacement, below which the positions' own slow errors may look like a bend
-)
+_LEAST_M = 3.0  # median displacement, below which the positions' slow errors may look like a bend
 _LEAST_RATIO = 2.0  # of it to what positions deviate from the bent surface
 _LEAST_WIDTH = 5.0  # of the surface, in these deviations: a straight line says nothing across
 _WRONG = 4.0  # medians, from which a position is left out
