@@ -101,19 +101,28 @@ def _map_large(
     with contextlib.closing(pycolmap.Database.open(job.database)) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, models)
     mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
-    adjusted, interrupted = 0, False  # images at the last adjustment; whether by SIGINT
+    adjusted: dict[int, int] = {}  # images of a model at its last adjustment
+    interrupted = False
 
     def interrupt() -> None:
         nonlocal interrupted
         interrupted = True
 
+    def adjust(number: int) -> None:
+        model = models.get(number)
+        adjusted[number] = model.num_reg_images()
+        mapper.complete_and_merge_tracks(options.get_triangulation())
+        mapper.retriangulate(options.get_triangulation())
+        # By now lenses are known, and one distortion term alone would bend what is straight.
+        straighten(model, threads=job.threads, refine_intrinsics=False, decrease=_CLOSE)
+        mapper.filter_points(options.get_mapper())
+
     def on_next() -> None:
-        nonlocal adjusted
         count.next()
         if interrupted:
             raise KeyboardInterrupt
-        model = models.get(models.size() - 1)
-        images = model.num_reg_images()
+        number = models.size() - 1
+        images = models.get(number).num_reg_images()
         large = images >= _SOLVED_EXACTLY
         # The pipeline looks at these before each of its own.
         options.ba_global_frames_ratio = options.ba_global_points_ratio = (
@@ -121,18 +130,20 @@ def _map_large(
         )
         options.ba_global_max_refinements = 0 if large else 1
         if not large:
-            adjusted = 0
-        elif images >= _GROWTH * adjusted:
-            adjusted = images
-            mapper.complete_and_merge_tracks(options.get_triangulation())
-            mapper.retriangulate(options.get_triangulation())
-            # By now lenses are known, and one distortion term alone would bend what is straight.
-            straighten(model, threads=job.threads, refine_intrinsics=False, decrease=_CLOSE)
-            mapper.filter_points(options.get_mapper())
+            adjusted.pop(number, None)
+        elif images >= _GROWTH * adjusted.get(number, 0):
+            adjust(number)
 
     callbacks = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(int(callbacks.INITIAL_IMAGE_PAIR_REG_CALLBACK), count.initial)
     pipeline.add_callback(int(callbacks.NEXT_IMAGE_REG_CALLBACK), on_next)
     with child.interrupts(interrupt):
         pipeline.reconstruct(mapper, options.get_mapper(), bool(job.start_from))
-    return {i: models.get(i) for i in range(models.size())}
+    made = {i: models.get(i) for i in range(models.size())}
+    # The last images may have closed a loop, and lie metres off on one side of it.
+    for i, model in made.items():
+        if model.num_reg_images() >= max(_SOLVED_EXACTLY, adjusted.get(i, 0) + 1):
+            mapper.begin_reconstruction(model)
+            adjust(i)
+            mapper.end_reconstruction(False)
+    return made
