@@ -118,15 +118,16 @@ def run(
                     camera_file=camera_file,
                     any_telemetry=any_telemetry,
                 )
-                record = stage(
-                    area,
-                    video,
-                    name,
-                    wanted,
-                    live.progress,
-                    dispatch=dispatch_to(cluster, workers),
-                    overwrite=overwrite,
-                )
+                with dispatch_to(cluster, workers) as dispatch:
+                    record = stage(
+                        area,
+                        video,
+                        name,
+                        wanted,
+                        live.progress,
+                        dispatch=dispatch,
+                        overwrite=overwrite,
+                    )
                 live.made(record, before)
                 names = [record.stage.removeprefix(f"{EVALUATION}/")]
             if all_frames:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from spn_data.cluster import dispatch_to
 from spn_data.features import FeatureOptions
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions
-from spn_data.parallel import Dispatch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +25,6 @@ class ReconstructOptions:
     seed: int = 0
     enough_share: float = 0.95  # registered, below which all is tried again with more features
     usable_share: float = 0.1  # registered, below which there is no model
-
-    @property
-    def dispatch(self) -> Dispatch:
-        """Who computes features and matches."""
-        return dispatch_to(self.cluster, self.threads)
 
 
 @dataclass(frozen=True)

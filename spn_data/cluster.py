@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import InputError
-from spn_data.parallel import Batch, Dispatch, WorkerDiedError, run_batches
+from spn_data.parallel import Batch, Dispatch, Team, WorkerDiedError
 
 _CONNECT_S = 10.0
 _WAIT_FOR_WORKERS_S = 30.0
@@ -22,9 +22,14 @@ _AHEAD = 2  # batches that each thread of a worker has, one of them waiting
 _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap")
 
 
-def dispatch_to(address: str, workers: int) -> Dispatch:
+@contextmanager
+def dispatch_to(address: str, workers: int) -> Iterator[Dispatch]:
     """The cluster at an address, or, where that is empty, so many processes of this machine."""
-    return partial(run_on_cluster, address) if address else partial(run_batches, workers=workers)
+    if address:
+        yield partial(run_on_cluster, address)
+    else:
+        with Team(workers) as team:
+            yield team.run
 
 
 def run_on_cluster(
@@ -33,7 +38,7 @@ def run_on_cluster(
     batches: Iterable[Batch],
     on_result: Callable[[Any], None],
 ) -> None:
-    """As `parallel.run_batches`, by the workers of the scheduler at an address (tcp://host:8786).
+    """As `parallel.Team.run`, by the workers of the scheduler at an address (tcp://host:8786).
 
     Arguments travel with each call and results come back. Calls of a worker that dies are done again by
     others; WorkerDiedError names a batch that four of them died of. Raises InputError where there is no such

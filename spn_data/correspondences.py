@@ -7,14 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from spn_data.camera import Camera
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
-from spn_data.errors import InputError
-from spn_data.features import FeatureOptions, Features, extract
+from spn_data.features import FeatureOptions, Features, extract_from_bytes
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
 from spn_data.parallel import Dispatch
@@ -66,22 +64,6 @@ def extract_missing(
         progress("features", done, len(frames.names))
 
     dispatch(extract_from_bytes, batches(), store)
-
-
-def extract_from_bytes(
-    name: str, image: bytes, mask: bytes | None, options: FeatureOptions
-) -> tuple[str, Features]:
-    """Features of an encoded image. Pure: the same bytes give the same features anywhere."""
-    gray = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
-        raise InputError("is no image that can be decoded", path=name)
-    use = None
-    if mask is not None:
-        decoded = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if decoded is None:
-            raise InputError("its mask is no image that can be decoded", path=name)
-        use = decoded > 127
-    return name, extract(gray, use, options)
 
 
 _FRAMES_OF_VOCABULARY = 200  # whose descriptors its words are drawn from

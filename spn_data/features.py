@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from spn_data.errors import InputError
+
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureOptions:
@@ -32,6 +34,22 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+
+def extract_from_bytes(
+    name: str, image: bytes, mask: bytes | None, options: FeatureOptions
+) -> tuple[str, Features]:
+    """Features of an encoded image. Pure: the same bytes give the same features anywhere."""
+    gray = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if gray is None:
+        raise InputError("is no image that can be decoded", path=name)
+    use = None
+    if mask is not None:
+        decoded = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if decoded is None:
+            raise InputError("its mask is no image that can be decoded", path=name)
+        use = decoded > 127
+    return name, extract(gray, use, options)
 
 
 def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) -> Features:

@@ -32,24 +32,63 @@ def match_descriptors(
     descriptors_a: np.ndarray, descriptors_b: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
     """Matches (M, 2) uint32 of row indices into two (N, 128) uint8 RootSIFT arrays."""
-    if len(descriptors_a) == 0 or len(descriptors_b) < 2:
-        return np.zeros((0, 2), np.uint32)
-    a = unit_descriptors(descriptors_a)
-    b_transposed = np.ascontiguousarray(unit_descriptors(descriptors_b).T)
-    best_of_b = np.full(b_transposed.shape[1], -1.0, np.float32)
-    nearest = np.empty(len(a), np.int64)
-    first = np.empty(len(a), np.float32)
-    second = np.empty(len(a), np.float32)
-    for start in range(0, len(a), _ROWS):
-        similarity = a[start : start + _ROWS] @ b_transposed
-        rows = np.arange(len(similarity))
-        block = slice(start, start + len(similarity))
-        np.maximum(best_of_b, similarity.max(axis=0), out=best_of_b)
-        nearest[block] = similarity.argmax(axis=1)
-        first[block] = similarity[rows, nearest[block]]
-        similarity[rows, nearest[block]] = -1.0
-        second[block] = similarity.max(axis=1)
-    return mutual_matches(nearest, first, second, best_of_b, options)
+    comparison = Comparison(descriptors_a, descriptors_b)
+    comparison.extend(max(len(descriptors_a), len(descriptors_b)))
+    return comparison.matches(options)
+
+
+class Comparison:
+    """All with all of the first n descriptors of two images, where n can grow: nothing is compared twice."""
+
+    def __init__(self, descriptors_a: np.ndarray, descriptors_b: np.ndarray) -> None:
+        """(N, 128) and (K, 128) uint8 RootSIFT."""
+        self._descriptors = descriptors_a, descriptors_b
+        # Of unit length, as far as they are compared; rows of one and columns of the other.
+        self._a = np.empty(descriptors_a.shape, np.float32)
+        self._b = np.empty(descriptors_b.T.shape, np.float32)
+        self._compared = 0, 0
+        self._nearest = np.zeros(len(descriptors_a), np.int64)
+        self._first, self._second = (
+            np.full(len(descriptors_a), -1.0, np.float32) for _ in range(2)
+        )
+        self._best_of_b = np.full(len(descriptors_b), -1.0, np.float32)
+
+    def extend(self, n: int) -> None:
+        """Compare the first n of each, or all where there are fewer."""
+        a, b = self._descriptors
+        rows, columns = self._compared
+        self._compared = min(n, len(a)), min(n, len(b))
+        new_rows, new_columns = slice(rows, self._compared[0]), slice(columns, self._compared[1])
+        self._a[new_rows] = unit_descriptors(a[new_rows])
+        self._b[:, new_columns] = unit_descriptors(b[new_columns]).T
+        self._compare(slice(0, rows), new_columns)
+        self._compare(new_rows, slice(0, new_columns.stop))
+
+    def _compare(self, rows: slice, columns: slice) -> None:
+        if columns.start >= columns.stop:
+            return
+        best_of_b = self._best_of_b[columns]
+        for start in range(rows.start, rows.stop, _ROWS):
+            block = slice(start, min(start + _ROWS, rows.stop))
+            similarity = self._a[block] @ self._b[:, columns]
+            np.maximum(best_of_b, similarity.max(axis=0), out=best_of_b)
+            each, best = np.arange(len(similarity)), similarity.argmax(axis=1)
+            first = similarity[each, best]
+            similarity[each, best] = -1.0
+            second = np.maximum(similarity.max(axis=1), np.minimum(first, self._first[block]))
+            self._second[block] = np.maximum(self._second[block], second)
+            nearer = first > self._first[block]
+            self._nearest[block][nearer] = columns.start + best[nearer]
+            self._first[block][nearer] = first[nearer]
+
+    def matches(self, options: MatchOptions) -> np.ndarray:
+        """(M, 2) uint32 row indices of those compared so far: mutual nearest that pass the ratio test."""
+        rows, columns = self._compared
+        if rows == 0 or columns < 2:
+            return np.zeros((0, 2), np.uint32)
+        return mutual_matches(
+            self._nearest[:rows], self._first[:rows], self._second[:rows], self._best_of_b, options
+        )
 
 
 def mutual_matches(

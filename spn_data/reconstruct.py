@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
+from spn_data.cluster import dispatch_to
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
@@ -20,6 +21,7 @@ from spn_data.errors import StageError
 from spn_data.features import FeatureOptions
 from spn_data.files import write_whole
 from spn_data.pairs import PairOptions, choose_pairs
+from spn_data.parallel import Dispatch
 from spn_data.timing import Progress, Stopwatch
 
 _DRIFTED = 1.5  # ratio of focal lengths; a video cropped for stabilisation has 1.1 to 1.4
@@ -32,6 +34,7 @@ class _Run:
     frames: FramesToMap
     work: Path
     options: ReconstructOptions
+    dispatch: Dispatch  # who computes features and matches
     progress: Progress
     stopwatch: Stopwatch
 
@@ -104,17 +107,10 @@ def reconstruct(
 
     Raises StageError where fewer than three images, or less than `usable_share` of them, register.
     """
-    run = _Run(frames, work, options, progress, stopwatch)
-    best: _Candidate | None = None
     story: list[str] = []
-    for attempt in attempts(options):
-        found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, story)
-        if found is None:
-            continue
-        if best is None or found.rank > best.rank:
-            best = found
-        if found.sound and found.registered >= options.enough_share * len(frames.names):
-            break
+    with dispatch_to(options.cluster, options.threads) as dispatch:
+        run = _Run(frames, work, options, dispatch, progress, stopwatch)
+        best = _best_attempt(run, story)
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
         raise StageError(_no_model(work, frames, 0 if best is None else best.registered, story))
     refined = _refine(run, best.model, story)
@@ -132,6 +128,21 @@ def reconstruct(
         verified,
         read_scene(refined),
     )
+
+
+def _best_attempt(run: _Run, story: list[str]) -> _Candidate | None:
+    """The first attempt that is good enough, or else the best of all."""
+    options = run.options
+    best: _Candidate | None = None
+    for attempt in attempts(options):
+        found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, story)
+        if found is None:
+            continue
+        if best is None or found.rank > best.rank:
+            best = found
+        if found.sound and found.registered >= options.enough_share * len(run.frames.names):
+            break
+    return best
 
 
 def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
@@ -185,7 +196,7 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
 
 def _extract(run: _Run, database: MapDatabase, features: FeatureOptions) -> None:
     with run.stopwatch.step("features"):
-        extract_missing(database, run.frames, features, run.options.dispatch, run.progress)
+        extract_missing(database, run.frames, features, run.dispatch, run.progress)
 
 
 def _pairs(
@@ -195,9 +206,9 @@ def _pairs(
 
 
 def _match(run: _Run, database: MapDatabase, pairs: list[tuple[int, int]]) -> None:
-    options = run.options
+    matching = run.options.matching
     with run.stopwatch.step("matching"):
-        match_missing(database, run.frames, pairs, options.matching, options.dispatch, run.progress)
+        match_missing(database, run.frames, pairs, matching, run.dispatch, run.progress)
 
 
 def _map(

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from spn_data.parallel import living_workers_cpu_seconds
+
 # Called with the step's name, what is done, and the total (0 where that is not known).
 Progress = Callable[[str, int, int], None]
 
@@ -30,6 +32,6 @@ class Stopwatch:
 
 
 def cpu_seconds() -> float:
-    """CPU seconds of this process and of the children that have ended."""
+    """CPU seconds of this process, of children that have ended, and of workers up to their last answer."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in used)
+    return sum(usage.ru_utime + usage.ru_stime for usage in used) + living_workers_cpu_seconds()

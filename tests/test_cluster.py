@@ -22,9 +22,8 @@ from spn_data.area import EVALUATION, MODEL, Area
 from spn_data.cluster import fingerprint, run_on_cluster
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene
-from spn_data.correspondences import extract_from_bytes
 from spn_data.errors import InputError
-from spn_data.features import FeatureOptions
+from spn_data.features import FeatureOptions, extract_from_bytes
 from spn_data.labels import read_labels
 from spn_data.pipeline.labels import POSES
 from spn_data.pipeline.model import DATABASE

@@ -11,7 +11,7 @@ from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.features import Features
 from spn_data.guided_matching import match_along_lines
-from spn_data.matching import MatchOptions, match_descriptors
+from spn_data.matching import Comparison, MatchOptions
 
 _ITERATIONS = 1000  # of its estimation, at most
 
@@ -77,7 +77,7 @@ def _match_pair(
         native_camera(b.camera, focal_is_known=b.focal_is_known),
         b.features.keypoints[:, :2].astype(np.float64),
         fitting,
-        verification_options(options),
+        verification_options(options, len(fitting)),
     )
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
     if len(inliers) < options.min_inliers:
@@ -94,9 +94,11 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
     The strongest features tell first, for a sixteenth of the cost, then twice as many, and so on: most pairs
     end here. Of those that surely overlap the other features are compared along epipolar lines alone.
     """
+    comparison = Comparison(a.descriptors, b.descriptors)
     fundamental, n = None, options.strongest
     while n < min(len(a), len(b)):
-        first = match_descriptors(a.descriptors[:n], b.descriptors[:n], options)
+        comparison.extend(n)
+        first = comparison.matches(options)
         n *= 2
         if len(first) < options.telling_matches:
             continue
@@ -107,7 +109,8 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
             fundamental = found
             break
     if fundamental is None:
-        matches = match_descriptors(a.descriptors, b.descriptors, options)
+        comparison.extend(max(len(a), len(b)))
+        matches = comparison.matches(options)
     else:
         points = a.keypoints[:, :2], b.keypoints[:, :2]
         matches = match_along_lines(
@@ -147,12 +150,15 @@ def _epipolar_geometry(
     return fundamental, fits.ravel().astype(bool)
 
 
-def verification_options(options: MatchOptions) -> pycolmap.TwoViewGeometryOptions:
+def verification_options(options: MatchOptions, matches: int) -> pycolmap.TwoViewGeometryOptions:
+    """COLMAP's, for so many matches."""
     native = pycolmap.TwoViewGeometryOptions()
     native.min_num_inliers = options.min_inliers
     # On-screen display and propellers are masked; a static flat border is no watermark in drone video.
     native.detect_watermark = False
     native.ransac.max_error = options.max_error_px
     native.ransac.min_num_trials = 30  # what does not fit is gone before
+    # With fewer inliers a pair is not verified: no samples are drawn to find them.
+    native.ransac.min_inlier_ratio = max(0.25, min(1.0, options.min_inliers / max(1, matches)))
     native.ransac.random_seed = options.seed
     return native
