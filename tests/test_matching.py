@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from spn_data.camera import Camera
-from spn_data.colmap.verify import ImageForMatching, match_pairs
+from spn_data.colmap import pycolmap
+from spn_data.colmap.verify import ImageForMatching, match_pairs, verification_options
 from spn_data.features import FeatureOptions, Features, extract
-from spn_data.matching import MatchOptions, match_descriptors
+from spn_data.matching import Comparison, MatchOptions, match_descriptors
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,22 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
     assert len(found ^ expected) <= 2
 
 
+def test_a_comparison_that_grows_ends_in_the_matches_of_all_at_once() -> None:
+    """At every size, also where one image has no more to compare."""
+    rng = np.random.default_rng(5)
+    a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
+    of_a = np.concatenate([rng.permutation(400), np.arange(50)])  # the last ones a second time
+    b = np.clip(a[of_a] + rng.normal(0, 15, size=(450, 128)), 0, 255).astype(np.uint8)
+    comparison = Comparison(a, b)
+    assert len(comparison.matches(MatchOptions())) == 0
+    for n in (1, 100, 300, 500, 700):
+        comparison.extend(n)
+        expected = match_descriptors(a[:n], b[:n], MatchOptions())
+        assert np.array_equal(comparison.matches(MatchOptions()), expected)
+    assert len(expected) > 300
+    assert (expected[:, 0] < 50).sum() < 10, "most doubles pass no ratio test"
+
+
 def test_no_feature_is_matched_twice() -> None:
     same = np.tile(np.arange(128, dtype=np.uint8), (5, 1))
     other = np.random.default_rng(1).integers(0, 255, (50, 128)).astype(np.uint8)
@@ -126,6 +143,14 @@ def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
     assert len(pair.matches) == 30
     assert len(pair.inliers) == 0
+
+
+def test_no_samples_are_drawn_to_find_fewer_inliers_than_verify_a_pair() -> None:
+    options = MatchOptions()
+    few = verification_options(options, 25).ransac
+    many = verification_options(options, 1000).ransac
+    assert few.min_inlier_ratio == pytest.approx(15 / 25)
+    assert many.min_inlier_ratio == pycolmap.TwoViewGeometryOptions().ransac.min_inlier_ratio
 
 
 def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -11,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.parallel import WorkerDiedError, run_batches
+from spn_data.parallel import Team, WorkerDiedError, run_batches
+from spn_data.timing import cpu_seconds
 
 
 def square(x: int) -> int:
@@ -38,6 +40,21 @@ def fail(x: int) -> int:
 
 def blas_threads() -> str:
     return os.environ["OPENBLAS_NUM_THREADS"]
+
+
+def work_for(cpu_s: float) -> int:
+    end = time.process_time() + cpu_s
+    while time.process_time() < end:
+        pass
+    return os.getpid()
+
+
+def held_mb_before(allocating_mb: int) -> float:
+    """What the process holds when it is called; then it allocates so much, and frees it."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    held_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
+    bytearray(allocating_mb * 2**20)
+    return held_kb / 1024
 
 
 def test_every_result_arrives_once() -> None:
@@ -72,6 +89,47 @@ def test_workers_compute_on_one_thread() -> None:
     results: list[str] = []
     run_batches(blas_threads, [("a", ())], workers=1, on_result=results.append)
     assert results == ["1"]
+
+
+def test_workers_stay_from_one_run_to_the_next_and_end_with_their_team() -> None:
+    first: list[int] = []
+    second: list[int] = []
+    with Team(2) as team:
+        team.run(work_for, [(str(k), (0.1,)) for k in range(4)], first.append)
+        team.run(work_for, [(str(k), (0.1,)) for k in range(4)], second.append)
+    assert len(set(first)) == 2
+    assert set(second) == set(first)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in set(first))
+
+
+def test_a_team_works_on_after_an_exception() -> None:
+    results: list[int] = []
+    with Team(2) as team:
+        with pytest.raises(ValueError, match="no 1"):
+            team.run(fail, [("1", (1,))], print)
+        team.run(square, [("3", (3,))], results.append)
+    assert results == [9]
+
+
+def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
+    before = cpu_seconds()
+    with Team(1) as team:
+        team.run(work_for, [("a", (1.0,))], print)
+        living = cpu_seconds() - before
+    ended = cpu_seconds() - before
+    assert living > 1.0
+    assert living - 0.1 < ended < living + 0.7  # what it takes to end, and what it took to start
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do as they like")
+def test_a_worker_keeps_its_memory_from_call_to_call_and_gives_it_back_when_it_idles() -> None:
+    held: list[float] = []
+    with Team(1) as team:
+        team.run(held_mb_before, [("a", (200,)), ("b", (200,))], held.append)
+        time.sleep(1.5)
+        team.run(held_mb_before, [("c", (0,))], held.append)
+    assert held[1] > held[0] + 190
+    assert held[2] < held[0] + 50
 
 
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:

@@ -159,6 +159,7 @@ def verification_options(options: MatchOptions, matches: int) -> pycolmap.TwoVie
     native.ransac.max_error = options.max_error_px
     native.ransac.min_num_trials = 30  # what does not fit is gone before
     # With fewer inliers a pair is not verified: no samples are drawn to find them.
-    native.ransac.min_inlier_ratio = max(0.25, min(1.0, options.min_inliers / max(1, matches)))
+    least = options.min_inliers / matches
+    native.ransac.min_inlier_ratio = max(native.ransac.min_inlier_ratio, least)
     native.ransac.random_seed = options.seed
     return native
