@@ -165,10 +165,7 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
     story.append(_tell(attempt, submodels, n))
     if not models:
         return None
-    model, kept = models[0], attempt.database
-    if attempt.thinned:
-        model = _with_all_points(run, attempt, model)
-    model = _without_misplaced(run, kept, model, story)
+    model, kept = _settled(run, attempt, models[0], story), attempt.database
     registered = count_registered(model)
     if registered > 2:
         with stopwatch.step("pairs"):
@@ -252,6 +249,24 @@ def _map(
         )
     write_whole(done, json.dumps([model.name for model in models]))
     return models
+
+
+def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path:
+    """The model with the points of all matches and without misplaced frames.
+
+    Made once: the chances that follow add matches to the database, and an interrupted run that made it anew
+    would go on from another model.
+    """
+    done = run.work / f"mapping-{attempt.name}" / "settled.json"
+    if not done.exists():
+        told: list[str] = []
+        if attempt.thinned:
+            model = _with_all_points(run, attempt, model)
+        model = _without_misplaced(run, attempt.database, model, told)
+        write_whole(done, json.dumps({"model": str(model.relative_to(run.work)), "told": told}))
+    found = json.loads(done.read_text())
+    story += found["told"]
+    return run.work / found["model"]
 
 
 def _with_all_points(run: _Run, attempt: Attempt, model: Path) -> Path:

@@ -9,7 +9,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -251,8 +253,7 @@ def test_a_model_that_is_contradicted_is_made_again(
     """The first time, as a wrong one would be, or each time: all attempts are made then, and it is told."""
     answers = [[wrong]] * 3 if stays else [[wrong], []]
     monkeypatch.setattr(spn_data.reconstruct, judge, lambda *_: answers.pop(0))
-    options = ("--max-features", "800", "--threads", "1", "--fov", "72")
-    result = run("reconstruct", flight1, "--area", tmp_path / "area", *options)
+    result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
     assert result.exit_code == 0, result.output
     assert answers == []
     notes = Area(tmp_path / "area").record(MODEL).notes
@@ -261,28 +262,63 @@ def test_a_model_that_is_contradicted_is_made_again(
     assert any(note.startswith("dense attempt") for note in notes) == stays
 
 
-@pytest.mark.slow
-def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
-    flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a wrong pose would be, the first time that it is looked for."""
-    name, judged = "flight1/000008.jpg", []
+_MISPLACED = "flight1/000008.jpg"
+
+
+@pytest.fixture
+def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """A frame is found to be misplaced in the first model; what the real judgement says of each model."""
+    judged: list[list[str]] = []
     drop: Callable[..., list[str]] = spn_data.reconstruct.drop_misplaced
 
     def drop_one(source: Path, target: Path, matches: dict[tuple[str, str], int]) -> list[str]:
         judged.append(drop(source, target, matches))
-        if len(judged) > 1:
+        if any(part.endswith("-again") for part in source.parts):
             return judged[-1]
         model = load_native(source)
-        frame_id = next(i.frame_id for i in model.images.values() if i.name == name)
+        frame_id = next(i.frame_id for i in model.images.values() if i.name == _MISPLACED)
         model.deregister_frame(frame_id)
         write_native(model, target)
-        return [name]
+        return [_MISPLACED]
 
     monkeypatch.setattr(spn_data.reconstruct, "drop_misplaced", drop_one)
+    return judged
+
+
+@pytest.mark.slow
+def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
+    flight1: Path, tmp_path: Path, misplaced: list[list[str]]
+) -> None:
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
     assert result.exit_code == 0, result.output
-    assert judged == [[], []]
+    assert misplaced == [[], []]
     area = Area(tmp_path / "area")
-    assert any(name in note and "taken out again" in note for note in area.record(MODEL).notes)
-    assert name in read_scene(area.folder(MODEL)).names
+    assert any(_MISPLACED in n and "taken out again" in n for n in area.record(MODEL).notes)
+    assert _MISPLACED in read_scene(area.folder(MODEL)).names
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("misplaced")
+def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_poses(
+    flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By then the database holds more matches than the first model was made of."""
+    match = spn_data.reconstruct.match_missing
+    matched = []
+
+    def match_and_stop(*arguments: Any) -> None:
+        match(*arguments)
+        matched.append(arguments)
+        if len(matched) == 2:
+            raise KeyboardInterrupt
+
+    whole, area = Area(tmp_path / "whole"), Area(tmp_path / "area")
+    assert run("reconstruct", flight1, "--area", whole.root, *FAST).exit_code == 0
+    monkeypatch.setattr(spn_data.reconstruct, "match_missing", match_and_stop)
+    assert run("reconstruct", flight1, "--area", area.root, *FAST).exit_code == 130
+    result = run("reconstruct", flight1, "--area", area.root, *FAST)
+    assert result.exit_code == 0, result.output
+    one, other = (read_scene(a.folder(MODEL)) for a in (whole, area))
+    assert one.names == other.names
+    np.testing.assert_allclose(one.poses.centers, other.poses.centers, rtol=0, atol=1e-9)
+    assert area.record(MODEL).notes == whole.record(MODEL).notes

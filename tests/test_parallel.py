@@ -166,11 +166,12 @@ def test_ctrl_c_at_any_moment_ends_it_though_answers_are_under_way(tmp_path: Pat
     """A worker killed in the middle of a large answer leaves half of it in the pipe."""
     script = tmp_path / "parent.py"
     script.write_text(
-        "import sys\n"
+        "import signal, sys\n"
         "from spn_data.parallel import run_batches\n"
         "def answer(size):\n"
         "    return bytes(size)\n"
         "if __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run behind '&'\n"
         "    batches = ((str(k), (6_000_000,)) for k in range(100_000))\n"
         "    try:\n"
         "        run_batches(answer, batches, workers=2, on_result=lambda r: print('go', flush=True))\n"
