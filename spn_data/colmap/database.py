@@ -152,12 +152,12 @@ class MapDatabase:
         return np.asarray(matches, dtype=np.int64).reshape(-1, 2)
 
     def write_thinned(self, target: Path, features: int) -> None:
-        """A database with the verified matches among the telling `features` of each image alone.
+        """A database with the telling `features` of each image alone, and the verified matches among them.
 
         Those tell that most pairs match. What repeats, as windows do, matches in one wrong pair or another,
-        so that wrong pairs lose more than right ones; images that match little keep all. Images, cameras and
-        indices of features are the same; a file that lies at `target` is replaced. Raises StageError where
-        the disk is full.
+        so that wrong pairs lose more than right ones; images that match little keep all. Images and cameras
+        are the same, features are numbered anew in the same order; a file that lies at `target` is replaced.
+        Raises StageError where the disk is full.
         """
         source = self._native
         pairs = [(self.ids[a], self.ids[b], n) for (a, b), n in self.verified_pairs().items()]
@@ -169,18 +169,23 @@ class MapDatabase:
             matches = source.read_two_view_geometry(first, second).inlier_matches
             matched[first][matches[:, 0]] += 1
             matched[second][matches[:, 1]] += 1
-        kept = {image_id: np.zeros(len(count), bool) for image_id, count in matched.items()}
-        for image_id, count in matched.items():  # the stronger of equal ones
-            kept[image_id][np.argsort(-count, kind="stable")[:features]] = True
-        size = sum(8 * n for *_, n in pairs) + sum(16 * len(k) for k in kept.values())
+        kept = {  # the stronger of equal ones
+            image_id: np.sort(np.argsort(-count, kind="stable")[:features])
+            for image_id, count in matched.items()
+        }
+        numbers = {image_id: np.full(len(count), -1) for image_id, count in matched.items()}
+        for image_id, rows in kept.items():
+            numbers[image_id][rows] = np.arange(len(rows))
+        size = sum(8 * n for *_, n in pairs) + sum(16 * len(rows) for rows in kept.values())
         with self._write_images(target, size) as thin:
-            for image_id in self.ids.values():
-                thin.write_keypoints(image_id, source.read_keypoints(image_id))
+            for image_id, rows in kept.items():
+                thin.write_keypoints(image_id, source.read_keypoints(image_id)[rows])
             for first, second, _ in pairs:
                 geometry = source.read_two_view_geometry(first, second)
-                matches = geometry.inlier_matches
-                both = kept[first][matches[:, 0]] & kept[second][matches[:, 1]]
-                geometry.inlier_matches = matches[both]
+                one, other = geometry.inlier_matches.T
+                matches = np.stack([numbers[first][one], numbers[second][other]], axis=1)
+                both = (matches >= 0).all(axis=1)
+                geometry.inlier_matches = matches[both].astype(np.uint32)
                 thin.write_two_view_geometry(first, second, geometry)
 
     def write_without(self, target: Path, names: Sequence[str]) -> None:

@@ -102,6 +102,7 @@ def _map_large(
         pipeline = pycolmap.IncrementalPipeline(options, database, models)
     mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
     adjusted: dict[int, int] = {}  # images of a model at its last adjustment
+    local_refinements = options.ba_local_max_refinements
     interrupted = False
 
     def interrupt() -> None:
@@ -129,6 +130,8 @@ def _map_large(
             _NEVER if large else _GROWTH
         )
         options.ba_global_max_refinements = 0 if large else 1
+        # Before each adjustment, however local, COLMAP goes through the whole model to see that it is valid.
+        options.ba_local_max_refinements = 1 if large else local_refinements
         if not large:
             adjusted.pop(number, None)
         elif images >= _GROWTH * adjusted.get(number, 0):

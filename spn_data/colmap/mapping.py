@@ -64,7 +64,10 @@ def latest_snapshot(snapshots: Path) -> Path | None:
 
 
 def triangulate(source: Path, target: Path, *, database: Path, log: Path) -> None:
-    """The model in `source` with the points of all matches in `database`, its poses as they are."""
+    """The cameras and poses in `source`, as they are, with the points of all matches in `database`.
+
+    Features may be others than those of `source`; images and cameras are the same.
+    """
     job = {
         "task": "triangulate",
         "source": str(source),
@@ -142,9 +145,15 @@ def _triangulate(source: str, target: str, database: str) -> None:
     from spn_data.colmap import pycolmap
     from spn_data.colmap.model import write_native
 
-    model = pycolmap.Reconstruction(source)
+    posed, model = pycolmap.Reconstruction(source), pycolmap.Reconstruction()
     with contextlib.closing(pycolmap.Database.open(database)) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    model.load(cache)
+    for camera_id, camera in posed.cameras.items():
+        model.cameras[camera_id].params = camera.params
+    for frame_id in posed.reg_frame_ids():
+        model.frames[frame_id].rig_from_world = posed.frames[frame_id].rig_from_world
+        model.register_frame(frame_id)
     mapper = pycolmap.IncrementalMapper(cache)
     options = pycolmap.IncrementalTriangulatorOptions()
     mapper.begin_reconstruction(model)
