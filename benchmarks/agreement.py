@@ -18,9 +18,9 @@ from rich.console import Console
 
 from spn_data.area import GEO, Area
 from spn_data.colmap.model import Scene, read_scene
-from spn_data.geodesy import GeoOrigin
+from spn_data.geometry.geodesy import GeoOrigin
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegister.result import GeoFit
-from spn_data.pose import Poses, Similarity, pose_errors
 from spn_data.record import read_json
 
 

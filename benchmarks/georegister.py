@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
 from spn_data.georegister import (
     GeoFit,
     GeoregisterOptions,
@@ -31,7 +32,6 @@ from spn_data.georegister import (
     georegistration_errors,
 )
 from spn_data.georegister.uncertainty import radius_sigma
-from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
 from spn_data.simulate.flight import FlightPath, simulate_paths, simulate_telemetry
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset

@@ -27,7 +27,7 @@ import numpy as np
 
 from spn_data.area import GEO, MODEL, Area
 from spn_data.colmap.model import read_scene
-from spn_data.pose import Similarity, pose_errors
+from spn_data.geometry.pose import Similarity, pose_errors
 
 _TICKS = os.sysconf("SC_CLK_TCK")
 STEPS = ("analysis", "frames", "features", "matching", "mapping", "refinement", "time offset")

@@ -20,10 +20,10 @@ from rich.table import Table
 from spn_data.area import FRAMES, GEO, MODEL, Area
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.frames import Frames, read_frames
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels
-from spn_data.pose import Poses, Similarity, pose_errors
 from spn_data.record import read_json
 from spn_data.simulate.truth import read_truth
 

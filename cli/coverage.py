@@ -87,9 +87,9 @@ def coverage(
     Example:
         spn-data coverage --area fields/north --fly-again again.csv
     """
-    from spn_data.camera_file import read_camera
     from spn_data.coverage import Stratum
     from spn_data.files import write_csv
+    from spn_data.geometry.camera_file import read_camera
     from spn_data.pipeline.coverage import CoverageStageOptions, check_new, cover_area
     from spn_data.refly import ReflyOptions
 

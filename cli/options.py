@@ -178,7 +178,7 @@ def geo_options(
     ignore_gimbal: bool,
 ) -> GeoStageOptions:
     """What those options say."""
-    from spn_data.geodesy import HeightReference
+    from spn_data.geometry.geodesy import HeightReference
     from spn_data.georegister.options import GeoregisterOptions, Heights
     from spn_data.pipeline.geo import GeoStageOptions
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spn_data.camera import MODELS, Camera
 from spn_data.colmap.model import Observations, Scene
-from spn_data.least_squares import (
+from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.least_squares import (
     POSE,
     lens_mixing,
     point_whitening,

@@ -15,7 +15,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.files import write_whole
-from spn_data.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses, canonical_quats
 
 TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (
     f"dataset_{part}.txt" for part in ("train", "validation", "test")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
 from spn_data.features import FeatureOptions, Features, extract_from_bytes
+from spn_data.geometry.camera import Camera
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
 from spn_data.parallel import Dispatch

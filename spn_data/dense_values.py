@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.camera import Camera
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from spn_data.errors import FormatError, InputError
+from spn_data.geometry.pose import Poses
 from spn_data.hdf5_schema import (
     COLUMNS,
     FORMAT,
@@ -25,7 +26,6 @@ from spn_data.hdf5_schema import (
     Role,
     flag,
 )
-from spn_data.pose import Poses
 
 _MAX_GROUPS = 10_000
 _MAX_SIDE_PX = 65_536

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json, camera_to_json
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json, camera_to_json
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from spn_data.camera import Camera
 from spn_data.colmap.model import Observations, Scene
-from spn_data.least_squares import (
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.least_squares import (
     LENS,
     POSE,
     point_whitening,

@@ -9,8 +9,8 @@ from scipy.interpolate import CubicSpline
 
 from spn_data.colmap.model import Observations, Scene
 from spn_data.frame_jitter import frame_jitter
-from spn_data.least_squares import POSE
-from spn_data.pose import Poses
+from spn_data.geometry.least_squares import POSE
+from spn_data.geometry.pose import Poses
 from spn_data.residual_fit import Block, Partialled, linearize, partial_out, solve_spd
 
 _KINDS = ("zoom", "shear", "stretch")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from spn_data.camera import Camera
-from spn_data.grouping import number_within
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.grouping import number_within
+from spn_data.geometry.pose import Poses
 from spn_data.timing import Progress
 
 _BORDER_STEPS = 17

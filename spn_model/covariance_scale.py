@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from spn_data.errors import GeometryError
-from spn_data.pose import Poses, rotation_vectors
+from spn_data.geometry.pose import Poses, rotation_vectors
 from spn_model.calibration import DOF, squared_distances
 from spn_model.members.member import PoseEstimates
 

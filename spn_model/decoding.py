@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors
 
 # Of the robust weight in each step, in units of its last: a start some pixels off finds its way.
 _REACH = (4.0, 2.0, *[1.0] * 10)

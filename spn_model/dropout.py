@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from spn_data.pose import Poses, rotation_vectors
+from spn_data.geometry.pose import Poses, rotation_vectors
 from spn_model.baselines import mean_pose
 from spn_model.members.member import Member, PoseEstimates
 

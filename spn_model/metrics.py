@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from spn_data.coverage import CoverageOptions, nearest_frames
+from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors
 from spn_data.hdf5_schema import DatasetInfo
-from spn_data.pose import Poses, pose_errors, rotation_vectors
 from spn_model.calibration import Calibration, calibrate, sigmas, squared_distances
 
 ENU = ("east", "north", "up")
@@ -69,7 +69,7 @@ class Estimates:
 class FrameErrors:
     """Of N frames; NaN where there is no pose, or no covariance.
 
-    error_m, error_deg : (N,) as `spn_data.pose.pose_errors`. signed_m : (N, 3), estimated minus true
+    error_m, error_deg : (N,) as `spn_data.geometry.pose.pose_errors`. signed_m : (N, 3), estimated minus true
     centre: negative up is too low. sigma_m, sigma_deg : (N,) stated. distance_sq : (N,) e^T C^-1 e.
     """
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from spn_data.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses, canonical_quats
 
 _ONE_PLACE = 1e-6  # spread, in the world's unit, below which all poses are at one place
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model import svg
 from spn_model.metrics import Estimates, EvaluationFrames
 from spn_model.svg import COLOURS, GRID, INK, SOFT

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model.members.member import Member, PoseEstimates
 from spn_model.metrics import Estimates, frame_errors, quantile
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json, camera_to_json
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json, camera_to_json
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.hdf5_schema import Role
 from spn_data.record import content_fingerprint
 

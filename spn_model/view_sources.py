@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model.ground import Ground, level_ground
 from spn_model.training_set import TrainingSet
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors
 from spn_model.point_targets import Surface, cell_centers
 
 _NEAREST = 0.5  # depth, in metres, before which nothing is drawn

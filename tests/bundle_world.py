@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
 from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import Checkpoint
 from spn_model.members.scene_coordinates import SceneCoordinatesMember

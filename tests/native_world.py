@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import native_camera
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 
 
 def native_model(

@@ -7,12 +7,12 @@ import base64
 import numpy as np
 
 from spn_data import audit
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles
 from spn_data.georegister.crossval import HeldOut
 from spn_data.georegister.result import FitSummary, GeoFit
 from spn_data.georegister.uncertainty import Uncertainty
 from spn_data.map_points import MapPoints
-from spn_data.pose import Poses, Similarity, rotations_from_angles
 from spn_data.record import StageRecord
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.split import Split, SplitOptions

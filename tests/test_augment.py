@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
-from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, rotations_from_vectors
 from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
 
 SIZE = (480, 271)  # an odd height: halving it is not exactly by two

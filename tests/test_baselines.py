@@ -10,7 +10,7 @@ import pytest
 
 from spn_data.cambridge import read_cambridge
 from spn_data.errors import GeometryError
-from spn_data.pose import Poses, pose_errors, quats_from_rotations, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors, quats_from_rotations, rotations_from_vectors
 from spn_model.baselines import (
     PAPER_TABLE_1,
     GemOptions,

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from spn_data.camera import MODELS, Camera
+from spn_data.geometry.camera import MODELS, Camera
 
 PARAMS = {
     "SIMPLE_PINHOLE": [900.0, 640.0, 355.0],

@@ -15,10 +15,11 @@ from click.testing import CliRunner
 
 from cli.data import main
 from spn_data.area import EVALUATION, FRAMES, GEO, Area
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_to_json
 from spn_data.coverage import CoverageOptions, strata_of
 from spn_data.coverage_table import COLUMNS
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_to_json
+from spn_data.geometry.pose import Poses, angles_from_rotations
 from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
 from spn_data.pipeline.coverage import PLANNED, read_coverage, stale_because
 from spn_data.pipeline.labels import (
@@ -27,7 +28,6 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.pose import Poses, angles_from_rotations
 from spn_data.record import read_json, write_json
 from spn_data.waypoints import Place, read_waypoints
 

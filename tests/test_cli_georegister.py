@@ -13,11 +13,11 @@ from click.testing import CliRunner, Result
 
 from cli.data import main
 from spn_data.area import GEO, MODEL, Area
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.colmap.model import read_scene
 from spn_data.errors import FormatError, InputError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.pipeline.geo import GeoStageOptions, recorded_options
 from spn_data.record import StageRecord, read_json

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
@@ -22,7 +21,8 @@ from spn_data.colmap.model import (
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.errors import FormatError, StageError
 from spn_data.features import Features
-from spn_data.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
 
 
 @pytest.fixture(scope="module")

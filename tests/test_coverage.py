@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from spn_data.cambridge import read_cambridge
-from spn_data.camera import Camera
 from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames, strata_of
 from spn_data.coverage_table import (
     COLUMNS,
@@ -19,7 +18,8 @@ from spn_data.coverage_table import (
     write_coverage,
 )
 from spn_data.errors import GeometryError
-from spn_data.pose import Poses, rotations_from_angles
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.refly import ReflyOptions, where_to_fly_again
 from spn_data.simulate import preset, simulate_paths
 from spn_data.view_share import SeenMap, ViewOptions, view_shares

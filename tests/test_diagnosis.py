@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.model import write_native
@@ -15,6 +14,7 @@ from spn_data.colmap.verify import VerifiedPair
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, diagnose, missing_passages
 from spn_data.features import Features
+from spn_data.geometry.camera import Camera
 
 CAMERA = Camera.from_horizontal_fov(1024, 768, 60, (0.0,))
 

@@ -25,13 +25,14 @@ from scipy.spatial.transform import Rotation
 from cli.data import main
 from cli.export import FORMATS
 from spn_data.area import EVALUATION, Area, StageWork
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_to_json
 from spn_data.colmap import pycolmap
 from spn_data.exports.frames import ExportedFrames, timestamps_us
 from spn_data.exports.geojson import write_geojson
 from spn_data.exports.kml import write_kml
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_to_json
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Poses, Similarity
 from spn_data.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
 from spn_data.map_points import MapPoints
 from spn_data.nvm import read_nvm
@@ -47,7 +48,6 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.pose import Poses, Similarity
 from spn_data.record import VERSION, write_json
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors
 from spn_model import figures, svg
 from spn_model.metrics import Estimates, evaluate, evaluation_frames
 from spn_model.trajectory_view import view_matrix

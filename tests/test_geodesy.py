@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from spn_data.geodesy import (
+from spn_data.geometry.geodesy import (
     GeoOrigin,
     HeightReference,
     ecef_from_wgs84,

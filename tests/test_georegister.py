@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from spn_data.errors import FormatError, GeometryError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
 from spn_data.georegister import (
     GeoErrors,
     GeoFit,
@@ -19,7 +20,6 @@ from spn_data.georegister import (
     georegister,
     georegistration_errors,
 )
-from spn_data.pose import Poses, Similarity, pose_errors, rotations_from_vectors
 from spn_data.simulate.flight import simulate_paths, simulate_telemetry
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset

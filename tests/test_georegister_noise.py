@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from spn_data.geometry.pose import Similarity, rotations_from_angles, rotations_from_vectors
 from spn_data.georegister import georegistration_errors
 from spn_data.georegister.crossval import time_blocks
 from spn_data.georegister.gravity import level_up, robust_direction
@@ -18,7 +19,6 @@ from spn_data.georegister.noise import (
     solve,
 )
 from spn_data.georegister.uncertainty import Uncertainty, radius_sigma
-from spn_data.pose import Similarity, rotations_from_angles, rotations_from_vectors
 
 TABLE = [(0.7, 0.5, 0.1, 1.0), (1.1, 0.5, 0.2, 1.0)]
 

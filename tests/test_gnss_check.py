@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
+from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, LabelStatus
 from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
-from spn_data.pose import Poses, rotations_from_angles
 from spn_data.telemetry.track import Telemetry
 from tests.report_data import geo_fit
 

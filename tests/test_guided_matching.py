@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
 from spn_data.guided_matching import match_along_lines
 from spn_data.matching import MatchOptions, match_descriptors, unit_descriptors
 

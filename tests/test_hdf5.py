@@ -14,13 +14,13 @@ import h5py
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.errors import FormatError, InputError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import canonical_quats
 from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import COLUMNS, POINTS, DatasetFrame, DatasetInfo, Role
-from spn_data.pose import canonical_quats
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Camera("SIMPLE_PINHOLE", 48, 27, np.array([40.0, 24.0, 13.5]))

@@ -13,14 +13,14 @@ from click.testing import CliRunner
 from cli.data import main
 from cli.import_ import import_
 from spn_data.cambridge import read_cambridge, write_cambridge
-from spn_data.camera import Camera
 from spn_data.errors import GeometryError, InputError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
 from spn_data.nvm import nvm_model, write_nvm
 from spn_data.nvm_frames import camera_from_visualsfm
 from spn_data.pipeline.import_cambridge import LISTS, Imported, ImportOptions, import_cambridge
-from spn_data.pose import Poses, rotations_from_angles
 
 OUTLIER = "seq5/frame00297.png"
 LENS = Camera("SIMPLE_PINHOLE", 160, 90, np.array([120.0, 80.0, 45.0]))

@@ -14,7 +14,7 @@ from spn_data import child
 from spn_data.colmap import incremental, pycolmap
 from spn_data.colmap.mapping import MappingJob, latest_snapshot
 from spn_data.colmap.model import scene_of
-from spn_data.pose import Similarity
+from spn_data.geometry.pose import Similarity
 
 _IMAGES = 40
 Events = list[dict[str, int]]

@@ -175,7 +175,7 @@ def test_a_model_that_a_full_disk_cut_short_is_an_error(
     script = (
         "import resource, sys; from pathlib import Path\n"
         "from spn_data.colmap.model import write_transformed\n"
-        "from spn_data.pose import Similarity\n"
+        "from spn_data.geometry.pose import Similarity\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
         "write_transformed(Path(sys.argv[1]), Path(sys.argv[2]), Similarity.identity())\n"
     )

@@ -12,6 +12,7 @@ import pytest
 from spn_data.area import MODEL
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
+from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles
 from spn_data.labels import (
     Labels,
     SeenPoints,
@@ -22,7 +23,6 @@ from spn_data.labels import (
 )
 from spn_data.map_hash import map_hash
 from spn_data.map_points import MapPoints, covered_share
-from spn_data.pose import Poses, Similarity, pose_errors, rotations_from_angles
 from spn_data.registration.frozen_map import FrozenMap
 
 

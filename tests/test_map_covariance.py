@@ -17,19 +17,19 @@ from spn_data.bundle_jacobians import (
     gauge_directions,
     linearize_bundle,
 )
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import Observations, Scene, read_observations
 from spn_data.errors import GeometryError
-from spn_data.least_squares import POSE
-from spn_data.map_covariance import Functional, MapCovariance, MapCovarianceOptions
-from spn_data.pose import (
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.least_squares import POSE
+from spn_data.geometry.pose import (
     Poses,
     Similarity,
     rotation_vectors,
     rotations_from_angles,
     rotations_from_vectors,
 )
+from spn_data.map_covariance import Functional, MapCovariance, MapCovarianceOptions
 from tests.native_world import native_model
 
 INDEPENDENT = MapCovarianceOptions(clustered=False)

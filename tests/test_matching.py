@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import ImageForMatching, match_pairs, verification_options
 from spn_data.features import FeatureOptions, Features, extract
+from spn_data.geometry.camera import Camera
 from spn_data.matching import Comparison, MatchOptions, match_descriptors
 
 

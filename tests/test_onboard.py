@@ -22,14 +22,14 @@ from click.testing import CliRunner
 from onnx import TensorProto, helper
 
 from cli.model import main
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_to_json
 from spn_data.errors import FormatError, InputError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_to_json
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_data.hdf5_reader import Dataset
-from spn_data.pose import Poses, pose_errors
 from spn_data.record import write_json
-from spn_data.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_model.bundle_checks import ExportOptions
 from spn_model.export import export
 from spn_model.onboard import lines
@@ -116,7 +116,7 @@ def test_an_image_without_a_pose_has_a_reason(bundle, flown, tmp_path):
 
 
 def test_the_view_on_board_is_that_of_the_data_set(flown):
-    """From 1280 x 720 to 480 x 270, images equal those of spn_data.rendering to a grey level in the mean."""
+    """From 1280 x 720 to 480 x 270, images equal those of spn_data.geometry.rendering to a grey level in the mean."""
     lens = Camera("OPENCV", 1280, 720, np.array([820, 822, 645, 355, -0.11, 0.06, 1e-3, -5e-4]))
     view = canonical_camera([lens], RenderingOptions())
     assert (view.width, view.height) == (480, 270)

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from spn_data.errors import GeometryError
-from spn_data.pose import (
+from spn_data.geometry.pose import (
     Poses,
     Similarity,
     angles_from_rotations,

@@ -20,8 +20,9 @@ from click.testing import CliRunner, Result
 
 from cli.data import main
 from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json, camera_to_json
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json, camera_to_json
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.labels import _COLUMNS, Labels, read_labels, read_seen_points
 from spn_data.map_hash import map_hash
 from spn_data.pipeline.frames import FramesOptions, plan
@@ -31,7 +32,6 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_from_json,
 )
-from spn_data.pose import Poses, Similarity, pose_errors
 from spn_data.record import read_json
 from spn_data.registration.options import CheckOptions
 from spn_data.simulate.truth import read_truth

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from spn_data.camera import MODELS, Camera
-from spn_data.least_squares import POSE
-from spn_data.pose import Poses, pose_errors, rotations_from_vectors
+from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.least_squares import POSE
+from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
 from spn_data.map_covariance import MapCovariance, MapCovarianceOptions
-from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_data.registration.tracks import Tracks, find_tracks, triangulate
 from tests.registration_scene import LENS, Flight, flight
 

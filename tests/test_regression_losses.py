@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from spn_data.camera import Camera
-from spn_data.pose import Poses, canonical_quats, rotations_from_vectors
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, canonical_quats, rotations_from_vectors
 from spn_model.loss import LearnedWeighting, beta_weighted, laplace, reprojection, residuals
 from spn_model.targets import PoseTargets
 

@@ -6,10 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from spn_data.camera import Camera
 from spn_data.errors import GeometryError
-from spn_data.pose import rotations_from_angles
-from spn_data.rendering import Renderer, RenderingOptions, canonical_camera, undistorted_camera
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import rotations_from_angles
+from spn_data.geometry.rendering import (
+    Renderer,
+    RenderingOptions,
+    canonical_camera,
+    undistorted_camera,
+)
 from spn_data.simulate.render import Renderer as Simulator
 from spn_data.simulate.scene import SceneOptions, build_place, paint_all
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spn_data.errors import InputError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
 from spn_data.telemetry.csv_log import read_csv_log
 from spn_data.telemetry.dji_srt import read_dji_srt

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, PngImagePlugin
 
 from spn_data.errors import InputError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.exif import PhotoMetadata, read_photo, telemetry_of_photos
 from spn_data.telemetry.track import summarize
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spn_data.errors import InputError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.dji_srt import parse_dji_srt, read_dji_srt
 from spn_data.telemetry.track import summarize
 

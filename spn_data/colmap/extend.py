@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import load_native, write_native
 from spn_data.colmap.verify import native_camera
 from spn_data.errors import StageError
+from spn_data.geometry.camera import Camera
 from spn_data.labels import Labels, SeenPoints
 
 

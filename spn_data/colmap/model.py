@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.errors import FormatError, StageError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, Similarity
 from spn_data.map_points import MapPoints
-from spn_data.pose import Poses, Similarity
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import from_native_camera
 from spn_data.colmap.verify import native_camera
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import registered_images
 from spn_data.errors import GeometryError
-from spn_data.pose import Similarity
+from spn_data.geometry.pose import Similarity
 
 _FEWEST = 1000  # positions; smaller models are adjusted as well without
 _LEAST_M = 3.0  # median displacement, below which the positions' slow errors may look like a bend

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap import pycolmap
 from spn_data.features import Features
+from spn_data.geometry.camera import Camera
 from spn_data.guided_matching import match_along_lines
 from spn_data.matching import Comparison, MatchOptions
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.errors import StageError
-from spn_data.geodesy import GeoOrigin
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints
 

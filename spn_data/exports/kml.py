@@ -9,7 +9,7 @@ from pathlib import Path
 from spn_data.exports.frames import ExportedFrames
 from spn_data.exports.geographic import Places, places_of
 from spn_data.files import write_whole
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 
 # KML's absolute altitudes count from mean sea level, and it knows no ellipsoid.
 _MODES = {

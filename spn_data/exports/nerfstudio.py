@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.exports.frames import ExportedFrames
+from spn_data.geometry.camera import Camera
 from spn_data.record import write_json
 
 FOLDER_OF_IMAGES = "images"

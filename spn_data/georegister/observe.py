@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import rotations_from_angles
 from spn_data.georegister.options import (
     RTK_SIGMA_M,
     GeoregisterOptions,
     Heights,
     default_sigma_m,
 )
-from spn_data.pose import rotations_from_angles
 from spn_data.telemetry.track import Telemetry
 
 # Finer than any fix, coarse enough to be read aloud: 6 decimals are 0.1 m.

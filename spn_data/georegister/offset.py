@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
 from spn_data.georegister.fit import covariance_of
 from spn_data.georegister.noise import (
     Linear,
@@ -18,7 +19,6 @@ from spn_data.georegister.noise import (
 from spn_data.georegister.observe import Fixes, observe
 from spn_data.georegister.options import GeoregisterOptions
 from spn_data.georegister.problem import Kind, Problem, State
-from spn_data.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FRAMES = 12

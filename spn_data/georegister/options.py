@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
 # Standard deviation (horizontal per axis, vertical) in metres of one fix of a source that states none.
 # Consumer GNSS without correction; heights of photos are as often barometric as not, hence wider.

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.pose import Poses, Similarity
 from spn_data.georegister.crossval import HeldOut, cross_validate, time_blocks
 from spn_data.georegister.fit import FIXED_OFFSET_M, Estimate, estimate
 from spn_data.georegister.gravity import Gravity, gravity_from_gimbal, level_up
@@ -17,7 +18,6 @@ from spn_data.georegister.problem import Kind, Problem
 from spn_data.georegister.result import FitSummary, GeoFit
 from spn_data.georegister.start import extent, find_start
 from spn_data.georegister.uncertainty import Uncertainty, effective_fixes, require_determined
-from spn_data.pose import Poses, Similarity
 from spn_data.telemetry.track import Telemetry
 
 # A frame whose fix lies this many sigma of white noise off its neighbours is called an outlier.

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import FormatError
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.pose import Similarity
 from spn_data.georegister.crossval import HeldOut
 from spn_data.georegister.uncertainty import Uncertainty
-from spn_data.pose import Similarity
 
 VERSION = 1
 

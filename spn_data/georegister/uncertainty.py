@@ -8,11 +8,11 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.pose import Similarity, rotation_vectors
 from spn_data.georegister.fit import Estimate, covariance_of
 from spn_data.georegister.noise import inverse_times, solve
 from spn_data.georegister.options import GeoregisterOptions
 from spn_data.georegister.problem import Kind, Problem
-from spn_data.pose import Similarity, rotation_vectors
 
 
 @dataclass(frozen=True, eq=False)

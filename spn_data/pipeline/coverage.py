@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
-from spn_data.camera import Camera
 from spn_data.coverage import CoverageOptions
 from spn_data.coverage_table import Coverage, MappingFrames, Queries, cover, remarks, write_coverage
 from spn_data.errors import FormatError, InputError, StageError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.geodesy import HeightReference
+from spn_data.geometry.pose import Poses
 from spn_data.labels import Labels
 from spn_data.pipeline.geo import recorded_options
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
-from spn_data.pose import Poses
 from spn_data.record import VERSION, read_json, write_json
 from spn_data.refly import FlyAgain, ReflyOptions, where_to_fly_again
 from spn_data.timing import Progress

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, Area
-from spn_data.camera_file import camera_to_json, read_camera
 from spn_data.candidates import Candidates, analyse, frames_of
 from spn_data.errors import InputError
 from spn_data.extraction import Cost, check_space, estimate_cost, extract_chosen
 from spn_data.frames import Frames, read_frames, write_frames
+from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.photos import load_mask
 from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks

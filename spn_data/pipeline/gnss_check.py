@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.offset import estimate_time_offset
 from spn_data.georegister.options import default_sigma_m
 from spn_data.georegister.result import GeoFit

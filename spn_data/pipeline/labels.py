@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json
 from spn_data.colmap.model import Observations, Scene, read_map
 from spn_data.errors import FormatError
 from spn_data.frames import Frames, read_frames
-from spn_data.geodesy import GeoOrigin
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json
+from spn_data.geometry.geodesy import GeoOrigin
+from spn_data.geometry.pose import Similarity
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
 from spn_data.pipeline.model import read_reasons
-from spn_data.pose import Similarity
 from spn_data.record import read_json
 
 POSES, SEEN, CAMERA, REGISTRATION = (

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
 from spn_data.map_hash import map_hash
 from spn_data.parallel import Dispatch

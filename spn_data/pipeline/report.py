@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
-from spn_data.camera import Camera
 from spn_data.coverage_table import read_strata
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.files import write_whole
 from spn_data.frames import Frames, read_frames
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, sigmas
 from spn_data.pipeline import coverage as coverage_stage
 from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.pipeline.runs import read_runs
-from spn_data.pose import Poses
 from spn_data.record import read_json, versions
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render

@@ -12,8 +12,8 @@ import numpy as np
 
 from spn_data.area import FRAMES, SPLIT, Area, StageWork
 from spn_data.audit import Finding, Verdict
-from spn_data.camera import Camera
 from spn_data.errors import GeometryError
+from spn_data.geometry.camera import Camera
 from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_schema import DatasetInfo, Role
 from spn_data.pipeline.audit import (

@@ -11,8 +11,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from spn_data.camera import MODELS, Camera
-from spn_data.least_squares import (
+from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.least_squares import (
     POSE,
     cauchy_weights,
     lens_mixing,
@@ -20,7 +20,7 @@ from spn_data.least_squares import (
     projection_jacobians,
     rows_to_sparse,
 )
-from spn_data.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors
 
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from spn_data.least_squares import POSE, cauchy_weights, cluster_pulls, rows_to_sparse
+from spn_data.geometry.least_squares import POSE, cauchy_weights, cluster_pulls, rows_to_sparse
 from spn_data.map_covariance import Functional, MapCovariance
 from spn_data.registration.adjustment import (
     Linearized,

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.camera import Camera
-from spn_data.least_squares import LENS, POSE, cauchy_weights, projection_jacobians
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.least_squares import LENS, POSE, cauchy_weights, projection_jacobians
+from spn_data.geometry.pose import Poses
 from spn_data.map_covariance import Functional, MapCovariance
-from spn_data.pose import Poses
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

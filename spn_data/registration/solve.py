@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.colmap.resection import Resection, resect
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

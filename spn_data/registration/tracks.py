@@ -8,8 +8,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from spn_data.camera import Camera
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,10 @@ import numpy as np
 
 from spn_data import audit
 from spn_data.coverage import Stratum
+from spn_data.geometry.pose import Poses
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import LabelStatus
 from spn_data.map_points import MapPoints
-from spn_data.pose import Poses
 from spn_data.record import StageRecord
 from spn_data.split import Split
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from spn_data.camera import Camera
 from spn_data.errors import InputError
-from spn_data.geodesy import GeoOrigin
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.scene import SceneOptions
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
 
 TILE_PX = 32
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
 from spn_data.simulate.faces import MAX_CORNERS, Face, Texture
 from spn_data.simulate.rays import TILE_PX, RayGrid
 

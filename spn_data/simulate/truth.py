@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.errors import FormatError, InputError
-from spn_data.geodesy import GeoOrigin
-from spn_data.pose import Poses
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.geodesy import GeoOrigin
+from spn_data.geometry.pose import Poses
 from spn_data.simulate.flight import FlightPath
 from spn_data.simulate.presets import SimulateOptions
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
 from spn_data.telemetry.csv_columns import COLUMNS, Column, columns_of
 from spn_data.telemetry.textfile import MAX_RECORDS, csv_rows, read_text

@@ -13,7 +13,7 @@ import numpy as np
 from defusedxml.common import DefusedXmlException
 
 from spn_data.errors import InputError
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import Sigma, sigma_from_dop
 from spn_data.telemetry.textfile import read_text
 from spn_data.telemetry.track import Telemetry, increasing

@@ -10,7 +10,7 @@ import numpy as np
 
 from spn_data.errors import FormatError
 from spn_data.files import write_whole
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.track import Telemetry
 
 _COLUMNS = (

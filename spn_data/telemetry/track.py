@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.geodesy import HeightReference
+from spn_data.geometry.geodesy import HeightReference
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Telemetry:
     rel_alt_m : (N,) height above the point of take-off.
     abs_alt_m : (N,) height above what `abs_reference` says.
     sigma_m : (N, 3) standard deviation east, north, up that the source itself states.
-    gimbal_deg : (N, 3) heading, pitch, roll of the camera (`spn_data.pose.rotations_from_angles`).
+    gimbal_deg : (N, 3) heading, pitch, roll of the camera (`spn_data.geometry.pose.rotations_from_angles`).
     utc_s : (N,) seconds since 1970; local time of unknown zone where `utc_is_local`.
     zoom : (N,) focal length times digital zoom in a unit of the source's own: only its changes count.
     kind : what wrote it, such as "dji-srt", "gpx", "csv", "exif"; source : the file's name.

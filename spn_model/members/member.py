@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor, nn
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model.training_set import TrainingSet
 from spn_model.unseen_views import UnseenViews
 

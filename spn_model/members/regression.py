@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spn_data.errors import InputError
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model import weights
 from spn_model.imagenet import MEAN, STD
 from spn_model.loss import beta_weighted, laplace, reprojection, residuals

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from spn_data.errors import GeometryError, InputError
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.imagenet import MEAN, STD
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates

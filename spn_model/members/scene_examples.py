@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
 from spn_model.fused_views import fused_view
 from spn_model.networks.scene_coordinates import (

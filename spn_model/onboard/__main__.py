@@ -12,8 +12,8 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(100_000_000))
 
 import cv2
 
-from spn_data.camera_file import read_camera
 from spn_data.errors import SpnError
+from spn_data.geometry.camera_file import read_camera
 from spn_model.onboard import lines
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import frames

@@ -17,9 +17,9 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
-from spn_data.camera import Camera
-from spn_data.camera_file import read_camera
 from spn_data.errors import SpnError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import read_camera
 from spn_model.onboard.bundle import INPUT
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import read_image

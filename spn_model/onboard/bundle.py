@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
-from spn_data.camera_file import camera_from_json
 from spn_data.errors import FormatError, InputError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_from_json
 from spn_model.decoding import DecodingOptions
 from spn_model.view import View
 

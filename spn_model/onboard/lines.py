@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from spn_data.geodesy import GeoOrigin
+from spn_data.geometry.geodesy import GeoOrigin
 from spn_model.onboard.localizer import Located
 
 _UPPER = list(zip(*np.triu_indices(6), strict=True))

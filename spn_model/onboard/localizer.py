@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from spn_data.camera import Camera
 from spn_data.errors import FormatError, GeometryError, InputError
-from spn_data.pose import Poses, canonical_quats
-from spn_data.rendering import Renderer
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.rendering import Renderer
 from spn_model.decoding import decode
 from spn_model.onboard.bundle import (
     FLOAT32,

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.errors import InputError
+from spn_data.geometry.camera import Camera
 
 _MAX_BYTES = 100_000
 

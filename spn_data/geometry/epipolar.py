@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spn_data.pose import Poses
+from spn_data.geometry.pose import Poses
 
 
 def essential_matrix(poses: Poses, a: int, b: int) -> np.ndarray:

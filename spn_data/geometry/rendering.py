@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spn_data.camera import Camera
 from spn_data.errors import GeometryError
+from spn_data.geometry.camera import Camera
 
 _WIDEST_TAN = np.tan(np.deg2rad(85.0))  # a pinhole image of more than 170 degrees has no use
 _BORDER_POINTS = 512  # a side

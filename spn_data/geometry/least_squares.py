@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import sparse
 
-from spn_data.camera import Camera
+from spn_data.geometry.camera import Camera
 
 POSE = 6
 LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2
