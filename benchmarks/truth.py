@@ -24,8 +24,8 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels
-from spn_data.record import read_json
 from spn_data.simulate.truth import read_truth
+from spn_data.storage.record import read_json
 
 
 def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:

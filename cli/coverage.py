@@ -88,10 +88,10 @@ def coverage(
         spn-data coverage --area fields/north --fly-again again.csv
     """
     from spn_data.coverage import Stratum
-    from spn_data.files import write_csv
     from spn_data.geometry.camera_file import read_camera
     from spn_data.pipeline.coverage import CoverageStageOptions, check_new, cover_area
     from spn_data.refly import ReflyOptions
+    from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):
         raise click.UsageError(

@@ -77,7 +77,7 @@ def run(
     from cli import page, show_networks
     from spn_data import area as names_of
     from spn_data.errors import InputError, StageError
-    from spn_data.record import content_fingerprint
+    from spn_data.storage.record import content_fingerprint
     from spn_model import machine
     from spn_model.checkpoint import load
     from spn_model.comparison_files import network_facts, of_network, write_comparison

@@ -59,7 +59,7 @@ def run(
 ) -> None:
     from spn_data import area as names_of
     from spn_data.errors import StageError
-    from spn_data.record import content_fingerprint
+    from spn_data.storage.record import content_fingerprint
     from spn_model.bundle_checks import ExportOptions
     from spn_model.checkpoint import load
     from spn_model.export import export as work

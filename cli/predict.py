@@ -106,7 +106,7 @@ def run(
     from spn_data.area import CHECKPOINT
     from spn_data.errors import StageError
     from spn_data.geometry.camera_file import camera_to_json, read_camera
-    from spn_data.record import content_fingerprint
+    from spn_data.storage.record import content_fingerprint
     from spn_model import machine
     from spn_model.checkpoint import load
     from spn_model.flown import Choice, find_flights

@@ -24,7 +24,7 @@ from spn_data.area import (
 )
 from spn_data.errors import StageError
 from spn_data.pipeline.frames import Plan
-from spn_data.record import StageRecord
+from spn_data.storage.record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from cli import console
 from spn_data.area import DENSE, EVALUATION, SPLIT
-from spn_data.record import StageRecord
+from spn_data.storage.record import StageRecord
 
 
 def evaluation(record: StageRecord, unit: str) -> None:

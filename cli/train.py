@@ -16,11 +16,11 @@ import click
 
 from cli import console, options
 from spn_data.errors import StageError
-from spn_data.files import LOCK, locked
+from spn_data.storage.files import LOCK, locked
 
 if TYPE_CHECKING:
     from spn_data.area import Area
-    from spn_data.record import StageRecord
+    from spn_data.storage.record import StageRecord
 
 
 @click.command()
@@ -101,7 +101,7 @@ def run(
     from spn_data import area as names
     from spn_data.errors import InputError
     from spn_data.hdf5_reader import Dataset
-    from spn_data.record import StageRecord, content_fingerprint, versions
+    from spn_data.storage.record import StageRecord, content_fingerprint, versions
     from spn_model.recipe import read_recipe
     from spn_model.train import Data, Stopped, TrainOptions
     from spn_model.train import train as train_network
@@ -206,7 +206,7 @@ def _standing(
     Raises StageError where another training would be lost and `overwrite` is false.
     """
     from spn_data.errors import FormatError, StageError
-    from spn_data.record import StageRecord, difference, read_json
+    from spn_data.storage.record import StageRecord, difference, read_json
 
     if not path.exists():
         if files.checkpoint.exists():
@@ -241,7 +241,7 @@ def _standing(
 
 
 def _write(path: Path, config: dict[str, Any]) -> None:
-    from spn_data.record import write_json
+    from spn_data.storage.record import write_json
     from spn_model.checkpoint import finite
 
     write_json(path, finite(config))

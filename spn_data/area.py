@@ -16,8 +16,9 @@ from typing import Any
 import tomli_w
 
 from spn_data.errors import FormatError, InputError, InUseError, StageError
-from spn_data.files import LOCK, locked, write_whole
-from spn_data.record import (
+from spn_data.sources import safe_name
+from spn_data.storage.files import LOCK, locked, write_whole
+from spn_data.storage.record import (
     VERSION,
     StageRecord,
     check_version,
@@ -26,7 +27,6 @@ from spn_data.record import (
     versions,
     write_json,
 )
-from spn_data.sources import safe_name
 
 FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"
 STAGES = (FRAMES, MODEL, GEO)  # of the map; --add exchanges them together

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import write_whole
 from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.storage.files import write_whole
 
 TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (
     f"dataset_{part}.txt" for part in ("train", "validation", "test")

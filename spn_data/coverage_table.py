@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames
-from spn_data.files import read_csv, write_csv
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
+from spn_data.storage.files import read_csv, write_csv
 from spn_data.timing import Progress
 from spn_data.view_share import SeenMap, view_shares
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import read_csv, write_csv
+from spn_data.storage.files import read_csv, write_csv
 from spn_data.telemetry.track import Telemetry
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,200}/[A-Za-z0-9._-]{1,200}\.jpg", re.ASCII)

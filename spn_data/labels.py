@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import read_csv, write_csv, writing_whole
 from spn_data.frames import Frames, check_name
 from spn_data.geometry.pose import Poses, Similarity, canonical_quats
+from spn_data.storage.files import read_csv, write_csv, writing_whole
 
 _MAX_CSV_BYTES = 2_000_000_000
 # What NumPy lets through of a damaged archive.

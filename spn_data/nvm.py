@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import writing_whole
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.grouping import number_within
 from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.storage.files import writing_whole
 
 MAX_IMAGES = 1_000_000
 MAX_POINTS = 100_000_000

@@ -19,9 +19,9 @@ from spn_data.correspondences import FramesToMap, appearance_of, extract_missing
 from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
 from spn_data.features import FeatureOptions
-from spn_data.files import write_whole
 from spn_data.pairs import PairOptions, choose_pairs
 from spn_data.parallel import Dispatch
+from spn_data.storage.files import write_whole
 from spn_data.timing import Progress, Stopwatch
 
 _DRIFTED = 1.5  # ratio of focal lengths; a video cropped for stabilisation has 1.1 to 1.4

@@ -10,7 +10,6 @@ import numpy as np
 
 from spn_data.errors import FormatError
 from spn_data.frames import check_name
-from spn_data.record import VERSION, read_json, write_json
 from spn_data.split import (
     LEFT_OUT,
     OPTIMISTIC,
@@ -20,6 +19,7 @@ from spn_data.split import (
     Split,
     SplitOptions,
 )
+from spn_data.storage.record import VERSION, read_json, write_json
 
 _NOT_FREE = (
     "Validation frames were bundle-adjusted jointly with the training frames: poses and points of both "

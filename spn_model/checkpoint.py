@@ -15,7 +15,7 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
-from spn_data.files import writing_whole
+from spn_data.storage.files import writing_whole
 from spn_model.members.member import Member
 from spn_model.members.registry import make
 from spn_model.view import View

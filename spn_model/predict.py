@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.files import exchange, write_whole
-from spn_data.record import write_json
+from spn_data.storage.files import exchange, write_whole
+from spn_data.storage.record import write_json
 from spn_data.timing import Progress
 from spn_model.checkpoint import Checkpoint
 from spn_model.flown import Choice, Flight, FlownFrame, Views, frames

@@ -15,9 +15,9 @@ import numpy as np
 
 from spn_data.errors import StageError
 from spn_data.exports.frames import timestamps_us
-from spn_data.files import write_csv
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
+from spn_data.storage.files import write_csv
 from spn_model.flown import FlownFrame
 from spn_model.members.member import PoseEstimates
 

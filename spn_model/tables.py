@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.files import write_csv
-from spn_data.record import write_json
+from spn_data.storage.files import write_csv
+from spn_data.storage.record import write_json
 from spn_model.baselines import PAPER_SOURCE, PAPER_TABLE_1
 from spn_model.metrics import Evaluation, Summary
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.files import read_csv
+from spn_data.storage.files import read_csv
 from spn_model import svg
 from spn_model.svg import COLOURS, INK, SOFT, Panel
 from spn_model.training_state import COLUMNS

@@ -11,7 +11,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.hdf5_schema import Role
-from spn_data.record import content_fingerprint
+from spn_data.storage.record import content_fingerprint
 
 if TYPE_CHECKING:
     from spn_data.hdf5_reader import Dataset  # not on board: it needs h5py

@@ -13,9 +13,9 @@ from spn_data.georegister.crossval import HeldOut
 from spn_data.georegister.result import FitSummary, GeoFit
 from spn_data.georegister.uncertainty import Uncertainty
 from spn_data.map_points import MapPoints
-from spn_data.record import StageRecord
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.split import Split, SplitOptions
+from spn_data.storage.record import StageRecord
 
 
 def flight(

@@ -9,7 +9,7 @@ import pytest
 
 from spn_data.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.errors import FormatError, StageError
-from spn_data.record import VERSION, StageRecord, content_fingerprint
+from spn_data.storage.record import VERSION, StageRecord, content_fingerprint
 
 
 def make(

@@ -103,7 +103,7 @@ def test_a_full_disk_keeps_the_old_checkpoint(saved, monkeypatch):
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("spn_data.files.os.fsync", full)
+    monkeypatch.setattr("spn_data.storage.files.os.fsync", full)
     with pytest.raises(
         StageError, match=r"checkpoint\.safetensors cannot be written: No space left"
     ):

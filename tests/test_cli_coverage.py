@@ -28,7 +28,7 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.record import read_json, write_json
+from spn_data.storage.record import read_json, write_json
 from spn_data.waypoints import Place, read_waypoints
 
 ROOT = Path(__file__).resolve().parents[1]

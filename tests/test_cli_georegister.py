@@ -20,7 +20,7 @@ from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.pipeline.geo import GeoStageOptions, recorded_options
-from spn_data.record import StageRecord, read_json
+from spn_data.storage.record import StageRecord, read_json
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

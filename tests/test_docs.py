@@ -15,8 +15,8 @@ from spn_data import errors
 from spn_data.area import STAGES
 from spn_data.attempts import ReconstructOptions
 from spn_data.diagnosis import FrameRegistration
-from spn_data.record import StageRecord
 from spn_data.selection import SelectionOptions
+from spn_data.storage.record import StageRecord
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])

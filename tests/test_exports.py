@@ -48,7 +48,7 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.record import VERSION, write_json
+from spn_data.storage.record import VERSION, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from spn_data.errors import InputError, StageError
-from spn_data.files import read_csv, write_csv, write_whole, writing_whole
+from spn_data.storage.files import read_csv, write_csv, write_whole, writing_whole
 
 
 def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> None:

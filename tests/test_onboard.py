@@ -29,7 +29,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_data.hdf5_reader import Dataset
-from spn_data.record import write_json
+from spn_data.storage.record import write_json
 from spn_model.bundle_checks import ExportOptions
 from spn_model.export import export
 from spn_model.onboard import lines

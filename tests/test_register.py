@@ -32,9 +32,9 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_from_json,
 )
-from spn_data.record import read_json
 from spn_data.registration.options import CheckOptions
 from spn_data.simulate.truth import read_truth
+from spn_data.storage.record import read_json
 
 DOC = Path(__file__).resolve().parents[1] / "docs" / "registration.md"
 FAST = ("--rate", "1", "--threads", "1")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from spn_data.errors import InputError
-from spn_data.files import write_csv
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import angles_from_rotations
+from spn_data.storage.files import write_csv
 from spn_data.waypoints import Place, read_waypoints, waypoint_columns
 
 LAT, LON = 49.0153, 8.4250

@@ -8,8 +8,8 @@ from typing import Any
 
 from spn_data.exports.frames import ExportedFrames
 from spn_data.exports.geographic import places_of
-from spn_data.files import write_whole
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.storage.files import write_whole
 
 
 def write_geojson(folder: Path, frames: ExportedFrames) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from spn_data.exports.frames import ExportedFrames
 from spn_data.exports.geographic import Places, places_of
-from spn_data.files import write_whole
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.storage.files import write_whole
 
 # KML's absolute altitudes count from mean sea level, and it knows no ellipsoid.
 _MODES = {

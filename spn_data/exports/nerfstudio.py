@@ -14,7 +14,7 @@ import numpy as np
 
 from spn_data.exports.frames import ExportedFrames
 from spn_data.geometry.camera import Camera
-from spn_data.record import write_json
+from spn_data.storage.record import write_json
 
 FOLDER_OF_IMAGES = "images"
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])

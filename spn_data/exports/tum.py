@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.frames import ExportedFrames, timestamps_us
-from spn_data.files import write_whole
+from spn_data.storage.files import write_whole
 
 
 def write_tum(folder: Path, frames: ExportedFrames) -> None:

@@ -40,9 +40,9 @@ from spn_data.map_hash import map_hash
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import REGISTRATION, LabelledArea, read_labelled_area
 from spn_data.pipeline.split_cambridge import image_name, list_of
-from spn_data.record import VERSION, read_json, write_json
 from spn_data.split import TRAIN, Split
 from spn_data.split_file import read_split
+from spn_data.storage.record import VERSION, read_json, write_json
 
 SPLIT_FILE, DATASET, AUDIT, CAMBRIDGE = "split.json", "dataset.h5", "audit.json", "cambridge"
 

@@ -21,8 +21,8 @@ from spn_data.geometry.pose import Poses
 from spn_data.labels import Labels
 from spn_data.pipeline.geo import recorded_options
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
-from spn_data.record import VERSION, read_json, write_json
 from spn_data.refly import FlyAgain, ReflyOptions, where_to_fly_again
+from spn_data.storage.record import VERSION, read_json, write_json
 from spn_data.timing import Progress
 from spn_data.view_share import SeenMap
 from spn_data.waypoints import Place, Waypoints, read_waypoints, waypoint_columns

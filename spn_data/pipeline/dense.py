@@ -32,13 +32,13 @@ from spn_data.pipeline.labels import (
 )
 from spn_data.pipeline.register_source import FRAMES_FILE
 from spn_data.pipeline.videos import find_videos
-from spn_data.record import VERSION, StageRecord, read_json, write_json
 from spn_data.registration.adjustment import lens_parameters
 from spn_data.registration.frame_covariance import (
     FramePoints,
     LensUncertainty,
     frame_covariances,
 )
+from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
 from spn_data.timing import Progress, Stopwatch
 
 

@@ -20,9 +20,9 @@ from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.photos import load_mask
 from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks
-from spn_data.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
 from spn_data.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
+from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.timing import Progress, Stopwatch

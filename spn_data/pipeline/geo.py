@@ -19,7 +19,7 @@ from spn_data.georegister.options import GeoregisterOptions, Heights
 from spn_data.georegister.register import georegister as fit
 from spn_data.georegister.result import GeoFit
 from spn_data.pipeline.move import move_labels
-from spn_data.record import StageRecord, write_json
+from spn_data.storage.record import StageRecord, write_json
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.timing import Progress, Stopwatch

@@ -29,7 +29,7 @@ from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.nvm import read_nvm
 from spn_data.nvm_frames import NvmFrames
 from spn_data.photos import decode_photo
-from spn_data.record import content_fingerprint
+from spn_data.storage.record import content_fingerprint
 from spn_data.timing import Progress
 
 LISTS = {

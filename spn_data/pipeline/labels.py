@@ -21,7 +21,7 @@ from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
 from spn_data.pipeline.model import read_reasons
-from spn_data.record import read_json
+from spn_data.storage.record import read_json
 
 POSES, SEEN, CAMERA, REGISTRATION = (
     "poses.csv",

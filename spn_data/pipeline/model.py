@@ -18,14 +18,14 @@ from spn_data.contradiction import focal_changes
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
-from spn_data.files import read_csv, write_csv
 from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.reconstruct import ReconstructResult, reconstruct
-from spn_data.record import StageRecord, read_json
 from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
+from spn_data.storage.files import read_csv, write_csv
+from spn_data.storage.record import StageRecord, read_json
 from spn_data.timing import Progress, Stopwatch
 
 DATABASE = "database.db"

@@ -15,7 +15,7 @@ from spn_data.pipeline.labels import (
     similarity_from_json,
     similarity_to_json,
 )
-from spn_data.record import read_json, write_json
+from spn_data.storage.record import read_json, write_json
 
 
 def move_labels(area: Area) -> tuple[str, ...]:

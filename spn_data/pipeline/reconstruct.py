@@ -19,7 +19,7 @@ from spn_data.pipeline.geo import (
 )
 from spn_data.pipeline.model import build_model
 from spn_data.reconstruct import estimate_model_cost
-from spn_data.record import StageRecord, read_json
+from spn_data.storage.record import StageRecord, read_json
 from spn_data.telemetry.track import TelemetrySummary
 
 

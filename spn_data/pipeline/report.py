@@ -13,7 +13,6 @@ import numpy as np
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
 from spn_data.coverage_table import read_strata
 from spn_data.errors import FormatError, InputError, StageError
-from spn_data.files import write_whole
 from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
@@ -23,11 +22,12 @@ from spn_data.pipeline import coverage as coverage_stage
 from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.pipeline.runs import read_runs
-from spn_data.record import read_json, versions
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import Verdict, verdict
 from spn_data.split_file import read_split
+from spn_data.storage.files import write_whole
+from spn_data.storage.record import read_json, versions
 
 FILE = "report.html"
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from spn_data.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
 from spn_data.errors import FormatError
-from spn_data.record import content_fingerprint
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.sources import safe_name
+from spn_data.storage.record import content_fingerprint
 
 _VERSION = 1  # of metrics.json
 _MAX_BYTES = 20_000_000

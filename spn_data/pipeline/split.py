@@ -33,10 +33,10 @@ from spn_data.pipeline.split_dataset import (
     given_frames,
     target_cameras,
 )
-from spn_data.record import StageRecord
 from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.split_file import write_split
 from spn_data.splitting import make_split
+from spn_data.storage.record import StageRecord
 from spn_data.timing import Progress, Stopwatch
 
 

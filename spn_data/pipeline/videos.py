@@ -6,8 +6,8 @@ from pathlib import Path
 
 from spn_data.area import EVALUATION, FRAMES, Area
 from spn_data.errors import InputError, StageError
-from spn_data.record import content_fingerprint
 from spn_data.sources import VIDEO_SUFFIXES, discover
+from spn_data.storage.record import content_fingerprint
 
 
 def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[Path, ...]:

@@ -16,8 +16,8 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import LabelStatus
 from spn_data.map_points import MapPoints
-from spn_data.record import StageRecord
 from spn_data.split import Split
+from spn_data.storage.record import StageRecord
 
 REGISTERED, FAILED = LabelStatus.REGISTERED.value, LabelStatus.FAILED.value
 STRATA = tuple(stratum.value for stratum in Stratum)

@@ -7,9 +7,9 @@ from html import escape
 
 import numpy as np
 
-from spn_data.record import StageRecord
 from spn_data.report.data import FrameTable, ReportData
 from spn_data.split import OPTIMISTIC, TRAIN
+from spn_data.storage.record import StageRecord
 
 
 def key_figures(data: ReportData) -> str:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import FormatError
-from spn_data.files import write_whole
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.storage.files import write_whole
 from spn_data.telemetry.track import Telemetry
 
 _COLUMNS = (

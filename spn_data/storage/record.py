@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import FormatError
-from spn_data.files import write_whole
+from spn_data.storage.files import write_whole
 
 VERSION = 1  # of the area's layout and of stage.json
 
