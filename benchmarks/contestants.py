@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from spn_data.correspondences import FramesToMap
     from spn_data.frames import Frames
-    from spn_data.timing import Stopwatch
+    from spn_data.work.timing import Stopwatch
 
 OURS, PYCOLMAP = "ours", "pycolmap"
 RESULT = "result.json"
@@ -151,7 +151,7 @@ def main(who: str, job: Job) -> None:
     from spn_data.errors import StageError
     from spn_data.frames import read_frames
     from spn_data.pipeline.model import frames_to_map
-    from spn_data.timing import Stopwatch
+    from spn_data.work.timing import Stopwatch
 
     area = Area(Path(job.area))
     frames = read_frames(area.folder(FRAMES) / "frames.csv")

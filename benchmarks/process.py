@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from spn_data.parallel import THREAD_LIMITS
+from spn_data.work.parallel import THREAD_LIMITS
 
 _SAMPLE_EVERY_S = 0.25
 

@@ -24,7 +24,7 @@ from rich.table import Table
 from rich.text import Text
 
 from spn_data.errors import SpnError
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 
 # Names of the user's files are shown as they are: brackets in them are no markup, colons no emoji.
 out = Console(highlight=False, markup=False, emoji=False)

@@ -92,11 +92,11 @@ def run(
 
     from cli import page, show
     from spn_data.area import EVALUATION, GEO
-    from spn_data.cluster import dispatch_to
     from spn_data.pipeline.dense import densify, sequences_with_video
     from spn_data.pipeline.register import RegisterStageOptions
     from spn_data.pipeline.register import register as stage
     from spn_data.registration.options import RegisterOptions
+    from spn_data.work.cluster import dispatch_to
 
     if video is None and not all_frames:
         raise click.UsageError("name a VIDEO to register, or give --all-frames")

@@ -15,8 +15,8 @@ from spn_data.features import FeatureOptions, Features, extract_from_bytes
 from spn_data.geometry.camera import Camera
 from spn_data.matching import MatchOptions
 from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
-from spn_data.parallel import Dispatch
-from spn_data.timing import Progress
+from spn_data.work.parallel import Dispatch
+from spn_data.work.timing import Progress
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_fra
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.storage.files import read_csv, write_csv
-from spn_data.timing import Progress
 from spn_data.view_share import SeenMap, view_shares
+from spn_data.work.timing import Progress
 
 _TELLING_M = 0.05  # less beyond the range of heights is not worth a sentence
 _FAR_M = 1000.0  # from the map: nobody plans that

@@ -16,8 +16,8 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints
-from spn_data.parallel import run_batches
-from spn_data.timing import Progress
+from spn_data.work.parallel import run_batches
+from spn_data.work.timing import Progress
 
 _STEP = "label the frames between"
 

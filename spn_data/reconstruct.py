@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
-from spn_data.cluster import dispatch_to
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
@@ -20,9 +19,10 @@ from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
 from spn_data.features import FeatureOptions
 from spn_data.pairs import PairOptions, choose_pairs
-from spn_data.parallel import Dispatch
 from spn_data.storage.files import write_whole
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.cluster import dispatch_to
+from spn_data.work.parallel import Dispatch
+from spn_data.work.timing import Progress, Stopwatch
 
 _DRIFTED = 1.5  # ratio of focal lengths; a video cropped for stabilisation has 1.1 to 1.4
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.grouping import number_within
 from spn_data.geometry.pose import Poses
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 
 _BORDER_STEPS = 17
 _BLOCK = 64  # points that are ruled out together where none of them is in view

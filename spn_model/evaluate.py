@@ -15,7 +15,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_data.storage.record import content_fingerprint
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 from spn_model.baselines import GEM, VLAD, better, guess_mean, oracle, posed
 from spn_model.checkpoint import Checkpoint
 from spn_model.dropout import dropout_estimates, has_dropout

@@ -18,7 +18,7 @@ from spn_data.hdf5_reader import Dataset, DatasetGroup
 from spn_data.hdf5_schema import Role
 from spn_data.storage.files import exchange, write_whole
 from spn_data.storage.record import content_fingerprint, write_json
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 from spn_model.bundle_checks import (
     ExportOptions,
     GroupErrors,

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from spn_data.errors import InputError
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 
 SHIPPED = Path(__file__).parent / "pretrained"
 _TIMEOUT_S = 30.0

@@ -17,9 +17,7 @@ from click.testing import CliRunner
 
 import spn_data
 from cli.data import main
-from spn_data import cluster
 from spn_data.area import EVALUATION, MODEL, Area
-from spn_data.cluster import fingerprint, run_on_cluster
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene
 from spn_data.errors import InputError
@@ -27,6 +25,8 @@ from spn_data.features import FeatureOptions, extract_from_bytes
 from spn_data.labels import read_labels
 from spn_data.pipeline.labels import POSES
 from spn_data.pipeline.model import DATABASE
+from spn_data.work import cluster
+from spn_data.work.cluster import fingerprint, run_on_cluster
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data import child
 from spn_data.colmap import incremental, pycolmap
 from spn_data.colmap.mapping import MappingJob, latest_snapshot
 from spn_data.colmap.model import scene_of
 from spn_data.geometry.pose import Similarity
+from spn_data.work import child
 
 _IMAGES = 40
 Events = list[dict[str, int]]

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.parallel import Team, WorkerDiedError, run_batches
-from spn_data.timing import cpu_seconds
+from spn_data.work.parallel import Team, WorkerDiedError, run_batches
+from spn_data.work.timing import cpu_seconds
 
 
 def square(x: int) -> int:
@@ -136,7 +136,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, sys, time\n"
-        "from spn_data.parallel import run_batches\n"
+        "from spn_data.work.parallel import run_batches\n"
         "def wait(path):\n"
         "    open(path, 'w').write(str(os.getpid())); time.sleep(60)\n"
         "if __name__ == '__main__':\n"
@@ -167,7 +167,7 @@ def test_ctrl_c_at_any_moment_ends_it_though_answers_are_under_way(tmp_path: Pat
     script = tmp_path / "parent.py"
     script.write_text(
         "import signal, sys\n"
-        "from spn_data.parallel import run_batches\n"
+        "from spn_data.work.parallel import run_batches\n"
         "def answer(size):\n"
         "    return bytes(size)\n"
         "if __name__ == '__main__':\n"

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import contextlib
 
-from spn_data import child
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import straighten
 from spn_data.colmap.mapping import MappingJob
+from spn_data.work import child
 
 _SOLVED_EXACTLY = 1000  # images, by COLMAP
 _GROWTH = 1.35  # of images or points, after which all is adjusted

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from spn_data import child
 from spn_data.errors import FormatError
+from spn_data.work import child
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,9 +23,9 @@ from spn_data.pipeline.geo import recorded_options
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.refly import FlyAgain, ReflyOptions, where_to_fly_again
 from spn_data.storage.record import VERSION, read_json, write_json
-from spn_data.timing import Progress
 from spn_data.view_share import SeenMap
 from spn_data.waypoints import Place, Waypoints, read_waypoints, waypoint_columns
+from spn_data.work.timing import Progress
 
 EVALUATED, PLANNED = "coverage", "coverage-waypoints"  # folders in the area
 WAYPOINTS = "waypoints"  # name of the plan, as of a sequence

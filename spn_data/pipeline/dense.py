@@ -39,7 +39,7 @@ from spn_data.registration.frame_covariance import (
     frame_covariances,
 )
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.timing import Progress, Stopwatch
 
 
 def sequences_with_video(area: Area) -> list[str]:

@@ -25,8 +25,8 @@ from spn_data.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind,
 from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
-from spn_data.timing import Progress, Stopwatch
 from spn_data.video import probe
+from spn_data.work.timing import Progress, Stopwatch
 
 # Names beside the folders of the sequences.
 _RESERVED = ("telemetry", "masks", "frames.csv", "cameras.json", "stage.json", "started.json")

@@ -22,7 +22,7 @@ from spn_data.pipeline.move import move_labels
 from spn_data.storage.record import StageRecord, write_json
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.timing import Progress, Stopwatch
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,7 @@ from spn_data.nvm import read_nvm
 from spn_data.nvm_frames import NvmFrames
 from spn_data.photos import decode_photo
 from spn_data.storage.record import content_fingerprint
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 
 LISTS = {
     Role.TRAIN: TRAIN_LIST,

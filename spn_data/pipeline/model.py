@@ -26,7 +26,7 @@ from spn_data.reconstruct import ReconstructResult, reconstruct
 from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.storage.files import read_csv, write_csv
 from spn_data.storage.record import StageRecord, read_json
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.timing import Progress, Stopwatch
 
 DATABASE = "database.db"
 REGISTRATION = "registration.csv"

@@ -16,7 +16,6 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
 from spn_data.map_hash import map_hash
-from spn_data.parallel import Dispatch
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
 from spn_data.pipeline.images import STORED
@@ -37,7 +36,8 @@ from spn_data.registration.register import Registered, labels_of, register_seque
 from spn_data.sources import Source
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
 from spn_data.telemetry.track import Telemetry
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.parallel import Dispatch
+from spn_data.work.timing import Progress, Stopwatch
 
 _MISFIT = 2.0  # times the map's own residuals
 # Relative difference of focal lengths from which two lenses contradict each other if they are one, and up

@@ -23,7 +23,7 @@ from spn_data.sources import Source, SourceKind, discover, safe_name
 from spn_data.split import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry
-from spn_data.timing import Progress
+from spn_data.work.timing import Progress
 
 FRAMES_FILE, TRACK = "frames.csv", "telemetry.csv"
 

@@ -37,7 +37,7 @@ from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, Split
 from spn_data.split_file import write_split
 from spn_data.splitting import make_split
 from spn_data.storage.record import StageRecord
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.timing import Progress, Stopwatch
 
 
 class CambridgeFrames(StrEnum):

@@ -9,11 +9,11 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.matching import MatchOptions, match_descriptors
-from spn_data.parallel import Dispatch
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
 from spn_data.registration.options import RegisterOptions
 from spn_data.storage.files import writing_whole
-from spn_data.timing import Progress
+from spn_data.work.parallel import Dispatch
+from spn_data.work.timing import Progress
 
 _FRAMES_A_BATCH = 4  # neighbours in time look like the same map frames
 

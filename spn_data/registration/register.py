@@ -14,7 +14,6 @@ from spn_data.labels import Labels, SeenPoints
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints
 from spn_data.pairs import PairOptions, sequence_pairs
-from spn_data.parallel import Dispatch
 from spn_data.registration.checks import gather_evidence, judge
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
@@ -23,7 +22,8 @@ from spn_data.registration.options import RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, free_lens, settle, without
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
-from spn_data.timing import Progress, Stopwatch
+from spn_data.work.parallel import Dispatch
+from spn_data.work.timing import Progress, Stopwatch
 
 DATABASE = "database.db"
 _MATCHES = ".matches"

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.parallel import exit_with_parent
 from spn_data.simulate.faces import Texture
 from spn_data.simulate.flight import (
     FlightPath,
@@ -32,6 +31,7 @@ from spn_data.simulate.scene import Place, build_place, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
+from spn_data.work.parallel import exit_with_parent
 
 Progress = Callable[[int, int], None]
 

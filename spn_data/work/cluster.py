@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import InputError
-from spn_data.parallel import Batch, Dispatch, Team, WorkerDiedError
+from spn_data.work.parallel import Batch, Dispatch, Team, WorkerDiedError
 
 _CONNECT_S = 10.0
 _WAIT_FOR_WORKERS_S = 30.0

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from spn_data.parallel import living_workers_cpu_seconds
+from spn_data.work.parallel import living_workers_cpu_seconds
 
 # Called with the step's name, what is done, and the total (0 where that is not known).
 Progress = Callable[[str, int, int], None]
