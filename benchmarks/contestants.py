@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from spn_data.capture.frames import Frames
     from spn_data.correspondences import FramesToMap
-    from spn_data.frames import Frames
     from spn_data.work.timing import Stopwatch
 
 OURS, PYCOLMAP = "ours", "pycolmap"
@@ -148,8 +148,8 @@ def _write_priors(database: Path, frames: FramesToMap, located: object) -> None:
 
 def main(who: str, job: Job) -> None:
     from spn_data.area import FRAMES, Area
+    from spn_data.capture.frames import read_frames
     from spn_data.errors import StageError
-    from spn_data.frames import read_frames
     from spn_data.pipeline.model import frames_to_map
     from spn_data.work.timing import Stopwatch
 

@@ -94,8 +94,8 @@ def simulated_model(options: SimulateOptions, draw: int = 0) -> Model:
 def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptions]:
     """A real reconstruction of simulated flights, and the options that these were made with."""
     from spn_data.area import FRAMES, MODEL, Area
+    from spn_data.capture.frames import read_frames
     from spn_data.colmap.model import read_scene
-    from spn_data.frames import read_frames
 
     made = json.loads((flights / "truth" / "options.json").read_text(encoding="utf-8"))
     options = replace(

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from spn_data.area import FRAMES, Area
-from spn_data.frames import read_frames
+from spn_data.capture.frames import read_frames
 from spn_data.pipeline.frames import FramesOptions, choose_frames, plan
 from spn_data.simulate.flight import simulate_paths
 from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset

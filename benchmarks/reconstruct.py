@@ -30,9 +30,9 @@ from rich.table import Table
 from truth import error_figures, true_of_scene
 
 from spn_data.area import FRAMES, Area
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, load_native, scene_of
 from spn_data.errors import GeometryError, SpnError, StageError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.storage.record import versions
 

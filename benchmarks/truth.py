@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from spn_data.area import FRAMES, GEO, MODEL, Area
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegister.result import GeoFit

@@ -8,12 +8,12 @@ from typing import Any
 
 from cli import options, page, show
 from spn_data.attempts import ReconstructOptions
+from spn_data.capture.selection import SelectionOptions
 from spn_data.features import FeatureOptions
 from spn_data.pipeline.frames import FramesOptions
 from spn_data.pipeline.geo import GeoStageOptions
 from spn_data.pipeline.reconstruct import Options, reconstruct
 from spn_data.pipeline.reconstruct import add as extend
-from spn_data.selection import SelectionOptions
 
 
 def run(

@@ -15,8 +15,8 @@ from typing import Any
 
 import tomli_w
 
+from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError, InUseError, StageError
-from spn_data.sources import safe_name
 from spn_data.storage.files import LOCK, locked, write_whole
 from spn_data.storage.record import (
     VERSION,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.capture.frames import Frames
 from spn_data.dense_segments import SequenceToLabel, read_segments
 from spn_data.dense_tracking import between, track_segment
 from spn_data.dense_values import DenseOptions, TrackedFrame, failed
-from spn_data.frames import Frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.labels import Labels, SeenPoints

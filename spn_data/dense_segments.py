@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data import video
+from spn_data.capture import video
+from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.dense_values import Anchor, DenseOptions, Segment
-from spn_data.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
 from spn_data.labels import Labels, SeenPoints
 from spn_data.map_points import MapPoints

@@ -12,8 +12,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from spn_data.capture.frames import Frames, check_name
 from spn_data.errors import InputError
-from spn_data.frames import Frames, check_name
 from spn_data.geometry.pose import Poses, Similarity, canonical_quats
 from spn_data.storage.files import read_csv, write_csv, writing_whole
 

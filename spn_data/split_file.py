@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from spn_data.capture.frames import check_name
 from spn_data.errors import FormatError
-from spn_data.frames import check_name
 from spn_data.split import (
     LEFT_OUT,
     OPTIMISTIC,

@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from spn_data.capture.sources import safe_name
 from spn_data.hdf5_schema import Role
-from spn_data.sources import safe_name
 from spn_data.storage.files import write_whole
 from spn_model import figures
 from spn_model.baselines import MEAN

@@ -10,14 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data import video
-from spn_data.candidates import photo_stems
+from spn_data.capture import video
+from spn_data.capture.candidates import photo_stems
+from spn_data.capture.photos import PhotoHeaders, decode_photo, read_headers
+from spn_data.capture.sources import Source, SourceKind, discover
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import at_size, of_focal_length
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
-from spn_data.photos import PhotoHeaders, decode_photo, read_headers
-from spn_data.sources import Source, SourceKind, discover
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_model.view import View
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.dense_segments import SequenceToLabel
 from spn_data.dense_values import Anchor, Segment
-from spn_data.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.labels import Labels, LabelStatus, SeenPoints

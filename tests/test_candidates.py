@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from spn_data.candidates import analyse, frames_of
-from spn_data.errors import InputError
-from spn_data.extraction import (
+from spn_data.capture.candidates import analyse, frames_of
+from spn_data.capture.extraction import (
     BYTES_PER_PIXEL,
     check_space,
     estimate_cost,
     extract_chosen,
 )
-from spn_data.frames import Frames, read_frames, write_frames
-from spn_data.measurement import Measurements
-from spn_data.selection import SelectionOptions, choose, choose_photos
-from spn_data.sources import Source, SourceKind, discover
-from spn_data.video import decode
+from spn_data.capture.frames import Frames, read_frames, write_frames
+from spn_data.capture.measurement import Measurements
+from spn_data.capture.selection import SelectionOptions, choose, choose_photos
+from spn_data.capture.sources import Source, SourceKind, discover
+from spn_data.capture.video import decode
+from spn_data.errors import InputError
 
 OPTIONS = SelectionOptions()
 

@@ -18,9 +18,9 @@ from click.testing import CliRunner, Result
 import spn_data.reconstruct
 from cli.data import main
 from spn_data.area import FRAMES, GEO, MODEL, Area
+from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native
 from spn_data.contradiction import Contradiction, FocalChange
-from spn_data.frames import read_frames
 from spn_data.storage.record import read_json
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")

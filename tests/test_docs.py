@@ -14,8 +14,8 @@ import pytest
 from spn_data import errors
 from spn_data.area import STAGES
 from spn_data.attempts import ReconstructOptions
+from spn_data.capture.selection import SelectionOptions
 from spn_data.diagnosis import FrameRegistration
-from spn_data.selection import SelectionOptions
 from spn_data.storage.record import StageRecord
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -142,7 +142,7 @@ def test_columns_of_telemetry_are_documented():
 
 def test_columns_of_frames_csv_are_documented():
     """input.md lists the columns of frames.csv in their order, and the example has them."""
-    from spn_data.frames import _COLUMNS
+    from spn_data.capture.frames import _COLUMNS
 
     assert first_cells(section(page("docs/input.md"), "frames.csv")) == list(_COLUMNS)
     assert f"\n{','.join(_COLUMNS)}\n" in section(page("docs/formats.md"), "1-frames/frames.csv")
@@ -150,7 +150,7 @@ def test_columns_of_frames_csv_are_documented():
 
 def test_examples_of_tables_are_read_by_the_program(tmp_path):
     """The examples in formats.md are files that the readers accept."""
-    from spn_data.frames import read_frames
+    from spn_data.capture.frames import read_frames
     from spn_data.telemetry.table import read_track
 
     blocks = re.findall(r"```csv\n(.*?)```", page("docs/formats.md"), re.DOTALL)

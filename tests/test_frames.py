@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spn_data.capture.frames import Frames, check_name, read_frames, write_frames
 from spn_data.errors import InputError
-from spn_data.frames import Frames, check_name, read_frames, write_frames
 from spn_data.telemetry.track import Telemetry
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from spn_data.capture.photos import decode_photo, decode_photo_gray, load_mask, read_headers
 from spn_data.errors import InputError
-from spn_data.photos import decode_photo, decode_photo_gray, load_mask, read_headers
 
 
 def marked_photo(width: int = 64, height: int = 48) -> np.ndarray:

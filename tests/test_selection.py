@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from spn_data.errors import InputError
-from spn_data.frames import FrameStatus
-from spn_data.measurement import GrayImage, Measurements, measure, sharpness_of
-from spn_data.selection import (
+from spn_data.capture.frames import FrameStatus
+from spn_data.capture.measurement import GrayImage, Measurements, measure, sharpness_of
+from spn_data.capture.selection import (
     SelectionOptions,
     check_usable,
     choose,
@@ -19,6 +18,7 @@ from spn_data.selection import (
     choose_photos,
     relative_sharpness,
 )
+from spn_data.errors import InputError
 
 DEFAULT = SelectionOptions()
 WIDTH = 1280

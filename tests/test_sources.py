@@ -11,8 +11,8 @@ import av
 import numpy as np
 import pytest
 
+from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
-from spn_data.sources import Source, SourceKind, discover, safe_name
 
 
 def touch(folder: Path, *names: str) -> None:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from spn_data.capture.video import DecodeReport, decode, decode_gray, probe
 from spn_data.errors import InputError
-from spn_data.video import DecodeReport, decode, decode_gray, probe
 
 GREEN = (0, 255, 0)
 

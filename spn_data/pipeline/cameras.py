@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.frames import Frames
+from spn_data.capture.frames import Frames
+from spn_data.capture.photos import PhotoHeaders
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import at_size, camera_to_json, of_focal_length
-from spn_data.photos import PhotoHeaders
 
 # Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
 _GUESSED_FOCAL_SHARE = 0.7

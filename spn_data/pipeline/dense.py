@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, MODEL, Area
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import read_map
 from spn_data.dense import dense_labels
 from spn_data.dense_values import DenseOptions
 from spn_data.errors import FormatError, InputError, StageError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
 from spn_data.map_covariance import MapCovariance

@@ -12,20 +12,26 @@ import cv2
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, Area
-from spn_data.candidates import Candidates, analyse, frames_of
+from spn_data.capture.candidates import Candidates, analyse, frames_of
+from spn_data.capture.extraction import Cost, check_space, estimate_cost, extract_chosen
+from spn_data.capture.frames import Frames, read_frames, write_frames
+from spn_data.capture.photos import load_mask
+from spn_data.capture.selection import (
+    Choice,
+    SelectionOptions,
+    check_usable,
+    choose_all,
+    choose_photos,
+)
+from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
+from spn_data.capture.video import probe
 from spn_data.errors import InputError
-from spn_data.extraction import Cost, check_space, estimate_cost, extract_chosen
-from spn_data.frames import Frames, read_frames, write_frames
 from spn_data.geometry.camera_file import camera_to_json, read_camera
-from spn_data.photos import load_mask
 from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks
-from spn_data.selection import Choice, SelectionOptions, check_usable, choose_all, choose_photos
-from spn_data.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
 from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
-from spn_data.video import probe
 from spn_data.work.timing import Progress, Stopwatch
 
 # Names beside the folders of the sequences.

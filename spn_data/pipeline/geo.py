@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import FRAMES, GEO, MODEL, Area, StageWork
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene, write_transformed
 from spn_data.errors import FormatError, GeometryError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegister.observe import align_telemetry
 from spn_data.georegister.offset import TimeOffset, estimate_time_offset

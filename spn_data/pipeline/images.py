@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data import video
 from spn_data.area import EVALUATION, FRAMES, Area
+from spn_data.capture import video
 from spn_data.errors import InputError
 from spn_data.labels import Labels
 from spn_data.pipeline.videos import find_videos

@@ -20,6 +20,7 @@ from spn_data.cambridge import (
     oddities,
     read_cambridge,
 )
+from spn_data.capture.photos import decode_photo
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
@@ -28,7 +29,6 @@ from spn_data.hdf5 import DatasetWriter
 from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.nvm import read_nvm
 from spn_data.nvm_frames import NvmFrames
-from spn_data.photos import decode_photo
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
 

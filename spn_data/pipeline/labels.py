@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Observations, Scene, read_map
 from spn_data.errors import FormatError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin

@@ -13,12 +13,12 @@ import numpy as np
 
 from spn_data.area import FRAMES, MODEL, Area, StageWork
 from spn_data.attempts import ReconstructOptions
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_observations
 from spn_data.contradiction import focal_changes
 from spn_data.correspondences import FramesToMap
 from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
+from spn_data.capture.sources import Source
 from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
@@ -33,7 +34,6 @@ from spn_data.pipeline.telemetry import check_telemetry
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.options import RegisterOptions
 from spn_data.registration.register import Registered, labels_of, register_sequence
-from spn_data.sources import Source
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.area import FRAMES, Area
-from spn_data.candidates import analyse, frames_of
+from spn_data.capture.candidates import analyse, frames_of
+from spn_data.capture.extraction import estimate_cost, extract_chosen
+from spn_data.capture.frames import Frames, FrameStatus, write_frames
+from spn_data.capture.selection import Choice
+from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
-from spn_data.extraction import estimate_cost, extract_chosen
-from spn_data.frames import Frames, FrameStatus, write_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.images import STORED
 from spn_data.pipeline.telemetry import telemetry_of
-from spn_data.selection import Choice
-from spn_data.sources import Source, SourceKind, discover, safe_name
 from spn_data.split import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry

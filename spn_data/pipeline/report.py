@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
+from spn_data.capture.frames import Frames, read_frames
 from spn_data.coverage_table import read_strata
 from spn_data.errors import FormatError, InputError, StageError
-from spn_data.frames import Frames, read_frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.georegister.result import GeoFit

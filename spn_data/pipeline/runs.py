@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
+from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
-from spn_data.sources import safe_name
 from spn_data.storage.record import content_fingerprint
 
 _VERSION = 1  # of metrics.json

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from spn_data.audit import training_points
+from spn_data.capture.photos import load_mask
 from spn_data.coverage import strata_of
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import (
@@ -19,7 +20,6 @@ from spn_data.geometry.rendering import (
 )
 from spn_data.hdf5_schema import DatasetFrame
 from spn_data.labels import Labels, SeenPoints
-from spn_data.photos import load_mask
 from spn_data.pipeline.labels import LabelledArea
 from spn_data.split import LEFT_OUT, TRAIN, Split
 

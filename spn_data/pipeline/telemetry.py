@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from spn_data.candidates import Candidates
+from spn_data.capture.candidates import Candidates
+from spn_data.capture.sources import Source, SourceKind
+from spn_data.capture.video import VideoInfo, probe
 from spn_data.errors import InputError
-from spn_data.sources import Source, SourceKind
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
-from spn_data.video import VideoInfo, probe
 
 # A subtitle file this much shorter or longer than its video is another flight's.
 _LENGTH_TOLERANCE_S = 5.0

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.correspondences import FramesToMap, extract_missing, match_missing
-from spn_data.frames import Frames
 from spn_data.labels import Labels, SeenPoints
 from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data import video
+from spn_data.capture import video
+from spn_data.capture.frames import Frames
+from spn_data.capture.measurement import MEASURE_WIDTH, GrayImage, Measurements, measure
+from spn_data.capture.photos import PhotoHeaders, decode_photo_gray, read_headers
+from spn_data.capture.selection import Choice
+from spn_data.capture.sources import Source, SourceKind, safe_name
 from spn_data.errors import InputError
-from spn_data.frames import Frames
-from spn_data.measurement import MEASURE_WIDTH, GrayImage, Measurements, measure
-from spn_data.photos import PhotoHeaders, decode_photo_gray, read_headers
-from spn_data.selection import Choice
-from spn_data.sources import Source, SourceKind, safe_name
 from spn_data.storage.files import writing_whole
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_data.telemetry.track import Telemetry

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 from spn_data.errors import InputError
 
 if TYPE_CHECKING:
-    from spn_data.video import VideoInfo
+    from spn_data.capture.video import VideoInfo
 
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
@@ -287,7 +287,7 @@ def _is_next_dji_part(
     if before.suffix.lower() != after.suffix.lower() or before.stat().st_size < min_split_bytes:
         return False
     if probe is None:
-        from spn_data import video
+        from spn_data.capture import video
 
         probe = video.probe
     try:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spn_data.capture.frames import FrameStatus
+from spn_data.capture.measurement import Measurements
 from spn_data.errors import InputError
-from spn_data.frames import FrameStatus
-from spn_data.measurement import Measurements
 
 _UNKNOWN_HEIGHT_M = 100.0
 # Positions in the image at which motion is measured, in shares of its width about the centre.

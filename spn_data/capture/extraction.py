@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data import video
+from spn_data.capture import video
+from spn_data.capture.frames import Frames
+from spn_data.capture.photos import decode_photo, read_headers
+from spn_data.capture.sources import Source, SourceKind
 from spn_data.errors import InputError
-from spn_data.frames import Frames
-from spn_data.photos import decode_photo, read_headers
-from spn_data.sources import Source, SourceKind
 from spn_data.storage.files import write_whole
 
 JPEG_QUALITY = 95
