@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from spn_data.features import FeatureOptions
-from spn_data.matching import MatchOptions
-from spn_data.pairs import PairOptions
+from spn_data.matching.features import FeatureOptions
+from spn_data.matching.pairs import PairOptions
+from spn_data.matching.putative import MatchOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,10 +11,10 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
-from spn_data.features import FeatureOptions, Features, extract_from_bytes
 from spn_data.geometry.camera import Camera
-from spn_data.matching import MatchOptions
-from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.features import FeatureOptions, Features, extract_from_bytes
+from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.putative import MatchOptions
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
 

@@ -17,8 +17,8 @@ from spn_data.contradiction import Contradiction, FocalChange, contradictions, f
 from spn_data.correspondences import FramesToMap, appearance_of, extract_missing, match_missing
 from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
-from spn_data.features import FeatureOptions
-from spn_data.pairs import PairOptions, choose_pairs
+from spn_data.matching.features import FeatureOptions
+from spn_data.matching.pairs import PairOptions, choose_pairs
 from spn_data.storage.files import write_whole
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch

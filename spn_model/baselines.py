@@ -9,9 +9,9 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from spn_data.features import FeatureOptions, extract
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.features import FeatureOptions, extract
+from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
 from spn_model.metrics import DEG_PER_M, Estimates, Evaluation, nearest_rows
 
 MEAN, ORACLE = "mean training pose", "nearest training pose (oracle)"

@@ -20,9 +20,9 @@ from spn_data.colmap.model import (
 )
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.errors import FormatError, StageError
-from spn_data.features import Features
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+from spn_data.matching.features import Features
 
 
 @pytest.fixture(scope="module")

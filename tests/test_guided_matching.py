@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
-from spn_data.guided_matching import match_along_lines
-from spn_data.matching import MatchOptions, match_descriptors, unit_descriptors
+from spn_data.matching.guided import match_along_lines
+from spn_data.matching.putative import MatchOptions, match_descriptors, unit_descriptors
 
 CAMERA = Camera.from_horizontal_fov(800, 600, 70)
 OPTIONS = MatchOptions()

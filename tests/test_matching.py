@@ -8,9 +8,9 @@ import pytest
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import ImageForMatching, match_pairs, verification_options
-from spn_data.features import FeatureOptions, Features, extract
 from spn_data.geometry.camera import Camera
-from spn_data.matching import Comparison, MatchOptions, match_descriptors
+from spn_data.matching.features import FeatureOptions, Features, extract
+from spn_data.matching.putative import Comparison, MatchOptions, match_descriptors
 
 
 @pytest.fixture(scope="module")

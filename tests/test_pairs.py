@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spn_data.pairs import (
+from spn_data.matching.pairs import (
     PairOptions,
     appearance_pairs,
     appearance_vocabulary,

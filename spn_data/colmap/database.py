@@ -17,8 +17,8 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import VerifiedPair, native_camera
 from spn_data.errors import FormatError, StageError
-from spn_data.features import Features
 from spn_data.geometry.camera import Camera
+from spn_data.matching.features import Features
 
 
 @dataclass(frozen=True)

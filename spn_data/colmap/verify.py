@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from spn_data.colmap import pycolmap
-from spn_data.features import Features
 from spn_data.geometry.camera import Camera
-from spn_data.guided_matching import match_along_lines
-from spn_data.matching import Comparison, MatchOptions
+from spn_data.matching.features import Features
+from spn_data.matching.guided import match_along_lines
+from spn_data.matching.putative import Comparison, MatchOptions
 
 _ITERATIONS = 1000  # of its estimation, at most
 

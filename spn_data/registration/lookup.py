@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.database import MapDatabase
-from spn_data.matching import MatchOptions, match_descriptors
+from spn_data.matching.putative import MatchOptions, match_descriptors
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
 from spn_data.registration.options import RegisterOptions
 from spn_data.storage.files import writing_whole

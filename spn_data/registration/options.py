@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from spn_data.features import FeatureOptions
-from spn_data.matching import MatchOptions
+from spn_data.matching.features import FeatureOptions
+from spn_data.matching.putative import MatchOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from spn_data.matching import MatchOptions, mutual_matches, unit_descriptors
+from spn_data.matching.putative import MatchOptions, mutual_matches, unit_descriptors
 
 _ROWS = 128  # features whose lines are neighbours, compared at a time
 

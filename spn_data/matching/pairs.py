@@ -9,7 +9,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from spn_data.matching import unit_descriptors
+from spn_data.matching.putative import unit_descriptors
 
 
 @dataclass(frozen=True, kw_only=True)
