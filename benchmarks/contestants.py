@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from spn_data.capture.frames import Frames
-    from spn_data.correspondences import FramesToMap
+    from spn_data.reconstruction.correspondences import FramesToMap
     from spn_data.work.timing import Stopwatch
 
 OURS, PYCOLMAP = "ours", "pycolmap"
@@ -45,8 +45,8 @@ class Result:
 
 def run_ours(frames: FramesToMap, job: Job, stopwatch: Stopwatch) -> tuple[Path, tuple[str, ...]]:
     """Our reconstruction with its default options."""
-    from spn_data.attempts import ReconstructOptions
-    from spn_data.reconstruct import reconstruct
+    from spn_data.reconstruction.attempts import ReconstructOptions
+    from spn_data.reconstruction.reconstruct import reconstruct
 
     options = ReconstructOptions(threads=job.threads, seed=job.seed)
     made = reconstruct(frames, Path(job.work), options, lambda *_: None, stopwatch)

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-import spn_data.reconstruct
+import spn_data.reconstruction.reconstruct
 from cli.data import main
 from spn_data.area import FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native
-from spn_data.contradiction import Contradiction, FocalChange
+from spn_data.reconstruction.contradiction import Contradiction, FocalChange
 from spn_data.storage.record import read_json
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
@@ -252,7 +252,7 @@ def test_a_model_that_is_contradicted_is_made_again(
 ) -> None:
     """The first time, as a wrong one would be, or each time: all attempts are made then, and it is told."""
     answers = [[wrong]] * 3 if stays else [[wrong], []]
-    monkeypatch.setattr(spn_data.reconstruct, judge, lambda *_: answers.pop(0))
+    monkeypatch.setattr(spn_data.reconstruction.reconstruct, judge, lambda *_: answers.pop(0))
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
     assert result.exit_code == 0, result.output
     assert answers == []
@@ -269,7 +269,7 @@ _MISPLACED = "flight1/000008.jpg"
 def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """A frame is found to be misplaced in the first model; what the real judgement says of each model."""
     judged: list[list[str]] = []
-    drop: Callable[..., list[str]] = spn_data.reconstruct.drop_misplaced
+    drop: Callable[..., list[str]] = spn_data.reconstruction.reconstruct.drop_misplaced
 
     def drop_one(source: Path, target: Path, matches: dict[tuple[str, str], int]) -> list[str]:
         judged.append(drop(source, target, matches))
@@ -281,7 +281,7 @@ def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         write_native(model, target)
         return [_MISPLACED]
 
-    monkeypatch.setattr(spn_data.reconstruct, "drop_misplaced", drop_one)
+    monkeypatch.setattr(spn_data.reconstruction.reconstruct, "drop_misplaced", drop_one)
     return judged
 
 
@@ -303,7 +303,7 @@ def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_p
     flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By then the database holds more matches than the first model was made of."""
-    match = spn_data.reconstruct.match_missing
+    match = spn_data.reconstruction.reconstruct.match_missing
     matched = []
 
     def match_and_stop(*arguments: Any) -> None:
@@ -314,7 +314,7 @@ def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_p
 
     whole, area = Area(tmp_path / "whole"), Area(tmp_path / "area")
     assert run("reconstruct", flight1, "--area", whole.root, *FAST).exit_code == 0
-    monkeypatch.setattr(spn_data.reconstruct, "match_missing", match_and_stop)
+    monkeypatch.setattr(spn_data.reconstruction.reconstruct, "match_missing", match_and_stop)
     assert run("reconstruct", flight1, "--area", area.root, *FAST).exit_code == 130
     result = run("reconstruct", flight1, "--area", area.root, *FAST)
     assert result.exit_code == 0, result.output

@@ -11,10 +11,10 @@ from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.model import write_native
 from spn_data.colmap.verify import VerifiedPair
-from spn_data.correspondences import FramesToMap
-from spn_data.diagnosis import FrameRegistration, diagnose, missing_passages
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
+from spn_data.reconstruction.correspondences import FramesToMap
+from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose, missing_passages
 
 CAMERA = Camera.from_horizontal_fov(1024, 768, 60, (0.0,))
 

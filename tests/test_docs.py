@@ -13,9 +13,9 @@ import pytest
 
 from spn_data import errors
 from spn_data.area import STAGES
-from spn_data.attempts import ReconstructOptions
 from spn_data.capture.selection import SelectionOptions
-from spn_data.diagnosis import FrameRegistration
+from spn_data.reconstruction.attempts import ReconstructOptions
+from spn_data.reconstruction.diagnosis import FrameRegistration
 from spn_data.storage.record import StageRecord
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,11 +12,11 @@ import pytest
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import Observations, Scene, read_observations
-from spn_data.frame_jitter import most_likely_scatter
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import projection_jacobians
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
-from spn_data.shutter import (
+from spn_data.reconstruction.frame_jitter import most_likely_scatter
+from spn_data.reconstruction.shutter import (
     ShutterDiagnosis,
     ShutterOptions,
     diagnose_shutter,

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import FRAMES, MODEL, Area, StageWork
-from spn_data.attempts import ReconstructOptions
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_observations
-from spn_data.contradiction import focal_changes
-from spn_data.correspondences import FramesToMap
-from spn_data.diagnosis import FrameRegistration, missing_passages
 from spn_data.errors import FormatError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
-from spn_data.reconstruct import ReconstructResult, reconstruct
-from spn_data.shutter import ShutterDiagnosis, diagnose_shutter
+from spn_data.reconstruction.attempts import ReconstructOptions
+from spn_data.reconstruction.contradiction import focal_changes
+from spn_data.reconstruction.correspondences import FramesToMap
+from spn_data.reconstruction.diagnosis import FrameRegistration, missing_passages
+from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
+from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.storage.files import read_csv, write_csv
 from spn_data.storage.record import StageRecord, read_json
 from spn_data.work.timing import Progress, Stopwatch

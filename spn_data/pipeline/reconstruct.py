@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Protocol
 
 from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
-from spn_data.attempts import ReconstructOptions
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegister.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
@@ -18,7 +17,8 @@ from spn_data.pipeline.geo import (
     recorded_options,
 )
 from spn_data.pipeline.model import build_model
-from spn_data.reconstruct import estimate_model_cost
+from spn_data.reconstruction.attempts import ReconstructOptions
+from spn_data.reconstruction.reconstruct import estimate_model_cost
 from spn_data.storage.record import StageRecord, read_json
 from spn_data.telemetry.track import TelemetrySummary
 

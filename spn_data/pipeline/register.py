@@ -11,7 +11,6 @@ import numpy as np
 
 from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.capture.sources import Source
-from spn_data.correspondences import FramesToMap
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
@@ -31,6 +30,7 @@ from spn_data.pipeline.labels import (
 )
 from spn_data.pipeline.register_source import find_source, take_frames
 from spn_data.pipeline.telemetry import check_telemetry
+from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.options import RegisterOptions
 from spn_data.registration.register import Registered, labels_of, register_sequence

@@ -8,10 +8,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from spn_data.colmap.model import Observations, Scene
-from spn_data.frame_jitter import frame_jitter
 from spn_data.geometry.least_squares import POSE
 from spn_data.geometry.pose import Poses
-from spn_data.residual_fit import Block, Partialled, linearize, partial_out, solve_spd
+from spn_data.reconstruction.frame_jitter import frame_jitter
+from spn_data.reconstruction.residual_fit import (
+    Block,
+    Partialled,
+    linearize,
+    partial_out,
+    solve_spd,
+)
 
 _KINDS = ("zoom", "shear", "stretch")
 _PLAUSIBLE_READOUT_S = 0.07  # slowest sensors of drones take about 50 ms for a frame

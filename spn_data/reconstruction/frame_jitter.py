@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from spn_data.geometry.least_squares import POSE
-from spn_data.residual_fit import FRAME_EFFECTS, Block, Partialled, solve_spd
+from spn_data.reconstruction.residual_fit import FRAME_EFFECTS, Block, Partialled, solve_spd
 
 _LENS_SIGMA = 0.02  # zoom, shear or stretch that all frames may have alike
 _MISFIT = 2.5  # times the noise: what lens model and matches leave in real models' frames, measured

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_observations
-from spn_data.correspondences import FramesToMap
+from spn_data.reconstruction.correspondences import FramesToMap
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,27 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import Scene, count_registered, read_scene
-from spn_data.contradiction import Contradiction, FocalChange, contradictions, focal_changes
-from spn_data.correspondences import FramesToMap, appearance_of, extract_missing, match_missing
-from spn_data.diagnosis import FrameRegistration, diagnose
 from spn_data.errors import StageError
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
+from spn_data.reconstruction.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
+from spn_data.reconstruction.contradiction import (
+    Contradiction,
+    FocalChange,
+    contradictions,
+    focal_changes,
+)
+from spn_data.reconstruction.correspondences import (
+    FramesToMap,
+    appearance_of,
+    extract_missing,
+    match_missing,
+)
+from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
 from spn_data.storage.files import write_whole
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch

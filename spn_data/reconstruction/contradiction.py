@@ -8,8 +8,8 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene
-from spn_data.correspondences import FramesToMap
 from spn_data.geometry.epipolar import essential_matrix, sampson_errors
+from spn_data.reconstruction.correspondences import FramesToMap
 
 # Epipolar error of a match in focal lengths, 12 px of a drone's video; a wrong pose leaves a few hundredths
 # of them below it.
