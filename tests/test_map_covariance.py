@@ -11,12 +11,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from spn_data.bundle_jacobians import (
-    Bundle,
-    Unknowns,
-    gauge_directions,
-    linearize_bundle,
-)
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import Observations, Scene, read_observations
 from spn_data.errors import GeometryError
@@ -29,7 +23,13 @@ from spn_data.geometry.pose import (
     rotations_from_angles,
     rotations_from_vectors,
 )
-from spn_data.map_covariance import Functional, MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.bundle_jacobians import (
+    Bundle,
+    Unknowns,
+    gauge_directions,
+    linearize_bundle,
+)
+from spn_data.uncertainty.map_covariance import Functional, MapCovariance, MapCovarianceOptions
 from tests.native_world import native_model
 
 INDEPENDENT = MapCovarianceOptions(clustered=False)
@@ -323,7 +323,7 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
     whole = small()
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
     at_once = MapCovariance.of(made.scene, made.seen)
-    monkeypatch.setattr("spn_data.map_covariance._MEASUREMENTS_AT_ONCE", 100)
+    monkeypatch.setattr("spn_data.uncertainty.map_covariance._MEASUREMENTS_AT_ONCE", 100)
     in_pieces = MapCovariance.of(made.scene, made.seen)
     assert np.allclose(in_pieces.pose_covariances(), at_once.pose_covariances(), rtol=1e-6)
     wanted = some_functional(made.scene, 1)

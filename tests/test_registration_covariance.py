@@ -10,7 +10,6 @@ import pytest
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
-from spn_data.map_covariance import MapCovariance, MapCovarianceOptions
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,
@@ -23,6 +22,7 @@ from spn_data.registration.frame_covariance import (
     LensUncertainty,
     frame_covariances,
 )
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
 from tests.test_map_covariance import Small, small
 
 CHI2_MEDIAN = 5.348

@@ -16,7 +16,6 @@ from spn_data.dense_values import DenseOptions
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
-from spn_data.map_covariance import MapCovariance
 from spn_data.map_hash import map_hash
 from spn_data.map_points import MapPoints
 from spn_data.pipeline.labels import (
@@ -39,6 +38,7 @@ from spn_data.registration.frame_covariance import (
     frame_covariances,
 )
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
+from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.timing import Progress, Stopwatch
 
 

@@ -18,10 +18,10 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Similarity
 from spn_data.georegister.result import GeoFit
 from spn_data.labels import Labels, SeenPoints, read_labels, read_seen_points
-from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints, covered_share
 from spn_data.pipeline.model import read_reasons
 from spn_data.storage.record import read_json
+from spn_data.uncertainty.map_covariance import MapCovariance
 
 POSES, SEEN, CAMERA, REGISTRATION = (
     "poses.csv",

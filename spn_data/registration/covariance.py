@@ -19,7 +19,6 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from spn_data.geometry.least_squares import POSE, cauchy_weights, cluster_pulls, rows_to_sparse
-from spn_data.map_covariance import Functional, MapCovariance
 from spn_data.registration.adjustment import (
     Linearized,
     SequenceObservations,
@@ -29,6 +28,7 @@ from spn_data.registration.adjustment import (
     normal_equations,
 )
 from spn_data.registration.solution import SCALE_PX
+from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
 _FRAMES_AT_ONCE = 8
 # Residuals of a sequence are usually a fifth larger than the map's own. Where they are more than half as

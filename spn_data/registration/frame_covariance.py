@@ -14,7 +14,6 @@ import numpy as np
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import LENS, POSE, cauchy_weights, projection_jacobians
 from spn_data.geometry.pose import Poses
-from spn_data.map_covariance import Functional, MapCovariance
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,
@@ -23,6 +22,7 @@ from spn_data.registration.adjustment import (
 )
 from spn_data.registration.covariance import bend_factor
 from spn_data.registration.solution import SCALE_PX
+from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
 _FRAMES_AT_ONCE = 32
 

@@ -10,7 +10,6 @@ import numpy as np
 from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.labels import Labels, SeenPoints
-from spn_data.map_covariance import MapCovariance
 from spn_data.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
 from spn_data.reconstruction.correspondences import FramesToMap, extract_missing, match_missing
@@ -22,6 +21,7 @@ from spn_data.registration.options import RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, free_lens, settle, without
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
+from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
 

@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spn_data.bundle_jacobians import GAUGE, Bundle, Unknowns, linearize_bundle
 from spn_data.colmap.model import Observations, Scene
 from spn_data.errors import GeometryError
-from spn_data.gauged_inverse import GaugedInverse
 from spn_data.geometry.least_squares import POSE, cluster_pulls
-from spn_data.track_noise import TrackNoise, fit_track_noise, own_errors
+from spn_data.uncertainty.bundle_jacobians import GAUGE, Bundle, Unknowns, linearize_bundle
+from spn_data.uncertainty.gauged_inverse import GaugedInverse
+from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, own_errors
 
 _FRAMES_AT_ONCE = 32
 _MEASUREMENTS_AT_ONCE = 200_000

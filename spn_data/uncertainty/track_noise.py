@@ -16,7 +16,7 @@ import numpy as np
 from scipy import optimize
 from scipy.special import gammaln
 
-from spn_data.bundle_jacobians import Bundle
+from spn_data.uncertainty.bundle_jacobians import Bundle
 
 # Much more than any track sees: what a drift does over a track's views grows with their change. It is not
 # estimated, as only its ratio to the variance matters then.

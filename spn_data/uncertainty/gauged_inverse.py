@@ -9,10 +9,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from spn_data.bundle_jacobians import GAUGE, Unknowns, gauge_directions
 from spn_data.colmap.model import Scene
 from spn_data.errors import GeometryError
 from spn_data.geometry.least_squares import POSE
+from spn_data.uncertainty.bundle_jacobians import GAUGE, Unknowns, gauge_directions
 
 _SMALLEST_PIVOT = 1e-10  # of the information scaled to a unit diagonal: less is rounding
 _UNTIED = "the map's measurements do not tie its frames together"
