@@ -20,7 +20,7 @@ from spn_data.area import GEO, Area
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
-from spn_data.georegister.result import GeoFit
+from spn_data.georegistration.result import GeoFit
 from spn_data.storage.record import read_json
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
-from spn_data.georegister import (
+from spn_data.georegistration import (
     GeoFit,
     GeoregisterOptions,
     align_telemetry,
@@ -31,7 +31,7 @@ from spn_data.georegister import (
     georegister,
     georegistration_errors,
 )
-from spn_data.georegister.uncertainty import radius_sigma
+from spn_data.georegistration.uncertainty import radius_sigma
 from spn_data.simulate.flight import FlightPath, simulate_paths, simulate_telemetry
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset

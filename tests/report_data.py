@@ -9,9 +9,9 @@ import numpy as np
 from spn_data import audit
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles
-from spn_data.georegister.crossval import HeldOut
-from spn_data.georegister.result import FitSummary, GeoFit
-from spn_data.georegister.uncertainty import Uncertainty
+from spn_data.georegistration.crossval import HeldOut
+from spn_data.georegistration.result import FitSummary, GeoFit
+from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.map_points import MapPoints
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.split import Split, SplitOptions

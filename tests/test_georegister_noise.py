@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.pose import Similarity, rotations_from_angles, rotations_from_vectors
-from spn_data.georegister import georegistration_errors
-from spn_data.georegister.crossval import time_blocks
-from spn_data.georegister.gravity import level_up, robust_direction
-from spn_data.georegister.noise import (
+from spn_data.georegistration import georegistration_errors
+from spn_data.georegistration.crossval import time_blocks
+from spn_data.georegistration.gravity import level_up, robust_direction
+from spn_data.georegistration.noise import (
     Chains,
     Levels,
     Linear,
@@ -18,7 +18,7 @@ from spn_data.georegister.noise import (
     robust_weights,
     solve,
 )
-from spn_data.georegister.uncertainty import Uncertainty, radius_sigma
+from spn_data.georegistration.uncertainty import Uncertainty, radius_sigma
 
 TABLE = [(0.7, 0.5, 0.1, 1.0), (1.1, 0.5, 0.2, 1.0)]
 

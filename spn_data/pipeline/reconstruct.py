@@ -8,7 +8,7 @@ from typing import Protocol
 
 from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
 from spn_data.errors import GeometryError, StageError
-from spn_data.georegister.result import GeoFit
+from spn_data.georegistration.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
 from spn_data.pipeline.geo import (
     GeoStageOptions,

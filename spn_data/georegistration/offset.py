@@ -8,17 +8,17 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
-from spn_data.georegister.fit import covariance_of
-from spn_data.georegister.noise import (
+from spn_data.georegistration.fit import covariance_of
+from spn_data.georegistration.noise import (
     Linear,
     improve_levels,
     robust_cost,
     robust_weights,
     solve,
 )
-from spn_data.georegister.observe import Fixes, observe
-from spn_data.georegister.options import GeoregisterOptions
-from spn_data.georegister.problem import Kind, Problem, State
+from spn_data.georegistration.observe import Fixes, observe
+from spn_data.georegistration.options import GeoregisterOptions
+from spn_data.georegistration.problem import Kind, Problem, State
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FRAMES = 12

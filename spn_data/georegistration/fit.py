@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.georegister.noise import Levels, Solution, improve_levels, robust_weights, solve
-from spn_data.georegister.problem import SHARED, Problem, State
+from spn_data.georegistration.noise import Levels, Solution, improve_levels, robust_weights, solve
+from spn_data.georegistration.problem import SHARED, Problem, State
 
 _ROUNDS = 40
 _SAME_PLACE_SIGMAS = 3.0

@@ -9,10 +9,10 @@ from scipy.special import gammaincinv
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Similarity, rotation_vectors
-from spn_data.georegister.fit import Estimate, covariance_of
-from spn_data.georegister.noise import inverse_times, solve
-from spn_data.georegister.options import GeoregisterOptions
-from spn_data.georegister.problem import Kind, Problem
+from spn_data.georegistration.fit import Estimate, covariance_of
+from spn_data.georegistration.noise import inverse_times, solve
+from spn_data.georegistration.options import GeoregisterOptions
+from spn_data.georegistration.problem import Kind, Problem
 
 
 @dataclass(frozen=True, eq=False)

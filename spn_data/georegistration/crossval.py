@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.georegister.fit import Estimate
-from spn_data.georegister.noise import solve
-from spn_data.georegister.problem import Kind, Problem
+from spn_data.georegistration.fit import Estimate
+from spn_data.georegistration.noise import solve
+from spn_data.georegistration.problem import Kind, Problem
 
 
 @dataclass(frozen=True)

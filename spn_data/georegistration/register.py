@@ -9,15 +9,15 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.georegister.crossval import HeldOut, cross_validate, time_blocks
-from spn_data.georegister.fit import FIXED_OFFSET_M, Estimate, estimate
-from spn_data.georegister.gravity import Gravity, gravity_from_gimbal, level_up
-from spn_data.georegister.observe import Fixes, observe
-from spn_data.georegister.options import GeoregisterOptions
-from spn_data.georegister.problem import Kind, Problem
-from spn_data.georegister.result import FitSummary, GeoFit
-from spn_data.georegister.start import extent, find_start
-from spn_data.georegister.uncertainty import Uncertainty, effective_fixes, require_determined
+from spn_data.georegistration.crossval import HeldOut, cross_validate, time_blocks
+from spn_data.georegistration.fit import FIXED_OFFSET_M, Estimate, estimate
+from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, level_up
+from spn_data.georegistration.observe import Fixes, observe
+from spn_data.georegistration.options import GeoregisterOptions
+from spn_data.georegistration.problem import Kind, Problem
+from spn_data.georegistration.result import FitSummary, GeoFit
+from spn_data.georegistration.start import extent, find_start
+from spn_data.georegistration.uncertainty import Uncertainty, effective_fixes, require_determined
 from spn_data.telemetry.track import Telemetry
 
 # A frame whose fix lies this many sigma of white noise off its neighbours is called an outlier.

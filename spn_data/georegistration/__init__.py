@@ -1,0 +1,25 @@
+"""Georegistration: a model in its own gauge and telemetry give the model's place in the world, in metres."""
+
+from spn_data.georegistration.crossval import HeldOut
+from spn_data.georegistration.observe import align_telemetry
+from spn_data.georegistration.offset import OffsetOptions, TimeOffset, estimate_time_offset
+from spn_data.georegistration.options import GeoregisterOptions, Heights
+from spn_data.georegistration.register import georegister
+from spn_data.georegistration.result import FitSummary, GeoFit
+from spn_data.georegistration.uncertainty import GeoErrors, Uncertainty, georegistration_errors
+
+__all__ = [
+    "FitSummary",
+    "GeoErrors",
+    "GeoFit",
+    "GeoregisterOptions",
+    "Heights",
+    "HeldOut",
+    "OffsetOptions",
+    "TimeOffset",
+    "Uncertainty",
+    "align_telemetry",
+    "estimate_time_offset",
+    "georegister",
+    "georegistration_errors",
+]
