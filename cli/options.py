@@ -179,7 +179,7 @@ def geo_options(
 ) -> GeoStageOptions:
     """What those options say."""
     from spn_data.geometry.geodesy import HeightReference
-    from spn_data.georegistration.options import GeoregisterOptions, Heights
+    from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
     from spn_data.pipeline.geo import GeoStageOptions
 
     if takeoff_alt_m is not None and height_reference is None:

@@ -9,7 +9,7 @@ import numpy as np
 from spn_data import audit
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles
-from spn_data.georegistration.crossval import HeldOut
+from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.map_points import MapPoints

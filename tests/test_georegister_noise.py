@@ -7,7 +7,7 @@ import pytest
 
 from spn_data.geometry.pose import Similarity, rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration import georegistration_errors
-from spn_data.georegistration.crossval import time_blocks
+from spn_data.georegistration.cross_validation import time_blocks
 from spn_data.georegistration.gravity import level_up, robust_direction
 from spn_data.georegistration.noise import (
     Chains,

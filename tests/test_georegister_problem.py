@@ -9,8 +9,8 @@ import pytest
 
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import rotations_from_angles, rotations_from_vectors
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.observe import Fixes
-from spn_data.georegistration.options import GeoregisterOptions
 from spn_data.georegistration.problem import SHARED, Kind, Problem, State
 
 ROTATION = rotations_from_vectors(np.array([0.3, 1.2, -0.5]))

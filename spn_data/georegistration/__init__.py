@@ -1,10 +1,10 @@
 """Georegistration: a model in its own gauge and telemetry give the model's place in the world, in metres."""
 
-from spn_data.georegistration.crossval import HeldOut
+from spn_data.georegistration.cross_validation import HeldOut
+from spn_data.georegistration.georegister import georegister
+from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
 from spn_data.georegistration.observe import align_telemetry
 from spn_data.georegistration.offset import OffsetOptions, TimeOffset, estimate_time_offset
-from spn_data.georegistration.options import GeoregisterOptions, Heights
-from spn_data.georegistration.register import georegister
 from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import GeoErrors, Uncertainty, georegistration_errors
 

@@ -9,6 +9,7 @@ import numpy as np
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
 from spn_data.georegistration.fit import covariance_of
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import (
     Linear,
     improve_levels,
@@ -17,7 +18,6 @@ from spn_data.georegistration.noise import (
     solve,
 )
 from spn_data.georegistration.observe import Fixes, observe
-from spn_data.georegistration.options import GeoregisterOptions
 from spn_data.georegistration.problem import Kind, Problem, State
 from spn_data.telemetry.track import Telemetry
 

@@ -8,9 +8,9 @@ from enum import IntEnum
 import numpy as np
 
 from spn_data.geometry.pose import Similarity, quats_from_rotations, rotations_from_vectors
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import Chains, Levels, Linear
 from spn_data.georegistration.observe import Fixes
-from spn_data.georegistration.options import GeoregisterOptions
 
 SHARED = 7  # parameters: centre (3), rotation vector in the world (3), logarithm of scale
 _FREE_HEIGHT_M = 1e3  # sigma of a height that nothing is known of

@@ -11,7 +11,7 @@ import numpy as np
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Similarity
-from spn_data.georegistration.crossval import HeldOut
+from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
 
 VERSION = 1

@@ -8,8 +8,8 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Similarity, rotations_from_vectors
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.observe import Fixes
-from spn_data.georegistration.options import GeoregisterOptions
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from scipy.special import gammaincinv
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Similarity, rotation_vectors
 from spn_data.georegistration.fit import Estimate, covariance_of
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import inverse_times, solve
-from spn_data.georegistration.options import GeoregisterOptions
 from spn_data.georegistration.problem import Kind, Problem
 
 

@@ -13,10 +13,10 @@ from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene, write_transformed
 from spn_data.errors import FormatError, GeometryError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.georegistration.georegister import georegister as fit
+from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
 from spn_data.georegistration.observe import align_telemetry
 from spn_data.georegistration.offset import TimeOffset, estimate_time_offset
-from spn_data.georegistration.options import GeoregisterOptions, Heights
-from spn_data.georegistration.register import georegister as fit
 from spn_data.georegistration.result import GeoFit
 from spn_data.pipeline.move import move_labels
 from spn_data.storage.record import StageRecord, write_json

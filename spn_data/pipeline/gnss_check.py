@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.georegistration.georegister_options import default_sigma_m
 from spn_data.georegistration.offset import estimate_time_offset
-from spn_data.georegistration.options import default_sigma_m
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels import Labels
 from spn_data.telemetry.track import Telemetry

@@ -9,11 +9,11 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.georegistration.crossval import HeldOut, cross_validate, time_blocks
+from spn_data.georegistration.cross_validation import HeldOut, cross_validate, time_blocks
 from spn_data.georegistration.fit import FIXED_OFFSET_M, Estimate, estimate
+from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, level_up
 from spn_data.georegistration.observe import Fixes, observe
-from spn_data.georegistration.options import GeoregisterOptions
 from spn_data.georegistration.problem import Kind, Problem
 from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.start import extent, find_start
