@@ -23,7 +23,7 @@ from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegistration.result import GeoFit
-from spn_data.labels import Labels
+from spn_data.labels.labels import Labels
 from spn_data.simulate.truth import read_truth
 from spn_data.storage.record import read_json
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spn_data.geometry.pose import rotation_errors_deg
-from spn_data.labels import Labels, SeenPoints
+from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.split import (
     OPTIMISTIC,
     SLACK,

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.audit import Finding, finding_of
 from spn_data.geometry.pose import Poses
-from spn_data.labels import Labels
+from spn_data.labels.labels import Labels
 from spn_data.split import LEFT_OUT, TEST, TRAIN, VALIDATION, Split
 
 # Half a unit of the sixth decimal, and what rounding adds.

@@ -14,8 +14,8 @@ from spn_data.dense_tracking import between, track_segment
 from spn_data.dense_values import DenseOptions, TrackedFrame, failed
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.labels import Labels, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.work.parallel import run_batches
 from spn_data.work.timing import Progress
 

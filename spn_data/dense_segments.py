@@ -12,8 +12,8 @@ from spn_data.capture import video
 from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.dense_values import Anchor, DenseOptions, Segment
 from spn_data.geometry.camera import Camera
-from spn_data.labels import Labels, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.map_points import MapPoints
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from spn_data.labels import Labels
+from spn_data.labels.labels import Labels
 
 TRAIN, VALIDATION, TEST, LEFT_OUT = "train", "validation", "test", ""
 GROUPS = (TRAIN, VALIDATION, TEST)  # no evaluation sequence may have the name of one

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spn_data.errors import GeometryError, StageError
-from spn_data.labels import Labels
+from spn_data.labels.labels import Labels
 from spn_data.split import (
     GROUPS,
     GUARD_DISTANCE,

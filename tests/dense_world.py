@@ -12,8 +12,8 @@ from spn_data.dense_segments import SequenceToLabel
 from spn_data.dense_values import Anchor, Segment
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.labels import Labels, LabelStatus, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.simulate.video_out import write_video
 
 CAMERA = Camera.from_horizontal_fov(480, 270, 80, (-0.08, 0.02))

@@ -11,7 +11,7 @@ from spn_data import audit, audit_files
 from spn_data.audit import Finding, MapHashes, Verdict
 from spn_data.audit_files import PoseList
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
 from spn_data.split import LEFT_OUT, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.splitting import make_split
 

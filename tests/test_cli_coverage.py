@@ -20,7 +20,7 @@ from spn_data.coverage_table import COLUMNS
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, angles_from_rotations
-from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
 from spn_data.pipeline.coverage import PLANNED, read_coverage, stale_because
 from spn_data.pipeline.labels import (
     LabelledArea,

@@ -16,7 +16,7 @@ from spn_data.area import EVALUATION, FRAMES, MODEL, SPLIT, Area
 from spn_data.cambridge import read_cambridge
 from spn_data.hdf5_reader import Dataset
 from spn_data.hdf5_schema import Role
-from spn_data.labels import LabelStatus, read_labels, write_labels
+from spn_data.labels.labels import LabelStatus, read_labels, write_labels
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import read_labelled_area
 from spn_data.split_file import read_split

@@ -33,8 +33,8 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
+from spn_data.labels.map_points import MapPoints
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.export import Format
 from spn_data.pipeline.images import image_path

@@ -13,7 +13,7 @@ from spn_data.area import MODEL
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles
-from spn_data.labels import (
+from spn_data.labels.labels import (
     Labels,
     SeenPoints,
     read_labels,
@@ -21,8 +21,8 @@ from spn_data.labels import (
     write_labels,
     write_seen_points,
 )
-from spn_data.map_hash import map_hash
-from spn_data.map_points import MapPoints, covered_share
+from spn_data.labels.map_hash import map_hash
+from spn_data.labels.map_points import MapPoints, covered_share
 from spn_data.registration.frozen_map import FrozenMap
 
 

@@ -23,8 +23,8 @@ from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
-from spn_data.labels import _COLUMNS, Labels, read_labels, read_seen_points
-from spn_data.map_hash import map_hash
+from spn_data.labels.labels import _COLUMNS, Labels, read_labels, read_seen_points
+from spn_data.labels.map_hash import map_hash
 from spn_data.pipeline.frames import FramesOptions, plan
 from spn_data.pipeline.labels import (
     LabelledArea,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.pose import pose_errors
-from spn_data.map_points import MapPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge, same_pose
 from spn_data.registration.options import CheckOptions, RegisterOptions
 from spn_data.registration.register import accept

@@ -14,7 +14,7 @@ from spn_data.colmap import pycolmap
 from spn_data.errors import FormatError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.map_points import MapPoints
+from spn_data.labels.map_points import MapPoints
 
 
 @dataclass(frozen=True, eq=False)

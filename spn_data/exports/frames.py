@@ -10,8 +10,8 @@ import numpy as np
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin
-from spn_data.labels import Labels, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.map_points import MapPoints
 
 
 @dataclass(frozen=True, eq=False)

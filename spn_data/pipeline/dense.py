@@ -15,9 +15,9 @@ from spn_data.dense import dense_labels
 from spn_data.dense_values import DenseOptions
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
-from spn_data.labels import Labels, SeenPoints, write_labels, write_seen_points
-from spn_data.map_hash import map_hash
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.labels.map_hash import map_hash
+from spn_data.labels.map_points import MapPoints
 from spn_data.pipeline.labels import (
     CAMERA,
     POSES,

@@ -10,7 +10,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegistration.georegister_options import default_sigma_m
 from spn_data.georegistration.offset import estimate_time_offset
 from spn_data.georegistration.result import GeoFit
-from spn_data.labels import Labels
+from spn_data.labels.labels import Labels
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FIXES = 5

@@ -14,8 +14,8 @@ from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
-from spn_data.labels import Labels, sigmas, write_labels, write_seen_points
-from spn_data.map_hash import map_hash
+from spn_data.labels.labels import Labels, sigmas, write_labels, write_seen_points
+from spn_data.labels.map_hash import map_hash
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
 from spn_data.pipeline.images import STORED

@@ -19,7 +19,7 @@ from spn_data.geometry.rendering import (
     undistorted_camera,
 )
 from spn_data.hdf5_schema import DatasetFrame
-from spn_data.labels import Labels, SeenPoints
+from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.pipeline.labels import LabelledArea
 from spn_data.split import LEFT_OUT, TRAIN, Split
 

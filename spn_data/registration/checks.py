@@ -16,8 +16,8 @@ import numpy as np
 from spn_data.colmap.resection import resect
 from spn_data.geometry.epipolar import essential_matrix, sampson_errors
 from spn_data.geometry.pose import Poses, rotation_errors_deg
-from spn_data.labels import sigmas
-from spn_data.map_points import covered_share
+from spn_data.labels.labels import sigmas
+from spn_data.labels.map_points import covered_share
 from spn_data.registration.options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, reprojection_errors
 

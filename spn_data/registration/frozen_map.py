@@ -13,7 +13,7 @@ import numpy as np
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.colmap.model import Observations, Scene, read_map_with_features
 from spn_data.errors import FormatError
-from spn_data.map_points import MapPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
 
 

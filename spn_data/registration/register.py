@@ -9,8 +9,8 @@ import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.labels import Labels, SeenPoints
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
 from spn_data.reconstruction.correspondences import FramesToMap, extract_missing, match_missing
 from spn_data.registration.checks import gather_evidence, judge

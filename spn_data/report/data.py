@@ -14,8 +14,8 @@ from spn_data import audit
 from spn_data.coverage import Stratum
 from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
-from spn_data.labels import LabelStatus
-from spn_data.map_points import MapPoints
+from spn_data.labels.labels import LabelStatus
+from spn_data.labels.map_points import MapPoints
 from spn_data.split import Split
 from spn_data.storage.record import StageRecord
 

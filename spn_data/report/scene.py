@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.map_points import MapPoints
+from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import FrameTable, ReportData
 from spn_data.report.pack import pack, pack_texts
 
