@@ -95,7 +95,7 @@ def run(
     from spn_data.pipeline.dense import densify, sequences_with_video
     from spn_data.pipeline.register import RegisterStageOptions
     from spn_data.pipeline.register import register as stage
-    from spn_data.registration.options import RegisterOptions
+    from spn_data.registration.register_options import RegisterOptions
     from spn_data.work.cluster import dispatch_to
 
     if video is None and not all_frames:

@@ -32,7 +32,7 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_from_json,
 )
-from spn_data.registration.options import CheckOptions
+from spn_data.registration.register_options import CheckOptions
 from spn_data.simulate.truth import read_truth
 from spn_data.storage.record import read_json
 

@@ -11,8 +11,8 @@ import pytest
 from spn_data.geometry.pose import pose_errors
 from spn_data.labels.map_points import MapPoints
 from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge, same_pose
-from spn_data.registration.options import CheckOptions, RegisterOptions
 from spn_data.registration.register import accept
+from spn_data.registration.register_options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, settle, without
 from spn_data.registration.solve import solve
 from tests.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight

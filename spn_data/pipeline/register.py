@@ -32,8 +32,8 @@ from spn_data.pipeline.register_source import find_source, take_frames
 from spn_data.pipeline.telemetry import check_telemetry
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
-from spn_data.registration.options import RegisterOptions
 from spn_data.registration.register import Registered, labels_of, register_sequence
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch

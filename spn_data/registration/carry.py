@@ -7,7 +7,7 @@ import numpy as np
 from spn_data.colmap.resection import Resection, resect
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
-from spn_data.registration.options import RegisterOptions
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import Sequence, reprojection_errors
 from spn_data.registration.tracks import triangulate
 

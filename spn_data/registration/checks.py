@@ -18,7 +18,7 @@ from spn_data.geometry.epipolar import essential_matrix, sampson_errors
 from spn_data.geometry.pose import Poses, rotation_errors_deg
 from spn_data.labels.labels import sigmas
 from spn_data.labels.map_points import covered_share
-from spn_data.registration.options import CheckOptions, RegisterOptions
+from spn_data.registration.register_options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, reprojection_errors
 
 _MIN_SHARED = 10  # map points that two frames both show, to compare their poses by

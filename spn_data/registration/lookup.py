@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.colmap.database import MapDatabase
 from spn_data.matching.putative import MatchOptions, match_descriptors
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
-from spn_data.registration.options import RegisterOptions
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.storage.files import writing_whole
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress

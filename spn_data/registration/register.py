@@ -17,7 +17,7 @@ from spn_data.registration.checks import gather_evidence, judge
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
 from spn_data.registration.lookup import look_up_missing
-from spn_data.registration.options import RegisterOptions
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import Sequence, Solution, free_lens, settle, without
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks

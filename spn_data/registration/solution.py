@@ -16,7 +16,7 @@ from spn_data.registration.adjustment import (
     lens_parameters,
     linearize,
 )
-from spn_data.registration.options import RegisterOptions
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.tracks import Tracks
 
 SCALE_PX = 0.5  # of the Cauchy loss

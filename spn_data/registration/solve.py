@@ -15,7 +15,7 @@ from spn_data.registration.adjustment import (
     adjust,
 )
 from spn_data.registration.carry import carry
-from spn_data.registration.options import RegisterOptions
+from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import (
     SCALE_PX,
     Sequence,
