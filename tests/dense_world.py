@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 
 from spn_data.capture.frames import Frames, FrameStatus
-from spn_data.dense_segments import SequenceToLabel
-from spn_data.dense_values import Anchor, Segment
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
 from spn_data.labels.map_points import MapPoints
 from spn_data.simulate.video_out import write_video
+from spn_data.tracking.segments import SequenceToLabel
+from spn_data.tracking.tracked_frames import Anchor, Segment
 
 CAMERA = Camera.from_horizontal_fov(480, 270, 80, (-0.08, 0.02))
 N = 24

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from spn_data.capture.frames import FrameStatus
-from spn_data.dense import dense_labels, drop_jumps
-from spn_data.dense_segments import read_segments
-from spn_data.dense_tracking import follow, spread, track_segment
-from spn_data.dense_values import DenseOptions, TrackedFrame
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.geometry.pose_fit import fit_pose
+from spn_data.tracking.label_video import dense_labels, drop_jumps
+from spn_data.tracking.point_tracking import follow, spread, track_segment
+from spn_data.tracking.segments import read_segments
+from spn_data.tracking.tracked_frames import DenseOptions, TrackedFrame
 from tests.dense_world import CAMERA, LABELLED, TEXTURE, N, World, visible
 
 OPTIONS = DenseOptions()

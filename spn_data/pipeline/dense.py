@@ -11,8 +11,6 @@ import numpy as np
 from spn_data.area import DENSE, EVALUATION, FRAMES, MODEL, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import read_map
-from spn_data.dense import dense_labels
-from spn_data.dense_values import DenseOptions
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
@@ -38,6 +36,8 @@ from spn_data.registration.frame_covariance import (
     frame_covariances,
 )
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
+from spn_data.tracking.label_video import dense_labels
+from spn_data.tracking.tracked_frames import DenseOptions
 from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.timing import Progress, Stopwatch
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.capture.frames import Frames
-from spn_data.dense_segments import SequenceToLabel, read_segments
-from spn_data.dense_tracking import between, track_segment
-from spn_data.dense_values import DenseOptions, TrackedFrame, failed
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.labels.map_points import MapPoints
+from spn_data.tracking.point_tracking import between, track_segment
+from spn_data.tracking.segments import SequenceToLabel, read_segments
+from spn_data.tracking.tracked_frames import DenseOptions, TrackedFrame, failed
 from spn_data.work.parallel import run_batches
 from spn_data.work.timing import Progress
 

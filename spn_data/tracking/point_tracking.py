@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from spn_data.dense_values import Anchor, DenseOptions, Segment, TrackedFrame, failed
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.grouping import number_within
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
 from spn_data.labels.map_points import covered_share
+from spn_data.tracking.tracked_frames import Anchor, DenseOptions, Segment, TrackedFrame, failed
 
 
 def track_segment(segment: Segment, options: DenseOptions) -> list[TrackedFrame]:

@@ -10,10 +10,10 @@ import numpy as np
 
 from spn_data.capture import video
 from spn_data.capture.frames import Frames, FrameStatus
-from spn_data.dense_values import Anchor, DenseOptions, Segment
 from spn_data.geometry.camera import Camera
 from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.labels.map_points import MapPoints
+from spn_data.tracking.tracked_frames import Anchor, DenseOptions, Segment
 
 
 @dataclass(frozen=True, eq=False)
