@@ -10,7 +10,7 @@ import click
 from cli import console, options, page
 
 if TYPE_CHECKING:
-    from spn_data.coverage_table import Coverage
+    from spn_data.coverage.sequence_table import Coverage
     from spn_data.pipeline.coverage import AreaCoverage
 
 _LIMITS = (options.Finite(0, min_open=True), options.Finite(0, 180, min_open=True))
@@ -87,10 +87,10 @@ def coverage(
     Example:
         spn-data coverage --area fields/north --fly-again again.csv
     """
-    from spn_data.coverage import Stratum
+    from spn_data.coverage.nearest_frame import Stratum
+    from spn_data.coverage.refly import ReflyOptions
     from spn_data.geometry.camera_file import read_camera
     from spn_data.pipeline.coverage import CoverageStageOptions, check_new, cover_area
-    from spn_data.refly import ReflyOptions
     from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):
@@ -129,7 +129,7 @@ def coverage(
 
 def _strata(high: tuple[float, float] | None, medium: tuple[float, float] | None) -> Any:
     """The given limits; None where none is given. Raises UsageError for limits that don't fit."""
-    from spn_data.coverage import CoverageOptions
+    from spn_data.coverage.nearest_frame import CoverageOptions
 
     if high is None and medium is None:
         return None

@@ -15,8 +15,9 @@ from click.testing import CliRunner
 
 from cli.data import main
 from spn_data.area import EVALUATION, FRAMES, GEO, Area
-from spn_data.coverage import CoverageOptions, strata_of
-from spn_data.coverage_table import COLUMNS
+from spn_data.coverage.nearest_frame import CoverageOptions, strata_of
+from spn_data.coverage.sequence_table import COLUMNS
+from spn_data.coverage.waypoints import Place, read_waypoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, angles_from_rotations
@@ -29,7 +30,6 @@ from spn_data.pipeline.labels import (
     similarity_to_json,
 )
 from spn_data.storage.record import read_json, write_json
-from spn_data.waypoints import Place, read_waypoints
 
 ROOT = Path(__file__).resolve().parents[1]
 

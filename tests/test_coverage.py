@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from spn_data.cambridge import read_cambridge
-from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames, strata_of
-from spn_data.coverage_table import (
+from spn_data.coverage.nearest_frame import (
+    CoverageOptions,
+    Stratum,
+    above_range,
+    nearest_frames,
+    strata_of,
+)
+from spn_data.coverage.refly import ReflyOptions, where_to_fly_again
+from spn_data.coverage.sequence_table import (
     COLUMNS,
     MappingFrames,
     Queries,
@@ -17,12 +24,11 @@ from spn_data.coverage_table import (
     remarks,
     write_coverage,
 )
+from spn_data.coverage.view_share import SeenMap, ViewOptions, view_shares
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.refly import ReflyOptions, where_to_fly_again
 from spn_data.simulate import preset, simulate_paths
-from spn_data.view_share import SeenMap, ViewOptions, view_shares
 
 CAMERA = Camera.from_horizontal_fov(1600, 900, 90.0)
 NORTH = (0.0, 0.0, 0.0)
@@ -104,7 +110,7 @@ class TestNearest:
         rows = rng.uniform((-20, -20, 0, 0, -40, 0), (20, 20, 10, 360, 10, 0.1), (300, 6))
         queries, mapping = looking(*rows[:120]), looking(*rows[120:])
         whole = nearest_frames(queries, mapping)
-        monkeypatch.setattr("spn_data.coverage._PAIRS_AT_ONCE", 1000)
+        monkeypatch.setattr("spn_data.coverage.nearest_frame._PAIRS_AT_ONCE", 1000)
         parts = nearest_frames(queries, mapping)
         for column in ("stratum", "frame", "distance", "answer_distance", "answer_angle_deg"):
             np.testing.assert_array_equal(getattr(whole, column), getattr(parts, column))
@@ -272,8 +278,8 @@ class TestViews:
         rows = rng.uniform((-9, -9, -2, 0, -80, -20), (9, 9, 9, 360, 30, 20), (40, 6))
         poses = looking(*rows)
         quick = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
-        monkeypatch.setattr("spn_data.view_share._BLOCK", 10_000)
-        monkeypatch.setattr("spn_data.view_share._FIRST", 10_000)
+        monkeypatch.setattr("spn_data.coverage.view_share._BLOCK", 10_000)
+        monkeypatch.setattr("spn_data.coverage.view_share._FIRST", 10_000)
         slow = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
         np.testing.assert_array_equal(quick, slow)
         assert 0.1 < quick.mean() < 0.9
@@ -349,7 +355,7 @@ class TestFlyAgain:
         queries = looking(*np.column_stack([rng.uniform(0, 80, (60, 2)), np.full(60, 5.0)]))
         ways = []
         for limit in (400, 0):
-            monkeypatch.setattr("spn_data.refly._MAX_SHORTENED", limit)
+            monkeypatch.setattr("spn_data.coverage.refly._MAX_SHORTENED", limit)
             centers = where_to_fly_again(queries, np.full(60, "low")).poses.centers
             ways.append(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
         assert ways[0] < 0.9 * ways[1]

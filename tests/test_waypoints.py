@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from spn_data.coverage.waypoints import Place, read_waypoints, waypoint_columns
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import angles_from_rotations
 from spn_data.storage.files import write_csv
-from spn_data.waypoints import Place, read_waypoints, waypoint_columns
 
 LAT, LON = 49.0153, 8.4250
 TAKEOFF = Place(GeoOrigin(LAT, LON, 0.0, HeightReference.TAKEOFF), 0.0)
@@ -163,7 +163,7 @@ class TestRefusing:
 
     def test_too_many_rows_are_refused(self, tmp_path, monkeypatch):
         """Memory is bounded by the number of rows."""
-        monkeypatch.setattr("spn_data.waypoints.MAX_WAYPOINTS", 2)
+        monkeypatch.setattr("spn_data.coverage.waypoints.MAX_WAYPOINTS", 2)
         with pytest.raises(InputError, match=r"plan\.csv:4: has more than 2 rows"):
             read(tmp_path, f"{HEADER}\n" + f"{GOOD}\n" * 3)
 

@@ -12,8 +12,18 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
-from spn_data.coverage import CoverageOptions
-from spn_data.coverage_table import Coverage, MappingFrames, Queries, cover, remarks, write_coverage
+from spn_data.coverage.nearest_frame import CoverageOptions
+from spn_data.coverage.refly import FlyAgain, ReflyOptions, where_to_fly_again
+from spn_data.coverage.sequence_table import (
+    Coverage,
+    MappingFrames,
+    Queries,
+    cover,
+    remarks,
+    write_coverage,
+)
+from spn_data.coverage.view_share import SeenMap
+from spn_data.coverage.waypoints import Place, Waypoints, read_waypoints, waypoint_columns
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import HeightReference
@@ -21,10 +31,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.labels.labels import Labels
 from spn_data.pipeline.geo import recorded_options
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
-from spn_data.refly import FlyAgain, ReflyOptions, where_to_fly_again
 from spn_data.storage.record import VERSION, read_json, write_json
-from spn_data.view_share import SeenMap
-from spn_data.waypoints import Place, Waypoints, read_waypoints, waypoint_columns
 from spn_data.work.timing import Progress
 
 EVALUATED, PLANNED = "coverage", "coverage-waypoints"  # folders in the area

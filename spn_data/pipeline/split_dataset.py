@@ -10,7 +10,7 @@ import numpy as np
 
 from spn_data.audit import training_points
 from spn_data.capture.photos import load_mask
-from spn_data.coverage import strata_of
+from spn_data.coverage.nearest_frame import strata_of
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import (
     Renderer,

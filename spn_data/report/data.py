@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spn_data import audit
-from spn_data.coverage import Stratum
+from spn_data.coverage.nearest_frame import Stratum
 from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.coverage import CoverageOptions, Stratum, distances_and_angles
+from spn_data.coverage.nearest_frame import CoverageOptions, Stratum, distances_and_angles
 from spn_data.geometry.pose import (
     Poses,
     angles_from_rotations,

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.coverage import CoverageOptions, Stratum, above_range, nearest_frames
+from spn_data.coverage.nearest_frame import CoverageOptions, Stratum, above_range, nearest_frames
+from spn_data.coverage.view_share import SeenMap, view_shares
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.storage.files import read_csv, write_csv
-from spn_data.view_share import SeenMap, view_shares
 from spn_data.work.timing import Progress
 
 _TELLING_M = 0.05  # less beyond the range of heights is not worth a sentence

@@ -8,9 +8,9 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from spn_data.coverage.view_share import ViewOptions
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.view_share import ViewOptions
 
 _PAIRS_AT_ONCE = 2_000_000  # of queries and mapping frames: bounds the memory
 
