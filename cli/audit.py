@@ -10,7 +10,7 @@ import click
 from cli import console, options
 
 if TYPE_CHECKING:
-    from spn_data.audit import Finding
+    from spn_data.split.audit import Finding
 
 _SHOWN = 5  # lines of evidence a finding
 
@@ -37,7 +37,7 @@ def audit(area_folder: Path, everything: bool) -> None:
 
 def show_findings(findings: tuple[Finding, ...], *, shown: int | None = _SHOWN) -> None:
     """One line a check, its evidence below. Ends the program with 1 where a check failed."""
-    from spn_data.audit import Verdict, has_failed
+    from spn_data.split.audit import Verdict, has_failed
 
     rows = []
     for finding in findings:

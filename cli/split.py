@@ -146,7 +146,7 @@ def _options(
     *, native: bool, width_px: int | None, cambridge: str, no_dense: bool, **chosen: Any
 ) -> SplitStageOptions:
     from spn_data.pipeline.split import CambridgeFrames, SplitStageOptions
-    from spn_data.split import Policy, SplitOptions
+    from spn_data.split.groups import Policy, SplitOptions
 
     chosen["validation"] = Policy(chosen["validation"])
     return SplitStageOptions(

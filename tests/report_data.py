@@ -6,7 +6,6 @@ import base64
 
 import numpy as np
 
-from spn_data import audit
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles
 from spn_data.georegistration.cross_validation import HeldOut
@@ -14,7 +13,7 @@ from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
-from spn_data.split import Split, SplitOptions
+from spn_data.split.groups import Split, SplitOptions, audit
 from spn_data.storage.record import StageRecord
 
 

@@ -7,13 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data import audit, audit_files
-from spn_data.audit import Finding, MapHashes, Verdict
-from spn_data.audit_files import PoseList
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
-from spn_data.split import LEFT_OUT, TRAIN, VALIDATION, Split, SplitOptions
-from spn_data.splitting import make_split
+from spn_data.split.audit import Finding, MapHashes, Verdict
+from spn_data.split.audit_files import PoseList
+from spn_data.split.groups import (
+    LEFT_OUT,
+    TRAIN,
+    VALIDATION,
+    Split,
+    SplitOptions,
+    audit,
+    audit_files,
+)
+from spn_data.split.holdout import make_split
 
 
 def frames(

@@ -23,8 +23,8 @@ from spn_data.hdf5_reader import Dataset
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import read_labelled_area
 from spn_data.pipeline.split import SplitStageOptions
-from spn_data.split import LEFT_OUT, TRAIN, SplitOptions
-from spn_data.split_file import read_split
+from spn_data.split.groups import LEFT_OUT, TRAIN, SplitOptions
+from spn_data.split.split_file import read_split
 from spn_data.storage.record import read_json, write_json
 
 DOC = Path(__file__).resolve().parents[1] / "docs" / "split.md"

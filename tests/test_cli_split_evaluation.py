@@ -19,7 +19,7 @@ from spn_data.hdf5_schema import Role
 from spn_data.labels.labels import LabelStatus, read_labels, write_labels
 from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import read_labelled_area
-from spn_data.split_file import read_split
+from spn_data.split.split_file import read_split
 from spn_data.storage.record import read_json, write_json
 
 pytestmark = pytest.mark.slow

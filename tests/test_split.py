@@ -11,9 +11,9 @@ import pytest
 from spn_data.errors import FormatError, GeometryError, StageError
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.labels.labels import Labels
-from spn_data.split import LEFT_OUT, TEST, TRAIN, VALIDATION, Policy, Split, SplitOptions
-from spn_data.split_file import read_split, write_split
-from spn_data.splitting import make_split
+from spn_data.split.groups import LEFT_OUT, TEST, TRAIN, VALIDATION, Policy, Split, SplitOptions
+from spn_data.split.holdout import make_split
+from spn_data.split.split_file import read_split, write_split
 from spn_data.storage.record import read_json
 
 

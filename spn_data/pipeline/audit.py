@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.area import DENSE, EVALUATION, FRAMES, MODEL, SPLIT, Area
-from spn_data.audit import (
+from spn_data.cambridge import NVM, read_cambridge
+from spn_data.colmap.model import read_scene
+from spn_data.errors import FormatError, SpnError
+from spn_data.hdf5_reader import Dataset
+from spn_data.labels.labels import Labels
+from spn_data.labels.map_hash import map_hash
+from spn_data.nvm import read_nvm
+from spn_data.pipeline.labels import REGISTRATION, LabelledArea, read_labelled_area
+from spn_data.pipeline.split_cambridge import image_name, list_of
+from spn_data.split.audit import (
     Finding,
     MapHashes,
     Verdict,
@@ -23,7 +32,7 @@ from spn_data.audit import (
     check_test_is_apart,
     check_training_points,
 )
-from spn_data.audit_files import (
+from spn_data.split.audit_files import (
     PoseList,
     check_cambridge,
     check_covered,
@@ -31,17 +40,8 @@ from spn_data.audit_files import (
     check_labels,
     check_measured,
 )
-from spn_data.cambridge import NVM, read_cambridge
-from spn_data.colmap.model import read_scene
-from spn_data.errors import FormatError, SpnError
-from spn_data.hdf5_reader import Dataset
-from spn_data.labels.labels import Labels
-from spn_data.labels.map_hash import map_hash
-from spn_data.nvm import read_nvm
-from spn_data.pipeline.labels import REGISTRATION, LabelledArea, read_labelled_area
-from spn_data.pipeline.split_cambridge import image_name, list_of
-from spn_data.split import TRAIN, Split
-from spn_data.split_file import read_split
+from spn_data.split.groups import TRAIN, Split
+from spn_data.split.split_file import read_split
 from spn_data.storage.record import VERSION, read_json, write_json
 
 SPLIT_FILE, DATASET, AUDIT, CAMBRIDGE = "split.json", "dataset.h5", "audit.json", "cambridge"

@@ -20,7 +20,7 @@ from spn_data.pipeline.cameras import start_cameras
 from spn_data.pipeline.frames import fingerprints
 from spn_data.pipeline.images import STORED
 from spn_data.pipeline.telemetry import telemetry_of
-from spn_data.split import GROUPS
+from spn_data.split.groups import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.timing import Progress

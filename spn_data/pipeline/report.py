@@ -25,7 +25,7 @@ from spn_data.pipeline.runs import read_runs
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import Verdict, verdict
-from spn_data.split_file import read_split
+from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_whole
 from spn_data.storage.record import read_json, versions
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import FRAMES, SPLIT, Area, StageWork
-from spn_data.audit import Finding, Verdict
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.hdf5 import DatasetWriter
@@ -33,9 +32,10 @@ from spn_data.pipeline.split_dataset import (
     given_frames,
     target_cameras,
 )
-from spn_data.split import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
-from spn_data.split_file import write_split
-from spn_data.splitting import make_split
+from spn_data.split.audit import Finding, Verdict
+from spn_data.split.groups import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
+from spn_data.split.holdout import make_split
+from spn_data.split.split_file import write_split
 from spn_data.storage.record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
 

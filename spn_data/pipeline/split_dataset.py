@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.audit import training_points
 from spn_data.capture.photos import load_mask
 from spn_data.coverage.nearest_frame import strata_of
 from spn_data.geometry.camera import Camera
@@ -21,7 +20,8 @@ from spn_data.geometry.rendering import (
 from spn_data.hdf5_schema import DatasetFrame
 from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.pipeline.labels import LabelledArea
-from spn_data.split import LEFT_OUT, TRAIN, Split
+from spn_data.split.audit import training_points
+from spn_data.split.groups import LEFT_OUT, TRAIN, Split
 
 
 @dataclass(frozen=True, eq=False)

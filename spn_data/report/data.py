@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from spn_data import audit
 from spn_data.coverage.nearest_frame import Stratum
 from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
-from spn_data.split import Split
+from spn_data.split.groups import Split, audit
 from spn_data.storage.record import StageRecord
 
 REGISTERED, FAILED = LabelStatus.REGISTERED.value, LabelStatus.FAILED.value

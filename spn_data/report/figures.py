@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from spn_data.report.data import FrameTable, ReportData
-from spn_data.split import OPTIMISTIC, TRAIN
+from spn_data.split.groups import OPTIMISTIC, TRAIN
 from spn_data.storage.record import StageRecord
 
 

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from spn_data import audit
 from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
 from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import Finding, Level, Verdict
-from spn_data.split import LEFT_OUT
-from spn_data.split_file import statements
+from spn_data.split.groups import LEFT_OUT, audit
+from spn_data.split.split_file import statements
 from spn_data.storage.record import StageRecord
 
 _REASONS_SHOWN = 6  # of one sequence

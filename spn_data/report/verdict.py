@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from spn_data import audit
 from spn_data.report.data import STRATA, CoverageFacts, ReportData
-from spn_data.split import OPTIMISTIC, TRAIN, VALIDATION
+from spn_data.split.groups import OPTIMISTIC, TRAIN, VALIDATION, audit
 
 
 class Level(StrEnum):

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from spn_data.errors import GeometryError, StageError
 from spn_data.labels.labels import Labels
-from spn_data.split import (
+from spn_data.split.groups import (
     GROUPS,
     GUARD_DISTANCE,
     GUARD_GAP,

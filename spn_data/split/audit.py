@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from spn_data.geometry.pose import rotation_errors_deg
 from spn_data.labels.labels import Labels, SeenPoints
-from spn_data.split import (
+from spn_data.split.groups import (
     OPTIMISTIC,
     SLACK,
     TEST,

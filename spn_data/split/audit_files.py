@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.audit import Finding, finding_of
 from spn_data.geometry.pose import Poses
 from spn_data.labels.labels import Labels
-from spn_data.split import LEFT_OUT, TEST, TRAIN, VALIDATION, Split
+from spn_data.split.audit import Finding, finding_of
+from spn_data.split.groups import LEFT_OUT, TEST, TRAIN, VALIDATION, Split
 
 # Half a unit of the sixth decimal, and what rounding adds.
 _PRINTED = 0.5e-6 + 1e-9

@@ -10,7 +10,7 @@ import numpy as np
 
 from spn_data.capture.frames import check_name
 from spn_data.errors import FormatError
-from spn_data.split import (
+from spn_data.split.groups import (
     LEFT_OUT,
     OPTIMISTIC,
     VALIDATION,
