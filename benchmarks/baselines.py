@@ -18,8 +18,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
 from spn_model import figures
 from spn_model.baselines import GEM, VLAD, Describe, Images, baselines, better, gem, vlad
 from spn_model.feature_maps import squeezenet_maps

@@ -23,10 +23,10 @@ import numpy as np
 from process import run_measured
 
 from spn_data.area import Area
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.pipeline.images import frame_images
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
 from spn_model.imagenet import MEAN, STD
 from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
 from spn_model.networks.registry import build

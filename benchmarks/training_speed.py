@@ -39,8 +39,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
 from spn_model.batches import rows_of_step
 from spn_model.gradients import Gradients, gradients
 from spn_model.imagenet import MEAN, STD

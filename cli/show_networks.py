@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from cli import console
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_schema import Role
 from spn_model.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
 from spn_model.evaluate import Comparison, Judged
 from spn_model.metrics import Evaluation, Summary

@@ -99,8 +99,8 @@ def run(
     from cli import page
     from cli.show_training import Following, errors_table
     from spn_data import area as names
+    from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
-    from spn_data.hdf5_reader import Dataset
     from spn_data.storage.record import StageRecord, content_fingerprint, versions
     from spn_model.recipe import read_recipe
     from spn_model.train import Data, Stopped, TrainOptions

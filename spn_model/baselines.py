@@ -22,7 +22,7 @@ FeatureMaps = Callable[[np.ndarray], np.ndarray]
 
 
 class Images(Protocol):
-    """Images of N frames, read one by one; `spn_data.hdf5_reader.DatasetGroup` is one."""
+    """Images of N frames, read one by one; `spn_data.dataset.hdf5_reader.DatasetGroup` is one."""
 
     def __len__(self) -> int: ...
 

@@ -14,10 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.hdf5_reader import Dataset
 from spn_data.storage.record import write_json
 from spn_model.bundle_checks import judged_groups
 from spn_model.onboard.bundle import GRAPHS, read_bundle

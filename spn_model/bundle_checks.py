@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.hdf5_schema import Role
 from spn_data.work.timing import Progress
 from spn_model.checkpoint import Checkpoint
 from spn_model.graphs import Deployment, reference

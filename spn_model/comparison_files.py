@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.capture.sources import safe_name
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_whole
 from spn_model import figures
 from spn_model.baselines import MEAN

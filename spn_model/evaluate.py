@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.hdf5_schema import Role
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
 from spn_model.baselines import GEM, VLAD, better, guess_mean, oracle, posed

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, SpnError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.hdf5_schema import Role
 from spn_data.storage.files import exchange, write_whole
 from spn_data.storage.record import content_fingerprint, write_json
 from spn_data.work.timing import Progress

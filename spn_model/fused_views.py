@@ -8,8 +8,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.pose import Poses
-from spn_data.hdf5_reader import FramePoints
 from spn_model.ground import Ground
 from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, surface
 from spn_model.training_set import TrainingSet

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from spn_data.coverage.nearest_frame import CoverageOptions, nearest_frames
+from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors
-from spn_data.hdf5_schema import DatasetInfo
 from spn_model.calibration import Calibration, calibrate, sigmas, squared_distances
 
 ENU = ("east", "north", "up")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
+from spn_data.dataset.hdf5_reader import DatasetGroup, FramePoints
 from spn_data.geometry.pose import Poses
-from spn_data.hdf5_reader import DatasetGroup, FramePoints
 
 
 def cell_centers(columns: int, rows: int, first_px: float, stride_px: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.storage.record import content_fingerprint, versions, write_json
 from spn_data.work.timing import Progress
 from spn_model.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad

@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, StageError
-from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.hdf5_schema import Role
 from spn_model.batches import batches_ahead, generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared

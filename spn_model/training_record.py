@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
-from spn_data.hdf5_reader import Dataset, DatasetGroup
-from spn_data.hdf5_schema import Role
 from spn_model import checkpoint
 from spn_model.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.members.member import Member

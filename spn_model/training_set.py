@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from spn_data.dataset.hdf5_reader import DatasetGroup, FramePoints
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_data.hdf5_reader import DatasetGroup, FramePoints
-from spn_data.hdf5_schema import Role
 
 MEMORY_BYTES = 2_000_000_000  # of decoded images that are kept
 

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.hdf5_schema import Role
 from spn_data.storage.record import content_fingerprint
 
 if TYPE_CHECKING:
-    from spn_data.hdf5_reader import Dataset  # not on board: it needs h5py
+    from spn_data.dataset.hdf5_reader import Dataset  # not on board: it needs h5py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 
 CAMERA = Camera("SIMPLE_PINHOLE", 320, 180, np.array([230.0, 160.0, 90.0]))
 SIZE_M = np.array([20.0, 16.0, 9.0])  # the hall reaches from 0 to here

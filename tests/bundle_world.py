@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.camera import Camera
-from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import Checkpoint
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
 from spn_model.precision import bfloat16_is_fast

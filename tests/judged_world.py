@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import DatasetInfo, Role
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_model.checkpoint import Checkpoint, load, save
 from spn_model.members.registry import make
 from spn_model.training_set import TrainingSet

@@ -68,7 +68,10 @@ def test_pyav_stays_with_video():
 
 def test_hdf5_stays_with_the_data_set():
     """h5py is imported by the module that writes dataset.h5 and the one that reads it."""
-    assert _importers("h5py") == {"spn_data/hdf5.py", "spn_data/hdf5_reader.py"}
+    assert _importers("h5py") == {
+        "spn_data/dataset/hdf5_writer.py",
+        "spn_data/dataset/hdf5_reader.py",
+    }
 
 
 @pytest.mark.parametrize("library", ["click", "rich"])

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from spn_data.cambridge import read_cambridge
+from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors, quats_from_rotations, rotations_from_vectors
 from spn_model.baselines import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.cambridge import far_positions, oddities, read_cambridge, write_cambridge
+from spn_data.dataset.cambridge import far_positions, oddities, read_cambridge, write_cambridge
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, rotations_from_angles
 

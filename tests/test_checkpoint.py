@@ -11,8 +11,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError, StageError
-from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import FORMAT, Checkpoint, load, save
 from spn_model.training_set import TrainingSet
 from spn_model.view import View

@@ -17,10 +17,10 @@ from click.testing import CliRunner, Result
 
 from cli.data import main
 from spn_data.area import FRAMES, MODEL, SPLIT, Area
-from spn_data.cambridge import read_cambridge
+from spn_data.dataset.cambridge import read_cambridge
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.nvm import read_nvm
 from spn_data.geometry.rendering import undistorted_camera
-from spn_data.hdf5_reader import Dataset
-from spn_data.nvm import read_nvm
 from spn_data.pipeline.labels import read_labelled_area
 from spn_data.pipeline.split import SplitStageOptions
 from spn_data.split.groups import LEFT_OUT, TRAIN, SplitOptions

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.cambridge import read_cambridge
 from spn_data.coverage.nearest_frame import (
     CoverageOptions,
     Stratum,
@@ -25,6 +24,7 @@ from spn_data.coverage.sequence_table import (
     write_coverage,
 )
 from spn_data.coverage.view_share import SeenMap, ViewOptions, view_shares
+from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles

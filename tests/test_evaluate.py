@@ -14,10 +14,10 @@ from click.testing import CliRunner, Result
 
 from cli.data import main as data_main
 from cli.model import main
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.hdf5_reader import Dataset
 from spn_data.storage.files import read_csv
 from spn_model import retrieval
 from spn_model.baselines import GEM, MEAN, ORACLE, VLAD

@@ -16,9 +16,9 @@ from click.testing import CliRunner
 from torch import nn
 
 from cli.model import main
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
-from spn_data.hdf5_reader import Dataset
 from spn_data.storage.record import write_json
 from spn_model import checkpoint
 from spn_model.bundle_checks import ExportOptions

@@ -26,6 +26,7 @@ from cli.data import main
 from cli.export import FORMATS
 from spn_data.area import EVALUATION, Area, StageWork
 from spn_data.colmap import pycolmap
+from spn_data.dataset.nvm import read_nvm
 from spn_data.exports.frames import ExportedFrames, timestamps_us
 from spn_data.exports.geojson import write_geojson
 from spn_data.exports.kml import write_kml
@@ -35,7 +36,6 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
 from spn_data.labels.map_points import MapPoints
-from spn_data.nvm import read_nvm
 from spn_data.pipeline.export import Format
 from spn_data.pipeline.images import image_path
 from spn_data.pipeline.labels import (

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.hdf5_reader import Dataset
 from spn_model.fused_views import fused_view
 from spn_model.ground import level_ground
 from spn_model.members.member import ANY_NUMBER

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
-from spn_data.hdf5_reader import Dataset
 from spn_model.gradients import gradients
 from spn_model.machine import choose
 from spn_model.members.scene_coordinates import SceneCoordinatesMember

@@ -14,13 +14,13 @@ import h5py
 import numpy as np
 import pytest
 
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import COLUMNS, POINTS, DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import canonical_quats
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import COLUMNS, POINTS, DatasetFrame, DatasetInfo, Role
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Camera("SIMPLE_PINHOLE", 48, 27, np.array([40.0, 24.0, 13.5]))
@@ -206,8 +206,8 @@ import resource, sys
 import numpy as np
 from pathlib import Path
 from tests.test_hdf5 import INFO, frame, replace
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_schema import Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
+from spn_data.dataset.hdf5_schema import Role
 image = np.random.default_rng(0).integers(0, 256, (500, 1000, 3)).astype(np.uint8)
 one = replace(frame("train", 4), image=image)
 with DatasetWriter(Path(sys.argv[1]), INFO, {"train": Role.TRAIN}) as writer:

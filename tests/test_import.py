@@ -12,14 +12,14 @@ from click.testing import CliRunner
 
 from cli.data import main
 from cli.import_ import import_
-from spn_data.cambridge import read_cambridge, write_cambridge
+from spn_data.dataset.cambridge import read_cambridge, write_cambridge
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
+from spn_data.dataset.nvm import nvm_model, write_nvm
+from spn_data.dataset.nvm_frames import camera_from_visualsfm
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import Role
-from spn_data.nvm import nvm_model, write_nvm
-from spn_data.nvm_frames import camera_from_visualsfm
 from spn_data.pipeline.import_cambridge import LISTS, Imported, ImportOptions, import_cambridge
 
 OUTLIER = "seq5/frame00297.png"

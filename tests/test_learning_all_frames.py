@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
-from spn_data.hdf5_reader import Dataset
 from spn_model.checkpoint import load
 from spn_model.evaluate import EvaluateOptions, compare
 from spn_model.recipe import ALL, Recipe, Stage, read_recipe

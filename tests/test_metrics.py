@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_data.hdf5_schema import DatasetInfo
 from spn_model.calibration import calibrate, is_covariance, sigmas, squared_distances
 from spn_model.metrics import (
     ENU,

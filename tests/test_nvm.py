@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spn_data.dataset.nvm import NvmModel, nvm_model, offsets_from_center, read_nvm, write_nvm
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.nvm import NvmModel, nvm_model, offsets_from_center, read_nvm, write_nvm
 
 TEXT = """NVM_V3
 

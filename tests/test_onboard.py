@@ -22,13 +22,13 @@ from click.testing import CliRunner
 from onnx import TensorProto, helper
 
 from cli.model import main
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
-from spn_data.hdf5_reader import Dataset
 from spn_data.storage.record import write_json
 from spn_model.bundle_checks import ExportOptions
 from spn_model.export import export

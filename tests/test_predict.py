@@ -18,11 +18,11 @@ from click.testing import CliRunner, Result
 from PIL import Image
 
 from cli.model import main
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
-from spn_data.hdf5_reader import Dataset
 from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.record import write_json

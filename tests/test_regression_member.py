@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import nn
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.hdf5_reader import Dataset
 from spn_model.calibration import calibrate
 from spn_model.dropout import dropout_estimates
 from spn_model.loss import beta_weighted, residuals

@@ -8,9 +8,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.hdf5_reader import FramePoints
 from spn_model.augment import WarpOptions, random_warp
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
-from spn_data.hdf5_reader import Dataset
 from spn_model.covariance_scale import measured_scale
 from spn_model.decoding import decode
 from spn_model.members.member import PoseEstimates

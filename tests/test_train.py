@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 import torch
 
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_reader import Dataset
-from spn_data.hdf5_schema import Role
 from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.checkpoint import load
 from spn_model.covariance_scale import measured_scale

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_model.checkpoint import load
 from spn_model.members import registry
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates

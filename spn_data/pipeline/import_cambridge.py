@@ -10,7 +10,8 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from spn_data.cambridge import (
+from spn_data.capture.photos import decode_photo
+from spn_data.dataset.cambridge import (
     NVM,
     TEST_LIST,
     TRAIN_LIST,
@@ -20,15 +21,14 @@ from spn_data.cambridge import (
     oddities,
     read_cambridge,
 )
-from spn_data.capture.photos import decode_photo
+from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
+from spn_data.dataset.nvm import read_nvm
+from spn_data.dataset.nvm_frames import NvmFrames
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_schema import DatasetFrame, DatasetInfo, Role
-from spn_data.nvm import read_nvm
-from spn_data.nvm_frames import NvmFrames
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from spn_data.area import FRAMES, SPLIT, Area, StageWork
+from spn_data.dataset.hdf5_schema import DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
-from spn_data.hdf5 import DatasetWriter
-from spn_data.hdf5_schema import DatasetInfo, Role
 from spn_data.pipeline.audit import (
     AUDIT,
     CAMBRIDGE,

@@ -10,6 +10,7 @@ import numpy as np
 
 from spn_data.capture.photos import load_mask
 from spn_data.coverage.nearest_frame import strata_of
+from spn_data.dataset.hdf5_schema import DatasetFrame
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import (
     Renderer,
@@ -17,7 +18,6 @@ from spn_data.geometry.rendering import (
     canonical_camera,
     undistorted_camera,
 )
-from spn_data.hdf5_schema import DatasetFrame
 from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.pipeline.labels import LabelledArea
 from spn_data.split.audit import training_points

@@ -12,9 +12,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from spn_data.errors import InputError, StageError
-from spn_data.hdf5_disk import Disk
-from spn_data.hdf5_schema import (
+from spn_data.dataset.hdf5_disk import Disk
+from spn_data.dataset.hdf5_schema import (
     COLUMNS,
     IMAGES,
     MASKS,
@@ -26,6 +25,7 @@ from spn_data.hdf5_schema import (
     DatasetInfo,
     Role,
 )
+from spn_data.errors import InputError, StageError
 
 _FRAMES_A_BLOCK = 64  # held in memory without their images
 _POINTS_A_CHUNK = 16_384

@@ -7,10 +7,10 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from spn_data.dataset.nvm import NvmModel
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.nvm import NvmModel
 
 _RADII = 400
 _MAX_ERROR_PX = 0.1

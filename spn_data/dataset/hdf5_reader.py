@@ -12,9 +12,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
-from spn_data.errors import FormatError, InputError
-from spn_data.geometry.pose import Poses
-from spn_data.hdf5_schema import (
+from spn_data.dataset.hdf5_schema import (
     COLUMNS,
     FORMAT,
     OFFSETS,
@@ -26,6 +24,8 @@ from spn_data.hdf5_schema import (
     Role,
     flag,
 )
+from spn_data.errors import FormatError, InputError
+from spn_data.geometry.pose import Poses
 
 _MAX_GROUPS = 10_000
 _MAX_SIDE_PX = 65_536
