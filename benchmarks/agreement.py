@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from spn_data.area import GEO, Area
+from spn_data.area.area import GEO, Area
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, Similarity, pose_errors

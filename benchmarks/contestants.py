@@ -147,7 +147,7 @@ def _write_priors(database: Path, frames: FramesToMap, located: object) -> None:
 
 
 def main(who: str, job: Job) -> None:
-    from spn_data.area import FRAMES, Area
+    from spn_data.area.area import FRAMES, Area
     from spn_data.capture.frames import read_frames
     from spn_data.errors import StageError
     from spn_data.pipeline.model import frames_to_map

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from process import run_measured
 
-from spn_data.area import Area
+from spn_data.area.area import Area
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter

@@ -93,7 +93,7 @@ def simulated_model(options: SimulateOptions, draw: int = 0) -> Model:
 
 def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptions]:
     """A real reconstruction of simulated flights, and the options that these were made with."""
-    from spn_data.area import FRAMES, MODEL, Area
+    from spn_data.area.area import FRAMES, MODEL, Area
     from spn_data.capture.frames import read_frames
     from spn_data.colmap.model import read_scene
 

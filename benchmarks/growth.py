@@ -23,7 +23,7 @@ from reconstruct import STAGES, errors_against_truth, machine, run
 from rich.console import Console
 from rich.table import Table
 
-from spn_data.area import FRAMES, Area
+from spn_data.area.area import FRAMES, Area
 from spn_data.capture.frames import read_frames
 from spn_data.pipeline.frames import FramesOptions, choose_frames, plan
 from spn_data.simulate.flight import simulate_paths

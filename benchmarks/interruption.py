@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area import GEO, MODEL, Area
+from spn_data.area.area import GEO, MODEL, Area
 from spn_data.colmap.model import read_scene
 from spn_data.geometry.pose import Similarity, pose_errors
 

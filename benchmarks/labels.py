@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from truth import error_figures, read_arguments, true_poses
 
-from spn_data.area import Area
+from spn_data.area.area import Area
 from spn_data.geometry.pose import Similarity, pose_errors, rotation_vectors
 from spn_data.labels.labels import Labels
 from spn_data.pipeline.labels import LabelledArea, read_labelled_area

@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 from truth import error_figures, true_of_scene
 
-from spn_data.area import FRAMES, Area
+from spn_data.area.area import FRAMES, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, load_native, scene_of
 from spn_data.errors import GeometryError, SpnError, StageError

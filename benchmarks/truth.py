@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from spn_data.area import FRAMES, GEO, MODEL, Area
+from spn_data.area.area import FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference

@@ -67,7 +67,7 @@ def run(
     threads: int,
     as_json: bool,
 ) -> None:
-    from spn_data import area as names_of
+    from spn_data.area.area import area as names_of
     from spn_model.benchmark import BenchmarkOptions, flown_frames
     from spn_model.benchmark import benchmark as work
 

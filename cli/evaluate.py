@@ -75,7 +75,7 @@ def run(
     seed: int,
 ) -> None:
     from cli import page, show_networks
-    from spn_data import area as names_of
+    from spn_data.area.area import area as names_of
     from spn_data.errors import InputError, StageError
     from spn_data.storage.record import content_fingerprint
     from spn_model import machine

@@ -57,7 +57,7 @@ def run(
     calibration_images: int,
     overwrite: bool,
 ) -> None:
-    from spn_data import area as names_of
+    from spn_data.area.area import area as names_of
     from spn_data.errors import StageError
     from spn_data.storage.record import content_fingerprint
     from spn_model.bundle_checks import ExportOptions

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spn_data.area import Area
+from spn_data.area.area import Area
 
 if TYPE_CHECKING:
     from spn_data.pipeline.geo import GeoStageOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cli import console
-from spn_data.area import FRAMES, Area
+from spn_data.area.area import FRAMES, Area
 from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:

@@ -103,7 +103,7 @@ def run(
 ) -> None:
     import os
 
-    from spn_data.area import CHECKPOINT
+    from spn_data.area.area import CHECKPOINT
     from spn_data.errors import StageError
     from spn_data.geometry.camera_file import camera_to_json, read_camera
     from spn_data.storage.record import content_fingerprint

@@ -91,7 +91,7 @@ def run(
     import os
 
     from cli import page, show
-    from spn_data.area import EVALUATION, GEO
+    from spn_data.area.area import EVALUATION, GEO
     from spn_data.pipeline.dense import densify, sequences_with_video
     from spn_data.pipeline.register import RegisterStageOptions
     from spn_data.pipeline.register import register as stage

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from cli import console, show_labels
-from spn_data.area import (
+from spn_data.area.area import (
     CHECKPOINT,
     COMPARED,
     DENSE,

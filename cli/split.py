@@ -120,7 +120,7 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
     Example:
         spn-data split --area fields/north
     """
-    from spn_data.area import SPLIT
+    from spn_data.area.area import SPLIT
     from spn_data.pipeline.audit import AUDIT, read_audit
     from spn_data.pipeline.split import split_area
 

@@ -19,7 +19,7 @@ from spn_data.errors import StageError
 from spn_data.storage.files import LOCK, locked
 
 if TYPE_CHECKING:
-    from spn_data.area import Area
+    from spn_data.area.area import Area
     from spn_data.storage.record import StageRecord
 
 
@@ -98,7 +98,7 @@ def run(
 ) -> None:
     from cli import page
     from cli.show_training import Following, errors_table
-    from spn_data import area as names
+    from spn_data.area.area import area as names
     from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
     from spn_data.storage.record import StageRecord, content_fingerprint, versions
@@ -190,7 +190,7 @@ def run(
 
 def _dataset(area: Area, given: Path | None) -> Path:
     """Raises StageError where the area's own is missing or stale."""
-    from spn_data.area import SPLIT
+    from spn_data.area.area import SPLIT
 
     if given is not None:
         return given

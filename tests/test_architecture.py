@@ -96,7 +96,7 @@ def test_spn_model_knows_no_command_line():
 
 def test_only_the_pipeline_and_cli_know_the_area():
     """File names of the user's area are no business of value, format and engine modules."""
-    assert _outside(_importers("spn_data.area"), "spn_data/pipeline/", "cli/") == set()
+    assert _outside(_importers("spn_data.area.area"), "spn_data/pipeline/", "cli/") == set()
 
 
 def test_only_cli_knows_the_pipeline():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
+from spn_data.area.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.errors import FormatError, StageError
 from spn_data.storage.record import VERSION, StageRecord, content_fingerprint
 

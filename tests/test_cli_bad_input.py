@@ -21,7 +21,7 @@ from click.testing import CliRunner, Result
 
 from cli.console import Group
 from cli.data import main
-from spn_data.area import FRAMES, MODEL, Area
+from spn_data.area.area import FRAMES, MODEL, Area
 from spn_data.errors import StageError
 from spn_data.storage.record import VERSION
 

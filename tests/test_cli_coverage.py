@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli.data import main
-from spn_data.area import EVALUATION, FRAMES, GEO, Area
+from spn_data.area.area import EVALUATION, FRAMES, GEO, Area
 from spn_data.coverage.nearest_frame import CoverageOptions, strata_of
 from spn_data.coverage.sequence_table import COLUMNS
 from spn_data.coverage.waypoints import Place, read_waypoints

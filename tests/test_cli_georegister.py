@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli.data import main
-from spn_data.area import GEO, MODEL, Area
+from spn_data.area.area import GEO, MODEL, Area
 from spn_data.colmap.model import read_scene
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera

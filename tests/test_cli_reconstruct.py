@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 import spn_data.reconstruction.reconstruct
 from cli.data import main
-from spn_data.area import FRAMES, GEO, MODEL, Area
+from spn_data.area.area import FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli.data import main
-from spn_data.area import MODEL, Area
+from spn_data.area.area import MODEL, Area
 from spn_data.simulate import preset, simulate
 
 

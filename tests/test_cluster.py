@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 import spn_data
 from cli.data import main
-from spn_data.area import EVALUATION, MODEL, Area
+from spn_data.area.area import EVALUATION, MODEL, Area
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene
 from spn_data.errors import InputError

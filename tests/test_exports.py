@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cli.data import main
 from cli.export import FORMATS
-from spn_data.area import EVALUATION, Area, StageWork
+from spn_data.area.area import EVALUATION, Area, StageWork
 from spn_data.colmap import pycolmap
 from spn_data.dataset.nvm import read_nvm
 from spn_data.exports.frames import ExportedFrames, timestamps_us

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from spn_data.area import GEO, MODEL, Area
+from spn_data.area.area import GEO, MODEL, Area
 
 OPTIONS = ["--max-features", "800", "--fov", "72"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.area import MODEL
+from spn_data.area.area import MODEL
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles

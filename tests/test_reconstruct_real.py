@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli.data import main
-from spn_data.area import GEO, MODEL, Area
+from spn_data.area.area import GEO, MODEL, Area
 
 
 def reconstruct(source: Path, area: Path) -> Area:

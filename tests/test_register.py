@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli.data import main
-from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
+from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.pose import Poses, Similarity, pose_errors

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from cli.data import main as data_main
 from cli.model import main
-from spn_data.area import Area
+from spn_data.area.area import Area
 from spn_data.pipeline.runs import read_runs
 from spn_data.report.html import render
 from tests.judged_world import write_judged, write_network

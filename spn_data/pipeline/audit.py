@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area import DENSE, EVALUATION, FRAMES, MODEL, SPLIT, Area
+from spn_data.area.area import DENSE, EVALUATION, FRAMES, MODEL, SPLIT, Area
 from spn_data.colmap.model import read_scene
 from spn_data.dataset.cambridge import NVM, read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import DENSE, EVALUATION, GEO, MODEL, Area
+from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.coverage.nearest_frame import CoverageOptions
 from spn_data.coverage.refly import FlyAgain, ReflyOptions, where_to_fly_again
 from spn_data.coverage.sequence_table import (

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import Area
+from spn_data.area.area import Area
 from spn_data.errors import StageError
 from spn_data.exports.colmap_export import FOLDER_OF_IMAGES as COLMAP_IMAGES
 from spn_data.exports.colmap_export import write_colmap

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area import DENSE, EVALUATION, FRAMES, Area
+from spn_data.area.area import DENSE, EVALUATION, FRAMES, Area
 from spn_data.capture.candidates import Candidates, analyse, frames_of
 from spn_data.capture.extraction import Cost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area import EVALUATION, FRAMES, Area
+from spn_data.area.area import EVALUATION, FRAMES, Area
 from spn_data.capture import video
 from spn_data.errors import InputError
 from spn_data.labels.labels import Labels

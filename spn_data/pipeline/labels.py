@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
+from spn_data.area.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Observations, Scene, read_map
 from spn_data.errors import FormatError

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, MODEL, Area, StageWork
+from spn_data.area.area import FRAMES, MODEL, Area, StageWork
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_observations
 from spn_data.errors import FormatError

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from spn_data.area import DENSE, EVALUATION, Area
+from spn_data.area.area import DENSE, EVALUATION, Area
 from spn_data.labels.labels import read_labels, write_labels
 from spn_data.pipeline.labels import (
     POSES,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from spn_data.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
+from spn_data.area.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegistration.result import GeoFit
 from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan

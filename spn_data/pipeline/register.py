@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
+from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area import FRAMES, Area
+from spn_data.area.area import FRAMES, Area
 from spn_data.capture.candidates import analyse, frames_of
 from spn_data.capture.extraction import estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, FrameStatus, write_frames

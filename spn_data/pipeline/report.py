@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
+from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.coverage.sequence_table import read_strata
 from spn_data.errors import FormatError, InputError, StageError

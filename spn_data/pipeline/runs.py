@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from spn_data.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
+from spn_data.area.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts

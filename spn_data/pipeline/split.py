@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area import FRAMES, SPLIT, Area, StageWork
+from spn_data.area.area import FRAMES, SPLIT, Area, StageWork
 from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import GeometryError
