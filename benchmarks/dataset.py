@@ -27,8 +27,8 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
-from spn_data.pipeline.images import frame_images
-from spn_data.pipeline.labels import LabelledArea, read_labelled_area
+from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
+from spn_data.inputs.frame_images import frame_images
 
 _NOISE_SIGMA = 3.0  # grey levels
 _MARGIN = 128  # pixels by which the field of noise is larger than an image

@@ -22,8 +22,8 @@ from truth import error_figures, read_arguments, true_poses
 
 from spn_data.area.area import Area
 from spn_data.geometry.pose import Similarity, pose_errors, rotation_vectors
+from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
-from spn_data.pipeline.labels import LabelledArea, read_labelled_area
 from spn_data.simulate.truth import read_truth
 
 CHI2_MEDIAN, CHI2_FAR = 5.348, 22.5

@@ -21,14 +21,14 @@ from spn_data.coverage.waypoints import Place, read_waypoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, angles_from_rotations
-from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
-from spn_data.pipeline.coverage import PLANNED, read_coverage, stale_because
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     LabelledArea,
     read_labelled_area,
     read_world_from_model,
     similarity_to_json,
 )
+from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.pipeline.coverage import PLANNED, read_coverage, stale_because
 from spn_data.storage.record import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[1]

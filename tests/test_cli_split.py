@@ -21,7 +21,7 @@ from spn_data.dataset.cambridge import read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm
 from spn_data.geometry.rendering import undistorted_camera
-from spn_data.pipeline.labels import read_labelled_area
+from spn_data.inputs.area_labels import read_labelled_area
 from spn_data.pipeline.split import SplitStageOptions
 from spn_data.split.groups import LEFT_OUT, TRAIN, SplitOptions
 from spn_data.split.split_file import read_split

@@ -17,8 +17,8 @@ from spn_data.dataset.cambridge import read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.nvm import read_nvm
+from spn_data.inputs.area_labels import read_labelled_area
 from spn_data.labels.labels import LabelStatus, read_labels, write_labels
-from spn_data.pipeline.labels import read_labelled_area
 from spn_data.split.split_file import read_split
 from spn_data.storage.record import read_json, write_json
 

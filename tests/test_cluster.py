@@ -21,9 +21,9 @@ from spn_data.area.area import EVALUATION, MODEL, Area
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene
 from spn_data.errors import InputError
+from spn_data.inputs.area_labels import POSES
 from spn_data.labels.labels import read_labels
 from spn_data.matching.features import FeatureOptions, extract_from_bytes
-from spn_data.pipeline.labels import POSES
 from spn_data.pipeline.model import DATABASE
 from spn_data.work import cluster
 from spn_data.work.cluster import fingerprint, run_on_cluster

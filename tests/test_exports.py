@@ -34,11 +34,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
-from spn_data.labels.map_points import MapPoints
-from spn_data.pipeline.export import Format
-from spn_data.pipeline.images import image_path
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     CAMERA,
     POSES,
     REGISTRATION,
@@ -48,6 +44,10 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
+from spn_data.inputs.frame_images import image_path
+from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
+from spn_data.labels.map_points import MapPoints
+from spn_data.pipeline.export import Format
 from spn_data.storage.record import VERSION, write_json
 
 ROOT = Path(__file__).resolve().parents[1]

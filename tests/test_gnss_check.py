@@ -10,8 +10,8 @@ import pytest
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_data.georegistration.result import GeoFit
+from spn_data.inputs.gnss_check import GnssCheck, check_gnss
 from spn_data.labels.labels import Labels, LabelStatus
-from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
 from spn_data.telemetry.track import Telemetry
 from tests.report_data import geo_fit
 

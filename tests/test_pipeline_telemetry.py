@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from spn_data.capture.sources import discover
-from spn_data.pipeline.telemetry import unread_tracks
+from spn_data.inputs.flight_telemetry import unread_tracks
 
 
 def test_a_gopro_video_is_told_to_carry_a_track_that_is_not_read(shared_data: Path) -> None:

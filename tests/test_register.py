@@ -23,15 +23,15 @@ from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
-from spn_data.labels.labels import _COLUMNS, Labels, read_labels, read_seen_points
-from spn_data.labels.map_hash import map_hash
-from spn_data.pipeline.frames import FramesOptions, plan
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     LabelledArea,
     read_labelled_area,
     read_world_from_model,
     similarity_from_json,
 )
+from spn_data.labels.labels import _COLUMNS, Labels, read_labels, read_seen_points
+from spn_data.labels.map_hash import map_hash
+from spn_data.pipeline.frames import FramesOptions, plan
 from spn_data.registration.register_options import CheckOptions
 from spn_data.simulate.truth import read_truth
 from spn_data.storage.record import read_json

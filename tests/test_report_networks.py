@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from cli.data import main as data_main
 from cli.model import main
 from spn_data.area.area import Area
-from spn_data.pipeline.runs import read_runs
+from spn_data.inputs.network_runs import read_runs
 from spn_data.report.html import render
 from tests.judged_world import write_judged, write_network
 from tests.report_data import area as made_up_area

@@ -13,10 +13,10 @@ from spn_data.dataset.cambridge import NVM, read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm
 from spn_data.errors import FormatError, SpnError
+from spn_data.inputs.area_labels import REGISTRATION, LabelledArea, read_labelled_area
+from spn_data.inputs.cambridge_contents import image_name, list_of
 from spn_data.labels.labels import Labels
 from spn_data.labels.map_hash import map_hash
-from spn_data.pipeline.labels import REGISTRATION, LabelledArea, read_labelled_area
-from spn_data.pipeline.split_cambridge import image_name, list_of
 from spn_data.split.audit import (
     Finding,
     MapHashes,

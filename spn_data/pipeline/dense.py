@@ -13,10 +13,7 @@ from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import read_map
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
-from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
-from spn_data.labels.map_hash import map_hash
-from spn_data.labels.map_points import MapPoints
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     CAMERA,
     POSES,
     REGISTRATION,
@@ -27,8 +24,11 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.pipeline.register_source import FRAMES_FILE
-from spn_data.pipeline.videos import find_videos
+from spn_data.inputs.evaluation_source import FRAMES_FILE
+from spn_data.inputs.source_videos import find_videos
+from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.labels.map_hash import map_hash
+from spn_data.labels.map_points import MapPoints
 from spn_data.registration.adjustment import lens_parameters
 from spn_data.registration.frame_covariance import (
     FramePoints,

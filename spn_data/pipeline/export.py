@@ -25,8 +25,8 @@ from spn_data.exports.nerfstudio import FOLDER_OF_IMAGES as NERFSTUDIO_IMAGES
 from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
-from spn_data.pipeline.images import image_path
-from spn_data.pipeline.labels import LabelledArea, map_folder, read_labelled_area, together
+from spn_data.inputs.area_labels import LabelledArea, map_folder, read_labelled_area, together
+from spn_data.inputs.frame_images import image_path
 from spn_data.storage.files import exchange
 from spn_data.storage.record import VERSION, write_json
 

@@ -27,8 +27,8 @@ from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sou
 from spn_data.capture.video import probe
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
-from spn_data.pipeline.cameras import start_cameras
-from spn_data.pipeline.telemetry import check_telemetry, telemetry_of, unread_tracks
+from spn_data.inputs.flight_telemetry import check_telemetry, telemetry_of, unread_tracks
+from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize

@@ -18,7 +18,7 @@ from spn_data.georegistration.georegister_options import GeoregisterOptions, Hei
 from spn_data.georegistration.observe import align_telemetry
 from spn_data.georegistration.offset import TimeOffset, estimate_time_offset
 from spn_data.georegistration.result import GeoFit
-from spn_data.pipeline.move import move_labels
+from spn_data.inputs.label_move import move_labels
 from spn_data.storage.record import StageRecord, write_json
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry

@@ -14,12 +14,7 @@ from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
-from spn_data.labels.labels import Labels, sigmas, write_labels, write_seen_points
-from spn_data.labels.map_hash import map_hash
-from spn_data.pipeline.frames import fingerprints
-from spn_data.pipeline.gnss_check import GnssCheck, check_gnss
-from spn_data.pipeline.images import STORED
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     CAMERA,
     POSES,
     REGISTRATION,
@@ -28,8 +23,13 @@ from spn_data.pipeline.labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.pipeline.register_source import find_source, take_frames
-from spn_data.pipeline.telemetry import check_telemetry
+from spn_data.inputs.evaluation_source import find_source, take_frames
+from spn_data.inputs.flight_telemetry import check_telemetry
+from spn_data.inputs.frame_images import STORED
+from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.labels.labels import Labels, sigmas, write_labels, write_seen_points
+from spn_data.labels.map_hash import map_hash
+from spn_data.pipeline.frames import fingerprints
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.register import Registered, labels_of, register_sequence

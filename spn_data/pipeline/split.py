@@ -15,6 +15,15 @@ from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
+from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
+from spn_data.inputs.cambridge_contents import CambridgeFolder
+from spn_data.inputs.dataset_contents import (
+    GivenFrames,
+    RenderedFrames,
+    given_frames,
+    target_cameras,
+)
+from spn_data.inputs.frame_images import frame_images
 from spn_data.pipeline.audit import (
     AUDIT,
     CAMBRIDGE,
@@ -22,15 +31,6 @@ from spn_data.pipeline.audit import (
     SPLIT_FILE,
     audit_folder,
     write_audit,
-)
-from spn_data.pipeline.images import frame_images
-from spn_data.pipeline.labels import LabelledArea, read_labelled_area
-from spn_data.pipeline.split_cambridge import CambridgeFolder
-from spn_data.pipeline.split_dataset import (
-    GivenFrames,
-    RenderedFrames,
-    given_frames,
-    target_cameras,
 )
 from spn_data.split.audit import Finding, Verdict
 from spn_data.split.groups import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions

@@ -11,8 +11,8 @@ from spn_data.dataset.cambridge import NVM, TEST_LIST, TRAIN_LIST, VALIDATION_LI
 from spn_data.dataset.nvm import nvm_model, write_nvm
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import Renderer, undistorted_camera
+from spn_data.inputs.dataset_contents import GivenFrames
 from spn_data.labels.map_points import MapPoints
-from spn_data.pipeline.split_dataset import GivenFrames
 from spn_data.split.audit import MIN_TRAINING_VIEWS
 from spn_data.split.groups import TRAIN, VALIDATION
 from spn_data.storage.files import write_whole

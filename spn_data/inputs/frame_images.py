@@ -11,8 +11,8 @@ import numpy as np
 from spn_data.area.area import EVALUATION, FRAMES, Area
 from spn_data.capture import video
 from spn_data.errors import InputError
+from spn_data.inputs.source_videos import find_videos
 from spn_data.labels.labels import Labels
-from spn_data.pipeline.videos import find_videos
 
 STORED = "frames"  # folder of the images of an evaluation sequence, inside its stage
 

@@ -7,14 +7,14 @@ import shutil
 from pathlib import Path
 
 from spn_data.area.area import DENSE, EVALUATION, Area
-from spn_data.labels.labels import read_labels, write_labels
-from spn_data.pipeline.labels import (
+from spn_data.inputs.area_labels import (
     POSES,
     REGISTRATION,
     read_world_from_model,
     similarity_from_json,
     similarity_to_json,
 )
+from spn_data.labels.labels import read_labels, write_labels
 from spn_data.storage.record import read_json, write_json
 
 

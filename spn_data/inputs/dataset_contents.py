@@ -18,8 +18,8 @@ from spn_data.geometry.rendering import (
     canonical_camera,
     undistorted_camera,
 )
+from spn_data.inputs.area_labels import LabelledArea
 from spn_data.labels.labels import Labels, SeenPoints
-from spn_data.pipeline.labels import LabelledArea
 from spn_data.split.audit import training_points
 from spn_data.split.groups import LEFT_OUT, TRAIN, Split
 
