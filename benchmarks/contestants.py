@@ -150,7 +150,7 @@ def main(who: str, job: Job) -> None:
     from spn_data.area.area import FRAMES, Area
     from spn_data.capture.frames import read_frames
     from spn_data.errors import StageError
-    from spn_data.pipeline.model import frames_to_map
+    from spn_data.pipeline.model_stage import frames_to_map
     from spn_data.work.timing import Stopwatch
 
     area = Area(Path(job.area))

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from spn_data.area.area import FRAMES, Area
 from spn_data.capture.frames import read_frames
-from spn_data.pipeline.frames import FramesOptions, choose_frames, plan
+from spn_data.pipeline.frames_stage import FramesOptions, choose_frames, plan
 from spn_data.simulate.flight import simulate_paths
 from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset
 from spn_data.simulate.produce import simulate

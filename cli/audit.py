@@ -27,7 +27,7 @@ def audit(area_folder: Path, everything: bool) -> None:
     Example:
         spn-data audit --area fields/north
     """
-    from spn_data.pipeline.audit import audit as check
+    from spn_data.pipeline.area_audit import audit as check
 
     area = options.open_area(area_folder)
     with area.locked():

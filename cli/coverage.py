@@ -11,7 +11,7 @@ from cli import console, options, page
 
 if TYPE_CHECKING:
     from spn_data.coverage.sequence_table import Coverage
-    from spn_data.pipeline.coverage import AreaCoverage
+    from spn_data.pipeline.area_coverage import AreaCoverage
 
 _LIMITS = (options.Finite(0, min_open=True), options.Finite(0, 180, min_open=True))
 _SHOWN_STOPS = 20
@@ -90,7 +90,7 @@ def coverage(
     from spn_data.coverage.nearest_frame import Stratum
     from spn_data.coverage.refly import ReflyOptions
     from spn_data.geometry.camera_file import read_camera
-    from spn_data.pipeline.coverage import CoverageStageOptions, check_new, cover_area
+    from spn_data.pipeline.area_coverage import CoverageStageOptions, check_new, cover_area
     from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):

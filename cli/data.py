@@ -103,7 +103,7 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
         spn-data georegister --area fields/north --gnss-sigma 0.03 0.05 --overwrite
     """
     from cli import page, show
-    from spn_data.pipeline.geo import georegister as stage
+    from spn_data.pipeline.geo_stage import georegister as stage
 
     area = options.open_area(area_folder)
     with area.locked():

@@ -50,7 +50,7 @@ def export(
     Example:
         spn-data export nerfstudio --to north-nerf --area fields/north
     """
-    from spn_data.pipeline import export as stage
+    from spn_data.pipeline import area_export as stage
 
     area = options.open_area(area_folder)
     chosen = stage.ExportOptions(sequences=sequences, all_frames=all_frames, images=not no_images)

@@ -11,7 +11,7 @@ import click
 from spn_data.area.area import Area
 
 if TYPE_CHECKING:
-    from spn_data.pipeline.geo import GeoStageOptions
+    from spn_data.pipeline.geo_stage import GeoStageOptions
 
 area = click.option(
     "--area",
@@ -180,7 +180,7 @@ def geo_options(
     """What those options say."""
     from spn_data.geometry.geodesy import HeightReference
     from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
-    from spn_data.pipeline.geo import GeoStageOptions
+    from spn_data.pipeline.geo_stage import GeoStageOptions
 
     if takeoff_alt_m is not None and height_reference is None:
         raise click.UsageError("--takeoff-alt needs --height-reference: what does it count from?")

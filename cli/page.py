@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def refresh(area: Area) -> None:
     """Write report.html. What a command has made stands, whatever becomes of the page."""
-    from spn_data.pipeline.report import write_report
+    from spn_data.pipeline.area_report import write_report
 
     try:
         path, verdict = write_report(area)

@@ -9,10 +9,10 @@ from typing import Any
 from cli import options, page, show
 from spn_data.capture.selection import SelectionOptions
 from spn_data.matching.features import FeatureOptions
-from spn_data.pipeline.frames import FramesOptions
-from spn_data.pipeline.geo import GeoStageOptions
-from spn_data.pipeline.reconstruct import Options, reconstruct
-from spn_data.pipeline.reconstruct import add as extend
+from spn_data.pipeline.frames_stage import FramesOptions
+from spn_data.pipeline.geo_stage import GeoStageOptions
+from spn_data.pipeline.map_stages import Options, reconstruct
+from spn_data.pipeline.map_stages import add as extend
 from spn_data.reconstruction.attempts import ReconstructOptions
 
 

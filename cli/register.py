@@ -92,9 +92,9 @@ def run(
 
     from cli import page, show
     from spn_data.area.area import EVALUATION, GEO
-    from spn_data.pipeline.dense import densify, sequences_with_video
-    from spn_data.pipeline.register import RegisterStageOptions
-    from spn_data.pipeline.register import register as stage
+    from spn_data.pipeline.evaluation_stage import RegisterStageOptions
+    from spn_data.pipeline.evaluation_stage import register as stage
+    from spn_data.pipeline.tracking_stage import densify, sequences_with_video
     from spn_data.registration.register_options import RegisterOptions
     from spn_data.work.cluster import dispatch_to
 

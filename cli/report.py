@@ -32,7 +32,7 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
     Example:
         spn-data report --area fields/north
     """
-    from spn_data.pipeline.report import ReportOptions, write_report
+    from spn_data.pipeline.area_report import ReportOptions, write_report
 
     area = options.open_area(area_folder)
     with area.locked():

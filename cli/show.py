@@ -23,7 +23,7 @@ from spn_data.area.area import (
     Area,
 )
 from spn_data.errors import StageError
-from spn_data.pipeline.frames import Plan
+from spn_data.pipeline.frames_stage import Plan
 from spn_data.storage.record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 

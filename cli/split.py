@@ -11,7 +11,7 @@ from cli import console, options, page
 from cli.audit import show_findings
 
 if TYPE_CHECKING:
-    from spn_data.pipeline.split import SplitStageOptions
+    from spn_data.pipeline.split_stage import SplitStageOptions
     from spn_data.storage.record import StageRecord
 
 _SHARE = options.Finite(0, 0.9, min_open=True)
@@ -121,8 +121,8 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
         spn-data split --area fields/north
     """
     from spn_data.area.area import SPLIT
-    from spn_data.pipeline.audit import AUDIT, read_audit
-    from spn_data.pipeline.split import split_area
+    from spn_data.pipeline.area_audit import AUDIT, read_audit
+    from spn_data.pipeline.split_stage import split_area
 
     area = options.open_area(area_folder)
     with area.locked():
@@ -145,7 +145,7 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
 def _options(
     *, native: bool, width_px: int | None, cambridge: str, no_dense: bool, **chosen: Any
 ) -> SplitStageOptions:
-    from spn_data.pipeline.split import CambridgeFrames, SplitStageOptions
+    from spn_data.pipeline.split_stage import CambridgeFrames, SplitStageOptions
     from spn_data.split.groups import Policy, SplitOptions
 
     chosen["validation"] = Policy(chosen["validation"])

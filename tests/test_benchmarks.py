@@ -18,7 +18,7 @@ from spn_data.area.area import FRAMES, Area
 from spn_data.capture.selection import SelectionOptions
 from spn_data.colmap.model import Scene
 from spn_data.geometry.pose import Poses, Similarity, rotations_from_vectors
-from spn_data.pipeline.frames import FramesOptions, choose_frames, plan
+from spn_data.pipeline.frames_stage import FramesOptions, choose_frames, plan
 from spn_data.simulate import preset, simulate
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"

@@ -22,7 +22,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm
 from spn_data.geometry.rendering import undistorted_camera
 from spn_data.inputs.area_labels import read_labelled_area
-from spn_data.pipeline.split import SplitStageOptions
+from spn_data.pipeline.split_stage import SplitStageOptions
 from spn_data.split.groups import LEFT_OUT, TRAIN, SplitOptions
 from spn_data.split.split_file import read_split
 from spn_data.storage.record import read_json, write_json
@@ -182,7 +182,7 @@ def test_an_interrupted_split_goes_on_and_comes_out_the_same(
     finished_area: Path, split_area: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C between two images: no stage stands, no half file lies about, the same command finishes."""
-    from spn_data.pipeline import split as stage
+    from spn_data.pipeline import split_stage as stage
 
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
     whole = stage.frame_images

@@ -24,7 +24,7 @@ from spn_data.errors import InputError
 from spn_data.inputs.area_labels import POSES
 from spn_data.labels.labels import read_labels
 from spn_data.matching.features import FeatureOptions, extract_from_bytes
-from spn_data.pipeline.model import DATABASE
+from spn_data.pipeline.model_stage import DATABASE
 from spn_data.work import cluster
 from spn_data.work.cluster import fingerprint, run_on_cluster
 

@@ -47,7 +47,7 @@ from spn_data.inputs.area_labels import (
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
 from spn_data.labels.map_points import MapPoints
-from spn_data.pipeline.export import Format
+from spn_data.pipeline.area_export import Format
 from spn_data.storage.record import VERSION, write_json
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -31,7 +31,7 @@ from spn_data.inputs.area_labels import (
 )
 from spn_data.labels.labels import _COLUMNS, Labels, read_labels, read_seen_points
 from spn_data.labels.map_hash import map_hash
-from spn_data.pipeline.frames import FramesOptions, plan
+from spn_data.pipeline.frames_stage import FramesOptions, plan
 from spn_data.registration.register_options import CheckOptions
 from spn_data.simulate.truth import read_truth
 from spn_data.storage.record import read_json
@@ -557,7 +557,7 @@ def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
 
 def test_a_lens_that_may_be_the_maps_own_is_compared_with_it() -> None:
     """10 % apart on images of one size is told; the same lens, another one and another size are not."""
-    from spn_data.pipeline.register import lens_remarks
+    from spn_data.pipeline.evaluation_stage import lens_remarks
 
     def lens(focal_px: float, width: int = 800) -> Camera:
         return Camera("RADIAL", width, 600, np.array([focal_px, width / 2, 300.0, 0.0, 0.0]))

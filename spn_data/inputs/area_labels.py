@@ -19,7 +19,7 @@ from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.labels.map_points import MapPoints, covered_share
-from spn_data.pipeline.model import read_reasons
+from spn_data.pipeline.model_stage import read_reasons
 from spn_data.storage.record import read_json
 from spn_data.uncertainty.map_covariance import MapCovariance
 

@@ -24,7 +24,7 @@ from spn_data.inputs.dataset_contents import (
     target_cameras,
 )
 from spn_data.inputs.frame_images import frame_images
-from spn_data.pipeline.audit import (
+from spn_data.pipeline.area_audit import (
     AUDIT,
     CAMBRIDGE,
     DATASET,

@@ -30,7 +30,7 @@ from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.pose import Poses
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
-from spn_data.pipeline.geo import recorded_options
+from spn_data.pipeline.geo_stage import recorded_options
 from spn_data.storage.record import VERSION, read_json, write_json
 from spn_data.work.timing import Progress
 

@@ -9,14 +9,14 @@ from typing import Protocol
 from spn_data.area.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegistration.result import GeoFit
-from spn_data.pipeline.frames import FramesOptions, Plan, choose_frames, plan
-from spn_data.pipeline.geo import (
+from spn_data.pipeline.frames_stage import FramesOptions, Plan, choose_frames, plan
+from spn_data.pipeline.geo_stage import (
     GeoStageOptions,
     georegister,
     has_fixes,
     recorded_options,
 )
-from spn_data.pipeline.model import build_model
+from spn_data.pipeline.model_stage import build_model
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.reconstruct import estimate_model_cost
 from spn_data.storage.record import StageRecord, read_json

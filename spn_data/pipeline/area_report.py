@@ -20,8 +20,8 @@ from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.network_runs import read_runs
 from spn_data.labels.labels import Labels, sigmas
-from spn_data.pipeline import coverage as coverage_stage
-from spn_data.pipeline.audit import AUDIT, SPLIT_FILE, read_audit
+from spn_data.pipeline import area_coverage as coverage_stage
+from spn_data.pipeline.area_audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import Verdict, verdict
