@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.exports.frames import timestamps_us
+from spn_data.exports.exported_frames import timestamps_us
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
 from spn_data.storage.files import write_csv

@@ -27,7 +27,7 @@ from cli.export import FORMATS
 from spn_data.area.area import EVALUATION, Area, StageWork
 from spn_data.colmap import pycolmap
 from spn_data.dataset.nvm import read_nvm
-from spn_data.exports.frames import ExportedFrames, timestamps_us
+from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
 from spn_data.exports.geojson import write_geojson
 from spn_data.exports.kml import write_kml
 from spn_data.geometry.camera import Camera

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.extend import write_extended
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 
 FOLDER_OF_MODEL = "sparse/0"
 FOLDER_OF_IMAGES = "images"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.pose import angles_from_rotations
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.exports.geographic import places_of
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.storage.files import write_whole

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.exports.geographic import Places, places_of
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.storage.files import write_whole

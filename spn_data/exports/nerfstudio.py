@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.geometry.camera import Camera
 from spn_data.storage.record import write_json
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.dataset.nvm import nvm_model, offsets_from_center, write_nvm
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 
 
 def write_nvm_export(folder: Path, frames: ExportedFrames) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.exports.frames import ExportedFrames, timestamps_us
+from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
 from spn_data.storage.files import write_whole
 
 

@@ -16,7 +16,7 @@ from spn_data.area.area import Area
 from spn_data.errors import StageError
 from spn_data.exports.colmap_export import FOLDER_OF_IMAGES as COLMAP_IMAGES
 from spn_data.exports.colmap_export import write_colmap
-from spn_data.exports.frames import ExportedFrames
+from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.exports.geojson import write_geojson
 from spn_data.exports.kapture import FOLDER_OF_IMAGES as KAPTURE_IMAGES
 from spn_data.exports.kapture import write_kapture
