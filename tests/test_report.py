@@ -17,7 +17,7 @@ from spn_data.report.residual_map import residual_map, round_down
 from spn_data.report.scene import display_of, thin
 from spn_data.report.thinning import thin_frames
 from spn_data.report.verdict import Level, VerdictLimits, verdict
-from spn_data.split.groups import audit
+from spn_data.split import audit
 from tests.report_data import area, flight, points, record, unpack
 
 ROOT = Path(__file__).resolve().parents[1]
