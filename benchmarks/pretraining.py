@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_model.imagenet import MEAN, STD
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
 from spn_model.networks.registry import build
 from spn_model.networks.regressor import Regressor

@@ -43,10 +43,10 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.batches import rows_of_step
 from spn_model.gradients import Gradients, gradients
-from spn_model.imagenet import MEAN, STD
 from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.recipe import Stage, read_recipe
 from spn_model.train import made_part, optimizer_of, run_stage
 from spn_model.training_record import Files, Record

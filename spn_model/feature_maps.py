@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from spn_model.baselines import FeatureMaps
-from spn_model.imagenet import MEAN, STD
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.squeezeposenet import SqueezePoseNet, SqueezePoseNetOptions
 from spn_model.tensors import load_pretrained, read_tensors
 from spn_model.weights import find

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from spn_data.errors import InputError
-from spn_model.imagenet import MEAN, STD
 from spn_model.members.member import Member
 from spn_model.members.regression import RegressionMember
 from spn_model.members.regression_examples import input_size, resized
 from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.onboard.bundle import INPUT, CellDecoding, Decoding, PoseDecoding
 
 _OPSET = 17  # read by onnxruntime from 1.12 on

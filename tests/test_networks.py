@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from spn_data.errors import InputError
-from spn_model.imagenet import MEAN, STD
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
 from spn_model.networks.posenet import PoseNet
 from spn_model.networks.registry import REGRESSORS, build, options_of

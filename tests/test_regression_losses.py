@@ -8,8 +8,14 @@ import torch
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats, rotations_from_vectors
-from spn_model.loss import LearnedWeighting, beta_weighted, laplace, reprojection, residuals
-from spn_model.targets import PoseTargets
+from spn_model.networks.pose_loss import (
+    LearnedWeighting,
+    beta_weighted,
+    laplace,
+    reprojection,
+    residuals,
+)
+from spn_model.networks.pose_targets import PoseTargets
 
 FAR = np.array(
     [450_000.0, -5_200_000.0, 120.0]

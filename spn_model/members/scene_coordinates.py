@@ -15,10 +15,10 @@ from torch.nn import functional
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.decoding import DecodingOptions, PoseEstimate, decode
-from spn_model.imagenet import MEAN, STD
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.scene_examples import Examples, StageOptions
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
     laplace_loss,

@@ -7,9 +7,9 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from spn_model.loss import LearnedWeighting
+from spn_model.networks.pose_loss import LearnedWeighting
+from spn_model.networks.pose_targets import PoseTargets
 from spn_model.networks.regressor import Estimate, Regressor
-from spn_model.targets import PoseTargets
 
 _LOG_STD = 7.0  # bound: from 0.1 % to 1000 times the training poses' spread, and radians
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from spn_model.imagenet import MEAN, STD
+from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.regressor import Estimate, Regressor, he_start, heads
 
 
