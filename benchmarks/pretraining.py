@@ -24,8 +24,8 @@ from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
 from spn_model.networks.registry import build
 from spn_model.networks.regressor import Regressor
-from spn_model.tensors import load_pretrained, read_tensors
-from spn_model.weights import find
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.weights import find
 
 
 def training_images(path: Path, count: int) -> Tensor:

@@ -19,7 +19,7 @@ def weights(context: click.Context) -> None:
     """
     if context.invoked_subcommand is not None:
         return
-    from spn_model.weights import CATALOGUE, cache_folder, state
+    from spn_model.pretrained.weights import CATALOGUE, cache_folder, state
 
     rows = []
     for entry in CATALOGUE:
@@ -40,8 +40,8 @@ def fetch(name: str) -> None:
     Example:
         spn-model weights fetch googlenet
     """
-    from spn_model.weights import fetch as download
-    from spn_model.weights import of_name
+    from spn_model.pretrained.weights import fetch as download
+    from spn_model.pretrained.weights import of_name
 
     entry = of_name(name)
     with console.progress() as progress:

@@ -8,8 +8,8 @@ import torch
 from spn_model.baselines import FeatureMaps
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.squeezeposenet import SqueezePoseNet, SqueezePoseNetOptions
-from spn_model.tensors import load_pretrained, read_tensors
-from spn_model.weights import find
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.weights import find
 
 WEIGHTS = "squeezenet1_1-features"
 

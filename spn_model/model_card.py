@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from spn_data.errors import InputError
 from spn_model.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
-from spn_model.weights import of_name
+from spn_model.pretrained.weights import of_name
 
 if TYPE_CHECKING:
     from spn_model.bundle_checks import GroupErrors

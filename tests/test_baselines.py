@@ -231,8 +231,8 @@ def test_feature_maps_are_those_of_squeezenet():
     """fire9 of the shipped weights, against the layers written out as plain convolutions with ReLUs."""
     torch = pytest.importorskip("torch")
     from spn_model.feature_maps import squeezenet_maps
-    from spn_model.tensors import read_tensors
-    from spn_model.weights import find
+    from spn_model.pretrained.tensors import read_tensors
+    from spn_model.pretrained.weights import find
 
     weights = {k: v.float() for k, v in read_tensors(find("squeezenet1_1-features")).items()}
 

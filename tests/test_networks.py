@@ -16,8 +16,8 @@ from spn_model.networks.normalization import InsertedBatchNorm, start_as_identit
 from spn_model.networks.posenet import PoseNet
 from spn_model.networks.registry import REGRESSORS, build, options_of
 from spn_model.networks.squeezeposenet import SqueezePoseNetOptions
-from spn_model.tensors import load_pretrained, read_tensors
-from spn_model.weights import find
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.weights import find
 
 torch.set_num_threads(1)
 MIB = 2**20

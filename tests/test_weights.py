@@ -24,8 +24,16 @@ from safetensors.torch import save_file
 from cli.model import main
 from spn_data.errors import InputError
 from spn_model.networks.registry import build
-from spn_model.tensors import load_pretrained, read_tensors
-from spn_model.weights import CATALOGUE, SHIPPED, cache_folder, fetch, find, of_name, state
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.weights import (
+    CATALOGUE,
+    SHIPPED,
+    cache_folder,
+    fetch,
+    find,
+    of_name,
+    state,
+)
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).resolve().parents[1]
@@ -514,7 +522,7 @@ def test_a_redirection_to_an_insecure_address_is_not_followed():
     import urllib.error
     import urllib.request
 
-    from spn_model.weights import _StaySecure
+    from spn_model.pretrained.weights import _StaySecure
 
     request = urllib.request.Request("https://download.pytorch.org/models/a.pth")
     follow = _StaySecure().redirect_request

@@ -4,7 +4,7 @@
 
 reads the whole network in torchvision's names, leaves its classifier out, rounds, and writes
 spn_model/pretrained/squeezenet1_1-features.safetensors. Prints the file's hash, which stands in
-spn_model/weights.py. The same input gives the same bytes.
+spn_model/pretrained/weights.py. The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 
-from spn_model.weights import SHIPPED, of_name
+from spn_model.pretrained.weights import SHIPPED, of_name
 
 ABOUT = "SqueezeNet 1.1 features, ImageNet, rounded to float16; "
 

@@ -63,11 +63,11 @@ class Member(ABC):
     @property
     @abstractmethod
     def weights_name(self) -> str:
-        """Name, in `spn_model.weights`, of the published weights that training starts from."""
+        """Name, in `spn_model.pretrained.weights`, of the published weights that training starts from."""
 
     @abstractmethod
     def load_pretrained(self, weights: str) -> None:
-        """Start from published weights: a name of `spn_model.weights` or a file."""
+        """Start from published weights: a name of `spn_model.pretrained.weights` or a file."""
 
     @abstractmethod
     def fit(self, data: TrainingSet) -> None:

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_model import weights
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.regression_examples import (
@@ -28,7 +27,8 @@ from spn_model.networks.normalization import start_as_identity
 from spn_model.networks.pose_loss import beta_weighted, laplace, reprojection, residuals
 from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
-from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.pretrained import weights
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.training_set import TrainingSet
 
 _MEASURED = (

@@ -23,10 +23,10 @@ from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
     laplace_loss,
 )
-from spn_model.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.tensors import load_pretrained, read_tensors
+from spn_model.pretrained.weights import find
 from spn_model.training_set import TrainingSet
 from spn_model.unseen_views import UnseenViews
-from spn_model.weights import find
 
 _MEASURED = 16  # training images, spread evenly, by which features are normalised
 

@@ -37,7 +37,7 @@ class Regressor(nn.Module, ABC):
     @property
     @abstractmethod
     def weights_name(self) -> str:
-        """Name, in `spn_model.weights`, of the published weights that the trunk starts from."""
+        """Name, in `spn_model.pretrained.weights`, of the published weights that the trunk starts from."""
 
     @abstractmethod
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
