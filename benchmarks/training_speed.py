@@ -47,12 +47,12 @@ from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
 from spn_model.networks.imagenet import MEAN, STD
+from spn_model.onboard.view import View
 from spn_model.recipe import Stage, read_recipe
 from spn_model.train import made_part, optimizer_of, run_stage
 from spn_model.training_record import Files, Record
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import Position
-from spn_model.view import View
 
 
 @dataclass(frozen=True)

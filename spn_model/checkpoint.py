@@ -18,7 +18,7 @@ from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import writing_whole
 from spn_model.members.member import Member
 from spn_model.members.registry import make
-from spn_model.view import View
+from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-checkpoint"
 VERSION = 1

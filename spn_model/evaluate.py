@@ -28,9 +28,9 @@ from spn_model.metrics import (
     evaluate,
     evaluation_frames,
 )
+from spn_model.onboard.view import View
 from spn_model.retrieval import most_alike
 from spn_model.validation import spread_rows
-from spn_model.view import View
 
 _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
 

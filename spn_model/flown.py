@@ -19,7 +19,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import at_size, of_focal_length
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_data.telemetry.exif import telemetry_of_photos
-from spn_model.view import View
+from spn_model.onboard.view import View
 
 _REMEDY = (
     "its camera is not known, and without it a pose would be a guess; give it as --camera FILE: "

@@ -26,12 +26,12 @@ from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.members.member import Batch, Member
 from spn_model.members.registry import make
 from spn_model.muon import Muon
+from spn_model.onboard.view import View
 from spn_model.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
 from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import Position, read_state
-from spn_model.view import View
 
 _LOG_EVERY_S = 10.0
 _SAVE_EVERY_S = 30.0

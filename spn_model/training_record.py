@@ -18,10 +18,10 @@ from spn_data.errors import GeometryError
 from spn_model import checkpoint
 from spn_model.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.members.member import Member
+from spn_model.onboard.view import View
 from spn_model.training_set import TrainingSet
 from spn_model.training_state import Log, Position, save_state
 from spn_model.validation import Errors, Frames, judge, spread_rows
-from spn_model.view import View
 
 # A later network is kept where its score is at most this times the best one: rates fall towards the end, and
 # validation frames are few and of one or two places.

@@ -12,7 +12,7 @@ import pytest
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
-from spn_model.decoding import DecodingOptions, decode
+from spn_model.onboard.decoding import DecodingOptions, decode
 
 MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])
 GRID = (59, 33)  # cells of a 480 x 270 image, the first at (7.5, 7.5), 8 px apart
@@ -157,7 +157,7 @@ def test_decoding_needs_neither_torch_nor_pycolmap():
     code = (
         "import sys\n"
         "sys.modules['torch'] = sys.modules['pycolmap'] = sys.modules['scipy'] = None\n"
-        "import spn_model.decoding\n"
+        "import spn_model.onboard.decoding\n"
     )
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(

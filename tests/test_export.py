@@ -27,7 +27,7 @@ from spn_model.graphs import _CellMeans, deployment, reference, write_graph
 from spn_model.members.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
 from spn_model.onboard.localizer import Localizer
-from spn_model.view import View
+from spn_model.onboard.view import View
 from tests.box_world import write_box
 from tests.bundle_world import learnt
 

@@ -14,7 +14,6 @@ from torch.nn import functional
 
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
-from spn_model.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.scene_examples import Examples, StageOptions
@@ -23,6 +22,7 @@ from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
     laplace_loss,
 )
+from spn_model.onboard.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.pretrained.weights import find
 from spn_model.training_set import TrainingSet
@@ -178,7 +178,7 @@ class SceneCoordinatesMember(Member):
 
     @property
     def decoding_options(self) -> DecodingOptions:
-        """What `spn_model.decoding.decode` needs, with what was measured: all that differs on board."""
+        """What `spn_model.onboard.decoding.decode` needs, with what was measured: all that differs on board."""
         return replace(
             self.decoding,
             cells_per_observation=self.decoding.cells_per_observation * self.covariance_scale,

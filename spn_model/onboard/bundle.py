@@ -18,8 +18,8 @@ import numpy as np
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
-from spn_model.decoding import DecodingOptions
-from spn_model.view import View
+from spn_model.onboard.decoding import DecodingOptions
+from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-bundle"
 VERSION = 1

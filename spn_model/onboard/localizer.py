@@ -13,7 +13,6 @@ from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats
 from spn_data.geometry.rendering import Renderer
-from spn_model.decoding import decode
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -24,6 +23,7 @@ from spn_model.onboard.bundle import (
     read_bundle,
     verified,
 )
+from spn_model.onboard.decoding import decode
 
 # From 1280 to 480 px 2 x 2 samples a pixel then suffice, which are taken four times as fast as 3 x 3;
 # images of simulated flights differ from those of the data set by 0.7 grey levels in the mean.
