@@ -42,6 +42,7 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.batches import rows_of_step
+from spn_model.examples.training_set import TrainingSet
 from spn_model.gradients import Gradients, gradients
 from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.members.member import Batch, Member
@@ -51,7 +52,6 @@ from spn_model.onboard.view import View
 from spn_model.recipe import Stage, read_recipe
 from spn_model.train import made_part, optimizer_of, run_stage
 from spn_model.training_record import Files, Record
-from spn_model.training_set import TrainingSet
 from spn_model.training_state import Position
 
 

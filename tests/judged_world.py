@@ -10,9 +10,9 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_model.checkpoint import Checkpoint, load, save
+from spn_model.examples.training_set import TrainingSet
 from spn_model.members.registry import make
 from spn_model.onboard.view import View
-from spn_model.training_set import TrainingSet
 from tests.training_world import INFO, frame
 
 ROLES = {

@@ -7,7 +7,7 @@ import pytest
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
+from spn_model.examples.augment import LookOptions, WarpOptions, change_look, random_warp
 
 SIZE = (480, 271)  # an odd height: halving it is not exactly by two
 MATRIX = np.array([[328.0, 0, 233.0], [0, 331.0, 141.0], [0, 0, 1.0]])

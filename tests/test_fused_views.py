@@ -9,14 +9,14 @@ import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_model.fused_views import fused_view
-from spn_model.ground import level_ground
+from spn_model.examples.fused_views import fused_view
+from spn_model.examples.ground import level_ground
+from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.view_sources import Occluders, Sources
+from spn_model.examples.virtual_views import ViewOptions, high_place
 from spn_model.members.member import ANY_NUMBER
 from spn_model.members.scene_examples import Examples, StageOptions
-from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, surface
-from spn_model.training_set import TrainingSet
-from spn_model.view_sources import Occluders, Sources
-from spn_model.virtual_views import ViewOptions, high_place
 from tests.box_world import CAMERA, SIZE_M, seen_by, write_box
 
 CENTER, SPREAD = SIZE_M / 2, 8.0

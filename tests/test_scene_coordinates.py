@@ -11,7 +11,15 @@ from torch.nn import functional
 from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_model.augment import WarpOptions, random_warp
+from spn_model.examples.augment import WarpOptions, random_warp
+from spn_model.examples.point_targets import (
+    Surface,
+    SurfaceOptions,
+    cell_centers,
+    cell_targets,
+    surface,
+)
+from spn_model.examples.virtual_views import ViewOptions, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -19,14 +27,6 @@ from spn_model.networks.scene_coordinates import (
     grid_size,
     laplace_loss,
 )
-from spn_model.point_targets import (
-    Surface,
-    SurfaceOptions,
-    cell_centers,
-    cell_targets,
-    surface,
-)
-from spn_model.virtual_views import ViewOptions, random_place, view_from
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

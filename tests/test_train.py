@@ -24,15 +24,15 @@ from spn_data.geometry.pose import Poses
 from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.checkpoint import load
 from spn_model.covariance_scale import measured_scale
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.unseen_views import UnseenViews
 from spn_model.members.member import PoseEstimates
 from spn_model.onboard.view import View
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train
 from spn_model.training_loss import Diverged, Losses
 from spn_model.training_record import Record, judged_frames
-from spn_model.training_set import TrainingSet
 from spn_model.training_state import COLUMNS, Log, Position, read_state
-from spn_model.unseen_views import UnseenViews
 from spn_model.validation import judge, spread_rows
 from tests.training_world import (
     INFO,

@@ -11,8 +11,8 @@ import numpy as np
 from torch import Tensor, nn
 
 from spn_data.geometry.pose import Poses
-from spn_model.training_set import TrainingSet
-from spn_model.unseen_views import UnseenViews
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.unseen_views import UnseenViews
 
 Batch = dict[str, Tensor]
 ANY_NUMBER = 10**12  # of images, where it is not known how many are drawn

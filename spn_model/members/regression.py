@@ -12,6 +12,7 @@ from torch import Tensor
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
+from spn_model.examples.training_set import TrainingSet
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.regression_examples import (
@@ -29,7 +30,6 @@ from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
 from spn_model.pretrained import weights
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
-from spn_model.training_set import TrainingSet
 
 _MEASURED = (
     64  # training images, spread evenly, on which batch normalisation starts as the identity

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model.augment import LookOptions, change_look, random_warp
+from spn_model.examples.augment import LookOptions, change_look, random_warp
+from spn_model.examples.training_set import TrainingSet
 from spn_model.members.regression_options import StageOptions
-from spn_model.training_set import TrainingSet
 
 
 def input_size(width: int, height: int, wanted_width: int) -> tuple[int, int]:

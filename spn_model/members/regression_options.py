@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spn_data.errors import InputError
-from spn_model.augment import WarpOptions
+from spn_model.examples.augment import WarpOptions
 
 LOSSES = ("beta", "learned", "reprojection")
 

@@ -14,6 +14,8 @@ from torch.nn import functional
 
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.unseen_views import UnseenViews
 from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.members.options import from_mapping
 from spn_model.members.scene_examples import Examples, StageOptions
@@ -25,8 +27,6 @@ from spn_model.networks.scene_coordinates import (
 from spn_model.onboard.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.pretrained.weights import find
-from spn_model.training_set import TrainingSet
-from spn_model.unseen_views import UnseenViews
 
 _MEASURED = 16  # training images, spread evenly, by which features are normalised
 

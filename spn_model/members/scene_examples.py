@@ -9,19 +9,25 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_model.augment import LookOptions, WarpOptions, change_look, random_warp
-from spn_model.fused_views import fused_view
+from spn_model.examples.augment import LookOptions, WarpOptions, change_look, random_warp
+from spn_model.examples.fused_views import fused_view
+from spn_model.examples.point_targets import (
+    Surface,
+    SurfaceOptions,
+    cell_centers,
+    cell_targets,
+    surface,
+)
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.unseen_views import UnseenViews
+from spn_model.examples.view_sources import Sources
+from spn_model.examples.virtual_views import ViewOptions, high_place, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
     SceneCoordinates,
     grid_size,
 )
-from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, cell_targets, surface
-from spn_model.training_set import TrainingSet
-from spn_model.unseen_views import UnseenViews
-from spn_model.view_sources import Sources
-from spn_model.virtual_views import ViewOptions, high_place, random_place, view_from
 
 _FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
 _LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height

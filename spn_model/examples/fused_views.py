@@ -10,10 +10,10 @@ import numpy as np
 
 from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.pose import Poses
-from spn_model.ground import Ground
-from spn_model.point_targets import Surface, SurfaceOptions, cell_centers, surface
-from spn_model.training_set import TrainingSet
-from spn_model.view_sources import Occluders, Sources, projected
+from spn_model.examples.ground import Ground
+from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
+from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.view_sources import Occluders, Sources, projected
 
 _SOURCES = 16  # images that a view is made of, at most
 _MARGIN_PX = 40.0  # around a view: map points there hold surfaces that reach into it

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model.point_targets import Surface, cell_centers
+from spn_model.examples.point_targets import Surface, cell_centers
 
 _NEAREST = 0.5  # depth, in metres, before which nothing is drawn
 _STEEP_DEG = (

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model.ground import Ground, level_ground
-from spn_model.training_set import TrainingSet
+from spn_model.examples.ground import Ground, level_ground
+from spn_model.examples.training_set import TrainingSet
 
 _MOST_IMAGES = 600  # that views are made of; neighbouring frames of a video show the same
 _VOXEL = 0.05  # spreads, side of what counts as one place of the scene
