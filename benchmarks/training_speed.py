@@ -45,8 +45,8 @@ from spn_model.batches import rows_of_step
 from spn_model.examples.training_set import TrainingSet
 from spn_model.gradients import Gradients, gradients
 from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
-from spn_model.members.member import Batch, Member
-from spn_model.members.registry import make
+from spn_model.models.member import Batch, Member
+from spn_model.models.registry import make
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.onboard.view import View
 from spn_model.recipe import Stage, read_recipe

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import writing_whole
-from spn_model.members.member import Member
-from spn_model.members.registry import make
+from spn_model.models.member import Member
+from spn_model.models.registry import make
 from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-checkpoint"

@@ -11,7 +11,7 @@ from torch import nn
 
 from spn_data.geometry.pose import Poses, rotation_vectors
 from spn_model.baselines import mean_pose
-from spn_model.members.member import Member, PoseEstimates
+from spn_model.models.member import Member, PoseEstimates
 
 _DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout)
 _FEWEST = 7  # samples with which a covariance over six numbers can have full rank

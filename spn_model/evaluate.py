@@ -19,7 +19,6 @@ from spn_data.work.timing import Progress
 from spn_model.baselines import GEM, VLAD, better, guess_mean, oracle, posed
 from spn_model.checkpoint import Checkpoint
 from spn_model.dropout import dropout_estimates, has_dropout
-from spn_model.members.member import Member, PoseEstimates
 from spn_model.metrics import (
     Estimates,
     Evaluation,
@@ -28,6 +27,7 @@ from spn_model.metrics import (
     evaluate,
     evaluation_frames,
 )
+from spn_model.models.member import Member, PoseEstimates
 from spn_model.onboard.view import View
 from spn_model.retrieval import most_alike
 from spn_model.validation import spread_rows

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from spn_model.machine import Machine
-from spn_model.members.member import Batch, Member
+from spn_model.models.member import Batch, Member
 
 
 class Gradients:

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from spn_data.errors import InputError
-from spn_model.members.member import Member
-from spn_model.members.regression import RegressionMember
-from spn_model.members.regression_examples import input_size, resized
-from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.models.member import Member
+from spn_model.models.regression import RegressionMember
+from spn_model.models.regression_examples import input_size, resized
+from spn_model.models.scene_coordinates import SceneCoordinatesMember
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.onboard.bundle import INPUT, CellDecoding, Decoding, PoseDecoding
 

@@ -24,8 +24,8 @@ from spn_model.batches import batches_ahead, generator_of_step, rows_of_step, to
 from spn_model.examples.training_set import TrainingSet
 from spn_model.gradients import gradients
 from spn_model.machine import Machine, Ranks, choose, joined, prepared
-from spn_model.members.member import Batch, Member
-from spn_model.members.registry import make
+from spn_model.models.member import Batch, Member
+from spn_model.models.registry import make
 from spn_model.muon import Muon
 from spn_model.onboard.view import View
 from spn_model.recipe import ALL, AREA, PRETRAINING, Recipe, Stage

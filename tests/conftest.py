@@ -22,11 +22,11 @@ def shared_data() -> Path:
 @pytest.fixture(scope="module")
 def tiny_kind() -> Iterator[None]:
     """Recipes and checkpoints know the small network of `tests.training_world`."""
-    from spn_model.members.registry import KINDS
+    from spn_model.models.registry import KINDS
     from tests.training_world import register_tiny
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spn_model.members.registry.KINDS", dict(KINDS))
+        patch.setattr("spn_model.models.registry.KINDS", dict(KINDS))
         register_tiny()
         yield
 

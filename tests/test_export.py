@@ -24,7 +24,7 @@ from spn_model import checkpoint
 from spn_model.bundle_checks import ExportOptions
 from spn_model.export import Exported, export
 from spn_model.graphs import _CellMeans, deployment, reference, write_graph
-from spn_model.members.registry import make
+from spn_model.models.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.view import View

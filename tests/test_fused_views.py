@@ -15,8 +15,8 @@ from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_cente
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.view_sources import Occluders, Sources
 from spn_model.examples.virtual_views import ViewOptions, high_place
-from spn_model.members.member import ANY_NUMBER
-from spn_model.members.scene_examples import Examples, StageOptions
+from spn_model.models.member import ANY_NUMBER
+from spn_model.models.scene_examples import Examples, StageOptions
 from tests.box_world import CAMERA, SIZE_M, seen_by, write_box
 
 CENTER, SPREAD = SIZE_M / 2, 8.0
@@ -255,7 +255,7 @@ def test_a_stage_begins_with_few_views(data):
 
 def test_views_are_kept_within_their_memory(data, monkeypatch):
     """Fewer are made where they would take more, of images spread over all of them."""
-    monkeypatch.setattr("spn_model.members.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
+    monkeypatch.setattr("spn_model.models.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
     examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     assert examples._view_count == 10
     views = [examples._view(n) for n in range(10)]
@@ -264,7 +264,7 @@ def test_views_are_kept_within_their_memory(data, monkeypatch):
 
 def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     """After some attempts; its targets are the image's own."""
-    monkeypatch.setattr("spn_model.members.scene_examples._LEAST_SHOWN", 1.1)
+    monkeypatch.setattr("spn_model.models.scene_examples._LEAST_SHOWN", 1.1)
     examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     assert examples._view(0) is None
     image, seen = examples._training_image(0)

@@ -13,7 +13,7 @@ from spn_data.errors import InputError
 from spn_model.examples.training_set import TrainingSet
 from spn_model.gradients import gradients
 from spn_model.machine import choose
-from spn_model.members.scene_coordinates import SceneCoordinatesMember
+from spn_model.models.scene_coordinates import SceneCoordinatesMember
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train
 from tests.box_world import write_box

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from spn_data.errors import InputError
-from spn_model.members.registry import make
+from spn_model.models.registry import make
 from spn_model.recipe import Recipe, Stage, names, read_recipe
 
 GOOD = """\

@@ -16,9 +16,9 @@ from spn_data.geometry.pose import Poses, pose_errors
 from spn_model.calibration import calibrate
 from spn_model.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
-from spn_model.members.registry import make
-from spn_model.members.regression import RegressionMember
-from spn_model.members.regression_examples import example
+from spn_model.models.registry import make
+from spn_model.models.regression import RegressionMember
+from spn_model.models.regression_examples import example
 from spn_model.networks.normalization import InsertedBatchNorm
 from spn_model.networks.pose_loss import beta_weighted, residuals
 from tests.box_world import CAMERA, seen_by, write_box

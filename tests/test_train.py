@@ -26,7 +26,7 @@ from spn_model.checkpoint import load
 from spn_model.covariance_scale import measured_scale
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
-from spn_model.members.member import PoseEstimates
+from spn_model.models.member import PoseEstimates
 from spn_model.onboard.view import View
 from spn_model.recipe import Recipe, Stage
 from spn_model.train import Data, Stopped, train

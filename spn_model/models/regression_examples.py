@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.geometry.pose import Poses
 from spn_model.examples.augment import LookOptions, change_look, random_warp
 from spn_model.examples.training_set import TrainingSet
-from spn_model.members.regression_options import StageOptions
+from spn_model.models.regression_options import StageOptions
 
 
 def input_size(width: int, height: int, wanted_width: int) -> tuple[int, int]:

@@ -7,12 +7,12 @@ from importlib import import_module
 from typing import Any
 
 from spn_data.errors import InputError
-from spn_model.members.member import Member
+from spn_model.models.member import Member
 
 # Imported when they are asked for: one kind does not need what another does.
 KINDS = {
-    "regression": ("spn_model.members.regression", "RegressionMember"),
-    "scene-coordinates": ("spn_model.members.scene_coordinates", "SceneCoordinatesMember"),
+    "regression": ("spn_model.models.regression", "RegressionMember"),
+    "scene-coordinates": ("spn_model.models.scene_coordinates", "SceneCoordinatesMember"),
 }
 
 

@@ -13,16 +13,16 @@ from torch import Tensor
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
-from spn_model.members.member import ANY_NUMBER, Batch, Member, PoseEstimates
-from spn_model.members.options import from_mapping
-from spn_model.members.regression_examples import (
+from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
+from spn_model.models.options import from_mapping
+from spn_model.models.regression_examples import (
     FeatureCache,
     example,
     input_size,
     resized,
     visible_points,
 )
-from spn_model.members.regression_options import RegressionOptions, StageOptions
+from spn_model.models.regression_options import RegressionOptions, StageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import start_as_identity
 from spn_model.networks.pose_loss import beta_weighted, laplace, reprojection, residuals
