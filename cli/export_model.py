@@ -61,9 +61,9 @@ def run(
     from spn_data.errors import StageError
     from spn_data.storage.record import content_fingerprint
     from spn_model.bundle_checks import ExportOptions
-    from spn_model.checkpoint import load
     from spn_model.export import export as work
     from spn_model.export import is_made_of
+    from spn_model.models.checkpoint import load
 
     area = options.open_area(area_folder)
     file = area.run(name) / names_of.CHECKPOINT

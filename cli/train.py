@@ -242,7 +242,7 @@ def _standing(
 
 def _write(path: Path, config: dict[str, Any]) -> None:
     from spn_data.storage.record import write_json
-    from spn_model.checkpoint import finite
+    from spn_model.models.checkpoint import finite
 
     write_json(path, finite(config))
 

@@ -13,8 +13,8 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_whole
 from spn_model import figures
 from spn_model.baselines import MEAN
-from spn_model.checkpoint import Checkpoint
 from spn_model.evaluate import Comparison, Cost, Judged
+from spn_model.models.checkpoint import Checkpoint
 from spn_model.tables import write_errors, write_metrics
 
 

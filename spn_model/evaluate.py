@@ -17,7 +17,6 @@ from spn_data.geometry.pose import Poses
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
 from spn_model.baselines import GEM, VLAD, better, guess_mean, oracle, posed
-from spn_model.checkpoint import Checkpoint
 from spn_model.dropout import dropout_estimates, has_dropout
 from spn_model.metrics import (
     Estimates,
@@ -27,6 +26,7 @@ from spn_model.metrics import (
     evaluate,
     evaluation_frames,
 )
+from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.member import Member, PoseEstimates
 from spn_model.onboard.view import View
 from spn_model.retrieval import most_alike

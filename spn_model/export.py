@@ -26,10 +26,10 @@ from spn_model.bundle_checks import (
     compare_with_pytorch,
     measure_errors,
 )
-from spn_model.checkpoint import Checkpoint
 from spn_model.evaluate import check_world
 from spn_model.graphs import Deployment, deployment, write_graph
 from spn_model.model_card import model_card
+from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import (
     CARD,
     CONVENTIONS,

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spn_data.errors import InputError
-from spn_model.checkpoint import Checkpoint
+from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
 from spn_model.pretrained.weights import of_name
 

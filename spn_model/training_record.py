@@ -15,9 +15,9 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
-from spn_model import checkpoint
 from spn_model.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.examples.training_set import TrainingSet
+from spn_model.models import checkpoint
 from spn_model.models.member import Member
 from spn_model.onboard.view import View
 from spn_model.training_state import Log, Position, save_state

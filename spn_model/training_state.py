@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from spn_data.errors import FormatError, StageError
-from spn_model.checkpoint import read_tensors, set_state, write_tensors
+from spn_model.models.checkpoint import read_tensors, set_state, write_tensors
 
 FORMAT = "squeezeposenet-state"
 _NETWORK, _OPTIMIZER = "network.", "optimizer."

@@ -9,8 +9,8 @@ import torch
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.camera import Camera
-from spn_model.checkpoint import Checkpoint
 from spn_model.examples.training_set import TrainingSet
+from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.scene_coordinates import SceneCoordinatesMember
 from spn_model.onboard.view import View
 from spn_model.precision import bfloat16_is_fast

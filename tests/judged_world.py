@@ -9,8 +9,8 @@ from typing import Any
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
-from spn_model.checkpoint import Checkpoint, load, save
 from spn_model.examples.training_set import TrainingSet
+from spn_model.models.checkpoint import Checkpoint, load, save
 from spn_model.models.registry import make
 from spn_model.onboard.view import View
 from tests.training_world import INFO, frame

@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError, StageError
-from spn_model.checkpoint import FORMAT, Checkpoint, load, save
 from spn_model.examples.training_set import TrainingSet
+from spn_model.models.checkpoint import FORMAT, Checkpoint, load, save
 from spn_model.onboard.view import View
 from tests.training_world import CAMERA, INFO, TinyMember, write_field
 

@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 from cli.model import main
 from cli.train import train
-from spn_model.checkpoint import load
+from spn_model.models.checkpoint import load
 from spn_model.training_state import COLUMNS
 from tests.training_world import write_field
 

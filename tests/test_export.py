@@ -20,10 +20,10 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
 from spn_data.storage.record import write_json
-from spn_model import checkpoint
 from spn_model.bundle_checks import ExportOptions
 from spn_model.export import Exported, export
 from spn_model.graphs import _CellMeans, deployment, reference, write_graph
+from spn_model.models import checkpoint
 from spn_model.models.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
 from spn_model.onboard.localizer import Localizer

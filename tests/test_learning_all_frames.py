@@ -9,9 +9,9 @@ import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
-from spn_model.checkpoint import load
 from spn_model.evaluate import EvaluateOptions, compare
 from spn_model.examples.training_set import TrainingSet
+from spn_model.models.checkpoint import load
 from spn_model.recipe import ALL, Recipe, Stage, read_recipe
 from spn_model.train import Data, Stopped, train
 from tests.training_world import ONE_THREAD, Follower, TinyMember, files, log

@@ -22,10 +22,10 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
 from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
-from spn_model.checkpoint import load
 from spn_model.covariance_scale import measured_scale
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
+from spn_model.models.checkpoint import load
 from spn_model.models.member import PoseEstimates
 from spn_model.onboard.view import View
 from spn_model.recipe import Recipe, Stage

@@ -18,9 +18,9 @@ from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_model.checkpoint import load
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import registry
+from spn_model.models.checkpoint import load
 from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.train import TrainOptions
 from spn_model.training_record import Files

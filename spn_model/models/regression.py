@@ -14,7 +14,7 @@ from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
-from spn_model.models.options import from_mapping
+from spn_model.models.option_parsing import from_mapping
 from spn_model.models.regression_examples import (
     FeatureCache,
     example,

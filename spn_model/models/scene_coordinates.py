@@ -17,7 +17,7 @@ from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
-from spn_model.models.options import from_mapping
+from spn_model.models.option_parsing import from_mapping
 from spn_model.models.scene_examples import Examples, StageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.scene_coordinates import (
