@@ -6,7 +6,7 @@
 Four loops take the same steps of a recipe's last stage in turns, so that what else the machine does meets all
 of them:
 
-loop      `spn_model.train.run_stage`, as `spn-model train` runs it: batches made ahead, log, state saved
+loop      `spn_model.training.train.run_stage`, as `spn-model train` runs it: batches made ahead, log, state saved
 bare      the same batches, made before and kept in memory: the limit that computing sets
 in turns  each batch is made, then used: what making ahead saves
 plain     as published PoseNet code feeds a network: each image of a batch is read from its JPEG in
@@ -41,18 +41,18 @@ from torch import nn
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_model.batches import rows_of_step
 from spn_model.examples.training_set import TrainingSet
-from spn_model.gradients import Gradients, gradients
-from spn_model.machine import PRECISIONS, Machine, Ranks, choose, prepared
 from spn_model.models.member import Batch, Member
 from spn_model.models.registry import make
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.onboard.view import View
-from spn_model.recipe import Stage, read_recipe
-from spn_model.train import made_part, optimizer_of, run_stage
-from spn_model.training_record import Files, Record
-from spn_model.training_state import Position
+from spn_model.training.batches import rows_of_step
+from spn_model.training.gradients import Gradients, gradients
+from spn_model.training.machine import PRECISIONS, Machine, Ranks, choose, prepared
+from spn_model.training.recipe import Stage, read_recipe
+from spn_model.training.train import made_part, optimizer_of, run_stage
+from spn_model.training.training_record import Files, Record
+from spn_model.training.training_state import Position
 
 
 @dataclass(frozen=True)

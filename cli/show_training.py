@@ -15,7 +15,7 @@ from rich.text import Text
 from cli import console
 
 if TYPE_CHECKING:
-    from spn_model.recipe import Recipe
+    from spn_model.training.recipe import Recipe
 
 _PLAIN_EVERY_S = 60.0
 _SHOWN = 12  # rows of the live table
@@ -72,7 +72,7 @@ class Following:
             console.out.print(Text(text), soft_wrap=True)
 
     def row(self, values: Mapping[str, Any]) -> None:
-        """See `spn_model.training_record.Watch`."""
+        """See `spn_model.training.training_record.Watch`."""
         if values["event"] == "steps":
             self._status = self._steps(values)
             now = time.monotonic()

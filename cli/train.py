@@ -102,10 +102,10 @@ def run(
     from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
     from spn_data.storage.record import StageRecord, content_fingerprint, versions
-    from spn_model.recipe import read_recipe
-    from spn_model.train import Data, Stopped, TrainOptions
-    from spn_model.train import train as train_network
-    from spn_model.training_record import Files
+    from spn_model.training.recipe import read_recipe
+    from spn_model.training.train import Data, Stopped, TrainOptions
+    from spn_model.training.train import train as train_network
+    from spn_model.training.training_record import Files
 
     area = options.open_area(area_folder)
     wanted = read_recipe(recipe).with_budget(images, minutes)

@@ -13,7 +13,7 @@ from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.scene_coordinates import SceneCoordinatesMember
 from spn_model.onboard.view import View
-from spn_model.precision import bfloat16_is_fast
+from spn_model.training.precision import bfloat16_is_fast
 
 STEPS = 100
 # A lens with distortion that sees a little more than the data set's camera.

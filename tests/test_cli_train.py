@@ -18,7 +18,7 @@ from click.testing import CliRunner, Result
 from cli.model import main
 from cli.train import train
 from spn_model.models.checkpoint import load
-from spn_model.training_state import COLUMNS
+from spn_model.training.training_state import COLUMNS
 from tests.training_world import write_field
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
@@ -165,7 +165,7 @@ def test_a_full_disk_is_one_line(place, monkeypatch):
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("spn_model.training_record.save_state", lambda *_: os.fsync(-1))
+    monkeypatch.setattr("spn_model.training.training_record.save_state", lambda *_: os.fsync(-1))
     monkeypatch.setattr("os.fsync", full)
     ran = trained(place)
     assert ran.exit_code == 1

@@ -25,8 +25,8 @@ from spn_model.comparison_files import drawn, of_network, write_comparison
 from spn_model.dropout import dropout_estimates, has_dropout
 from spn_model.evaluate import Comparison, EvaluateOptions, Judged, compare
 from spn_model.models.checkpoint import Checkpoint, load
-from spn_model.training_figure import read_log, training_figure
-from spn_model.training_state import COLUMNS
+from spn_model.training.training_figure import read_log, training_figure
+from spn_model.training.training_state import COLUMNS
 from tests.judged_world import write_judged, write_network
 from tests.training_world import INFO, TinyMember
 

@@ -11,11 +11,11 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_model.examples.training_set import TrainingSet
-from spn_model.gradients import gradients
-from spn_model.machine import choose
 from spn_model.models.scene_coordinates import SceneCoordinatesMember
-from spn_model.recipe import Recipe, Stage
-from spn_model.train import Data, Stopped, train
+from spn_model.training.gradients import gradients
+from spn_model.training.machine import choose
+from spn_model.training.recipe import Recipe, Stage
+from spn_model.training.train import Data, Stopped, train
 from tests.box_world import write_box
 from tests.training_world import ONE_THREAD, Follower, TinyMember, files, weights
 

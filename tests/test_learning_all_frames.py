@@ -12,8 +12,8 @@ from spn_data.errors import InputError
 from spn_model.evaluate import EvaluateOptions, compare
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import load
-from spn_model.recipe import ALL, Recipe, Stage, read_recipe
-from spn_model.train import Data, Stopped, train
+from spn_model.training.recipe import ALL, Recipe, Stage, read_recipe
+from spn_model.training.train import Data, Stopped, train
 from tests.training_world import ONE_THREAD, Follower, TinyMember, files, log
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")

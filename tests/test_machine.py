@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from spn_data.errors import InputError
-from spn_model.machine import choose, cores, prepared
+from spn_model.training.machine import choose, cores, prepared
 
 
 @pytest.mark.parametrize("device", ["tpu", "cuda:x", "mps", "meta", ""])

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from spn_model.muon import Muon, orthogonalized
-from spn_model.recipe import Recipe, Stage
-from spn_model.train import Data, Stopped, train
+from spn_model.training.muon import Muon, orthogonalized
+from spn_model.training.recipe import Recipe, Stage
+from spn_model.training.train import Data, Stopped, train
 from tests.training_world import ONE_THREAD, Follower, files, weights
 
 RECIPE = Recipe(

@@ -9,7 +9,7 @@ import pytest
 
 from spn_data.errors import InputError
 from spn_model.models.registry import make
-from spn_model.recipe import Recipe, Stage, names, read_recipe
+from spn_model.training.recipe import Recipe, Stage, names, read_recipe
 
 GOOD = """\
 kind = "regression"

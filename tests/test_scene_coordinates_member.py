@@ -14,14 +14,14 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
-from spn_model.covariance_scale import measured_scale
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.member import PoseEstimates
 from spn_model.models.scene_coordinates import SceneCoordinatesMember
 from spn_model.models.scene_examples import StageOptions
 from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX
 from spn_model.onboard.decoding import decode
-from spn_model.precision import bfloat16_is_fast
+from spn_model.training.covariance_scale import measured_scale
+from spn_model.training.precision import bfloat16_is_fast
 from tests.box_world import CAMERA, seen_by, write_box
 
 pytestmark = pytest.mark.usefixtures("one_thread")

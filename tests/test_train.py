@@ -21,18 +21,18 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
-from spn_model.batches import generator_of_step, rows_of_step, torch_seed_of_step
-from spn_model.covariance_scale import measured_scale
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.checkpoint import load
 from spn_model.models.member import PoseEstimates
 from spn_model.onboard.view import View
-from spn_model.recipe import Recipe, Stage
-from spn_model.train import Data, Stopped, train
-from spn_model.training_loss import Diverged, Losses
-from spn_model.training_record import Record, judged_frames
-from spn_model.training_state import COLUMNS, Log, Position, read_state
+from spn_model.training.batches import generator_of_step, rows_of_step, torch_seed_of_step
+from spn_model.training.covariance_scale import measured_scale
+from spn_model.training.recipe import Recipe, Stage
+from spn_model.training.train import Data, Stopped, train
+from spn_model.training.training_loss import Diverged, Losses
+from spn_model.training.training_record import Record, judged_frames
+from spn_model.training.training_state import COLUMNS, Log, Position, read_state
 from spn_model.validation import judge, spread_rows
 from tests.training_world import (
     INFO,
@@ -120,7 +120,7 @@ import sys, time
 from pathlib import Path
 from tests.test_train import *
 from tests.training_world import register_tiny
-from spn_model import train as module
+from spn_model.training import train as module
 register_tiny()
 module._SAVE_EVERY_S = 0.0
 

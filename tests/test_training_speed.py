@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from spn_model.machine import choose, prepared
+from spn_model.training.machine import choose, prepared
 from tests.training_world import write_field
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"

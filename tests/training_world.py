@@ -22,8 +22,8 @@ from spn_model.examples.training_set import TrainingSet
 from spn_model.models import registry
 from spn_model.models.checkpoint import load
 from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
-from spn_model.train import TrainOptions
-from spn_model.training_record import Files
+from spn_model.training.train import TrainOptions
+from spn_model.training.training_record import Files
 
 CAMERA = Camera("SIMPLE_PINHOLE", 64, 48, np.array([40.0, 32.0, 24.0]))
 INFO = DatasetInfo(

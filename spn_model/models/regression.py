@@ -208,7 +208,7 @@ class RegressionMember(Member):
 
     @property
     def covariance_scale(self) -> float:
-        """Factor of all covariances; see `spn_model.covariance_scale`."""
+        """Factor of all covariances; see `spn_model.training.covariance_scale`."""
         return float(self.network.covariance_scale)
 
     def set_covariance_scale(self, factor: float) -> None:

@@ -20,18 +20,23 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, StageError
-from spn_model.batches import batches_ahead, generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.examples.training_set import TrainingSet
-from spn_model.gradients import gradients
-from spn_model.machine import Machine, Ranks, choose, joined, prepared
 from spn_model.models.member import Batch, Member
 from spn_model.models.registry import make
-from spn_model.muon import Muon
 from spn_model.onboard.view import View
-from spn_model.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
-from spn_model.training_loss import Diverged, Losses
-from spn_model.training_record import Clock, Files, Record, Watch, judged_frames
-from spn_model.training_state import Position, read_state
+from spn_model.training.batches import (
+    batches_ahead,
+    generator_of_step,
+    rows_of_step,
+    torch_seed_of_step,
+)
+from spn_model.training.gradients import gradients
+from spn_model.training.machine import Machine, Ranks, choose, joined, prepared
+from spn_model.training.muon import Muon
+from spn_model.training.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
+from spn_model.training.training_loss import Diverged, Losses
+from spn_model.training.training_record import Clock, Files, Record, Watch, judged_frames
+from spn_model.training.training_state import Position, read_state
 
 _LOG_EVERY_S = 10.0
 _SAVE_EVERY_S = 30.0

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor, distributed
 
 from spn_data.errors import InputError
-from spn_model.precision import bfloat16_is_fast
+from spn_model.training.precision import bfloat16_is_fast
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 _MAX_WORKERS = 8

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from spn_model.machine import Machine
 from spn_model.models.member import Batch, Member
+from spn_model.training.machine import Machine
 
 
 class Gradients:
