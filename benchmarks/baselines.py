@@ -20,11 +20,11 @@ from rich.table import Table
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_model import figures
-from spn_model.baselines import GEM, VLAD, Describe, Images, baselines, better, gem, vlad
-from spn_model.feature_maps import squeezenet_maps
-from spn_model.metrics import Evaluation, axes_of, evaluate, evaluation_frames
-from spn_model.tables import header, paper_rows, rows, write_errors, write_metrics
+from spn_model.evaluation import figures
+from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, baselines, better, gem, vlad
+from spn_model.evaluation.feature_maps import squeezenet_maps
+from spn_model.evaluation.metrics import Evaluation, axes_of, evaluate, evaluation_frames
+from spn_model.evaluation.tables import header, paper_rows, rows, write_errors, write_metrics
 
 
 class Timed:

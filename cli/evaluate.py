@@ -78,8 +78,8 @@ def run(
     from spn_data.area.area import area as names_of
     from spn_data.errors import InputError, StageError
     from spn_data.storage.record import content_fingerprint
-    from spn_model.comparison_files import network_facts, of_network, write_comparison
-    from spn_model.evaluate import EvaluateOptions, compare
+    from spn_model.evaluation.comparison_files import network_facts, of_network, write_comparison
+    from spn_model.evaluation.evaluate import EvaluateOptions, compare
     from spn_model.models.checkpoint import load
     from spn_model.training import machine
     from spn_model.training.training_figure import read_log, training_figure

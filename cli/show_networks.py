@@ -6,9 +6,9 @@ import math
 
 from cli import console
 from spn_data.dataset.hdf5_schema import Role
-from spn_model.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
-from spn_model.evaluate import Comparison, Judged
-from spn_model.metrics import Evaluation, Summary
+from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
+from spn_model.evaluation.evaluate import Comparison, Judged
+from spn_model.evaluation.metrics import Evaluation, Summary
 
 # Where many columns leave little room for names; the table of errors has them in full.
 _SHORT = {MEAN: "mean pose", VLAD: "VLAD", GEM: "GeM", ORACLE: "oracle"}

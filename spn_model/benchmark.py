@@ -20,8 +20,8 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.record import write_json
 from spn_model.bundle_checks import judged_groups
+from spn_model.evaluation.validation import spread_rows
 from spn_model.onboard.bundle import GRAPHS, read_bundle
-from spn_model.validation import spread_rows
 
 _SIZE = (1280, 720)
 _DISTORTION = (-0.05, 0.01)  # a mild barrel, as of small drones

@@ -26,7 +26,8 @@ from spn_model.bundle_checks import (
     compare_with_pytorch,
     measure_errors,
 )
-from spn_model.evaluate import check_world
+from spn_model.evaluation.evaluate import check_world
+from spn_model.evaluation.validation import spread_rows
 from spn_model.graphs import Deployment, deployment, write_graph
 from spn_model.model_card import model_card
 from spn_model.models.checkpoint import Checkpoint
@@ -44,7 +45,6 @@ from spn_model.onboard.bundle import (
     verified,
 )
 from spn_model.quantization import quantize
-from spn_model.validation import spread_rows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,7 +11,7 @@ import pytest
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors, quats_from_rotations, rotations_from_vectors
-from spn_model.baselines import (
+from spn_model.evaluation.baselines import (
     PAPER_TABLE_1,
     GemOptions,
     VladOptions,
@@ -25,7 +25,7 @@ from spn_model.baselines import (
     pool,
     vlad,
 )
-from spn_model.metrics import Estimates, evaluate, evaluation_frames
+from spn_model.evaluation.metrics import Estimates, evaluate, evaluation_frames
 
 
 @dataclass
@@ -230,7 +230,7 @@ def test_all_baselines_of_several_groups():
 def test_feature_maps_are_those_of_squeezenet():
     """fire9 of the shipped weights, against the layers written out as plain convolutions with ReLUs."""
     torch = pytest.importorskip("torch")
-    from spn_model.feature_maps import squeezenet_maps
+    from spn_model.evaluation.feature_maps import squeezenet_maps
     from spn_model.pretrained.tensors import read_tensors
     from spn_model.pretrained.weights import find
 

@@ -19,11 +19,11 @@ from spn_data.errors import FormatError, InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.storage.files import read_csv
-from spn_model import retrieval
-from spn_model.baselines import GEM, MEAN, ORACLE, VLAD
-from spn_model.comparison_files import drawn, of_network, write_comparison
-from spn_model.dropout import dropout_estimates, has_dropout
-from spn_model.evaluate import Comparison, EvaluateOptions, Judged, compare
+from spn_model.evaluation import retrieval
+from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, VLAD
+from spn_model.evaluation.comparison_files import drawn, of_network, write_comparison
+from spn_model.evaluation.dropout import dropout_estimates, has_dropout
+from spn_model.evaluation.evaluate import Comparison, EvaluateOptions, Judged, compare
 from spn_model.models.checkpoint import Checkpoint, load
 from spn_model.training.training_figure import read_log, training_figure
 from spn_model.training.training_state import COLUMNS

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model import figures, svg
-from spn_model.metrics import Estimates, evaluate, evaluation_frames
-from spn_model.trajectory_view import view_matrix
+from spn_model.evaluation import figures, svg
+from spn_model.evaluation.metrics import Estimates, evaluate, evaluation_frames
+from spn_model.evaluation.trajectory_view import view_matrix
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -9,7 +9,7 @@ import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
-from spn_model.evaluate import EvaluateOptions, compare
+from spn_model.evaluation.evaluate import EvaluateOptions, compare
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import load
 from spn_model.training.recipe import ALL, Recipe, Stage, read_recipe

@@ -16,8 +16,8 @@ from scipy.special import chdtri
 from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model.calibration import calibrate, is_covariance, sigmas, squared_distances
-from spn_model.metrics import (
+from spn_model.evaluation.calibration import calibrate, is_covariance, sigmas, squared_distances
+from spn_model.evaluation.metrics import (
     ENU,
     Estimates,
     EvaluationFrames,
@@ -28,7 +28,7 @@ from spn_model.metrics import (
     frame_errors,
     quantile,
 )
-from spn_model.tables import header, paper_rows, rows, write_errors, write_metrics
+from spn_model.evaluation.tables import header, paper_rows, rows, write_errors, write_metrics
 
 
 def poses(centers, vectors=None):

@@ -13,8 +13,8 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_model.calibration import calibrate
-from spn_model.dropout import dropout_estimates
+from spn_model.evaluation.calibration import calibrate
+from spn_model.evaluation.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.registry import make
 from spn_model.models.regression import RegressionMember

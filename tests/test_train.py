@@ -21,6 +21,7 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
+from spn_model.evaluation.validation import judge, spread_rows
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.checkpoint import load
@@ -33,7 +34,6 @@ from spn_model.training.train import Data, Stopped, train
 from spn_model.training.training_loss import Diverged, Losses
 from spn_model.training.training_record import Record, judged_frames
 from spn_model.training.training_state import COLUMNS, Log, Position, read_state
-from spn_model.validation import judge, spread_rows
 from tests.training_world import (
     INFO,
     ONE_THREAD,

@@ -15,13 +15,13 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
+from spn_model.evaluation.validation import Errors, Frames, judge, spread_rows
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import checkpoint
 from spn_model.models.member import Member
 from spn_model.onboard.view import View
 from spn_model.training.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.training.training_state import Log, Position, save_state
-from spn_model.validation import Errors, Frames, judge, spread_rows
 
 # A later network is kept where its score is at most this times the best one: rates fall towards the end, and
 # validation frames are few and of one or two places.

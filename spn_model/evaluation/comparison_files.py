@@ -11,11 +11,11 @@ from typing import Any
 from spn_data.capture.sources import safe_name
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_whole
-from spn_model import figures
-from spn_model.baselines import MEAN
-from spn_model.evaluate import Comparison, Cost, Judged
+from spn_model.evaluation import figures
+from spn_model.evaluation.baselines import MEAN
+from spn_model.evaluation.evaluate import Comparison, Cost, Judged
+from spn_model.evaluation.tables import write_errors, write_metrics
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.tables import write_errors, write_metrics
 
 
 def of_network(comparison: Comparison, name: str) -> Comparison:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model import svg
-from spn_model.metrics import Estimates, EvaluationFrames
-from spn_model.svg import COLOURS, GRID, INK, SOFT
+from spn_model.evaluation import svg
+from spn_model.evaluation.metrics import Estimates, EvaluationFrames
+from spn_model.evaluation.svg import COLOURS, GRID, INK, SOFT
 
 _AROUND = 0.25  # of the place's extent: estimates farther outside it are not drawn
 MOST_DRAWN = 1500  # cameras, and estimates of one method: more are thinned evenly

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from spn_model.baselines import FeatureMaps
+from spn_model.evaluation.baselines import FeatureMaps
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.squeezeposenet import SqueezePoseNet, SqueezePoseNetOptions
 from spn_model.pretrained.tensors import load_pretrained, read_tensors

@@ -16,9 +16,9 @@ from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
-from spn_model.baselines import GEM, VLAD, better, guess_mean, oracle, posed
-from spn_model.dropout import dropout_estimates, has_dropout
-from spn_model.metrics import (
+from spn_model.evaluation.baselines import GEM, VLAD, better, guess_mean, oracle, posed
+from spn_model.evaluation.dropout import dropout_estimates, has_dropout
+from spn_model.evaluation.metrics import (
     Estimates,
     Evaluation,
     EvaluationFrames,
@@ -26,11 +26,11 @@ from spn_model.metrics import (
     evaluate,
     evaluation_frames,
 )
+from spn_model.evaluation.retrieval import most_alike
+from spn_model.evaluation.validation import spread_rows
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.member import Member, PoseEstimates
 from spn_model.onboard.view import View
-from spn_model.retrieval import most_alike
-from spn_model.validation import spread_rows
 
 _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model import svg
-from spn_model.metrics import ENU, CurveBin, Estimates, Evaluation, EvaluationFrames
-from spn_model.svg import COLOURS, INK, SOFT, Panel
-from spn_model.trajectory_view import thinned, trajectory_panel
+from spn_model.evaluation import svg
+from spn_model.evaluation.metrics import ENU, CurveBin, Estimates, Evaluation, EvaluationFrames
+from spn_model.evaluation.svg import COLOURS, INK, SOFT, Panel
+from spn_model.evaluation.trajectory_view import thinned, trajectory_panel
 
 _MOST_BARS = 25
 _FAR = 1.5  # times the p95: errors that are larger stretch no scale

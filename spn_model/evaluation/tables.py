@@ -12,8 +12,8 @@ import numpy as np
 
 from spn_data.storage.files import write_csv
 from spn_data.storage.record import write_json
-from spn_model.baselines import PAPER_SOURCE, PAPER_TABLE_1
-from spn_model.metrics import Evaluation, Summary
+from spn_model.evaluation.baselines import PAPER_SOURCE, PAPER_TABLE_1
+from spn_model.evaluation.metrics import Evaluation, Summary
 
 VERSION = 1
 HEADER = (

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model.metrics import Estimates, frame_errors, quantile
+from spn_model.evaluation.metrics import Estimates, frame_errors, quantile
 from spn_model.models.member import Member, PoseEstimates
 
 _AT_ONCE = 8  # images given to `estimate`

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from spn_data.geometry.pose import Poses, rotation_vectors
-from spn_model.baselines import mean_pose
+from spn_model.evaluation.baselines import mean_pose
 from spn_model.models.member import Member, PoseEstimates
 
 _DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout)

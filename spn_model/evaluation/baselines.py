@@ -12,7 +12,7 @@ import numpy as np
 from spn_data.geometry.pose import Poses, canonical_quats
 from spn_data.matching.features import FeatureOptions, extract
 from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
-from spn_model.metrics import DEG_PER_M, Estimates, Evaluation, nearest_rows
+from spn_model.evaluation.metrics import DEG_PER_M, Estimates, Evaluation, nearest_rows
 
 MEAN, ORACLE = "mean training pose", "nearest training pose (oracle)"
 VLAD, GEM = "retrieval, VLAD of SIFT", "retrieval, GeM of SqueezeNet"

@@ -11,7 +11,7 @@ import numpy as np
 from spn_data.coverage.nearest_frame import CoverageOptions, nearest_frames
 from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors
-from spn_model.calibration import Calibration, calibrate, sigmas, squared_distances
+from spn_model.evaluation.calibration import Calibration, calibrate, sigmas, squared_distances
 
 ENU = ("east", "north", "up")
 _NO_PLACE = ("x", "y", "z")

@@ -12,8 +12,8 @@ import numpy as np
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.storage.record import content_fingerprint, versions, write_json
 from spn_data.work.timing import Progress
-from spn_model.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
-from spn_model.feature_maps import squeezenet_maps
+from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
+from spn_model.evaluation.feature_maps import squeezenet_maps
 
 VERSION = 1  # of what is kept; another one whenever a way of describing images changes
 _METHODS = (VLAD, GEM)
