@@ -76,7 +76,7 @@ def predict(
     Example:
         spn-model predict flight.mp4 --run first --camera cam.json --to poses/
     """
-    from spn_model.predict import Stopped
+    from spn_model.prediction.predict import Stopped
 
     try:
         run(inputs, area_folder, **chosen)
@@ -107,10 +107,10 @@ def run(
     from spn_data.errors import StageError
     from spn_data.geometry.camera_file import camera_to_json, read_camera
     from spn_data.storage.record import content_fingerprint
-    from spn_model.flown import Choice, find_flights
     from spn_model.models.checkpoint import load
-    from spn_model.predict import PredictOptions, check_target
-    from spn_model.predict import predict as work
+    from spn_model.prediction.flown import Choice, find_flights
+    from spn_model.prediction.predict import PredictOptions, check_target
+    from spn_model.prediction.predict import predict as work
     from spn_model.training import machine
 
     file = options.open_area(area_folder).run(name) / CHECKPOINT

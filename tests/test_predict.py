@@ -26,10 +26,10 @@ from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.record import write_json
-from spn_model.flown import Choice, Views, find_flights, frames
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.predict import Predicted, PredictOptions, Stopped, predict
-from spn_model.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
+from spn_model.prediction.flown import Choice, Views, find_flights, frames
+from spn_model.prediction.predict import Predicted, PredictOptions, Stopped, predict
+from spn_model.prediction.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
 from tests.judged_world import write_judged, write_network
 from tests.training_world import CAMERA, frame
 

@@ -16,9 +16,9 @@ from spn_data.errors import StageError
 from spn_data.storage.files import exchange, write_whole
 from spn_data.storage.record import write_json
 from spn_data.work.timing import Progress
-from spn_model.flown import Choice, Flight, FlownFrame, Views, frames
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.predicted_files import PoseTable, Rows, write_tum, write_wgs84
+from spn_model.prediction.flown import Choice, Flight, FlownFrame, Views, frames
+from spn_model.prediction.predicted_files import PoseTable, Rows, write_tum, write_wgs84
 
 VERSION = 1
 RECORD, POSES, WGS84, TUM = "predict.json", "poses.csv", "wgs84.csv", "tum"
