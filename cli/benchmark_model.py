@@ -12,7 +12,7 @@ import click
 from cli import console, options
 
 if TYPE_CHECKING:
-    from spn_model.benchmark import Cost
+    from spn_model.export.bundle_benchmark import Cost
 
 _STEPS = ("preprocessing", "graph", "decoding", "total")
 
@@ -68,8 +68,8 @@ def run(
     as_json: bool,
 ) -> None:
     from spn_data.area.area import area as names_of
-    from spn_model.benchmark import BenchmarkOptions, flown_frames
-    from spn_model.benchmark import benchmark as work
+    from spn_model.export.bundle_benchmark import BenchmarkOptions, flown_frames
+    from spn_model.export.bundle_benchmark import benchmark as work
 
     if (bundle is None) == (name is None):
         raise click.UsageError("give BUNDLE or --run")

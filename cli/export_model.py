@@ -12,7 +12,7 @@ import click
 from cli import console, options
 
 if TYPE_CHECKING:
-    from spn_model.export import Exported
+    from spn_model.export.bundle_export import Exported
 
 
 @click.command("export")
@@ -60,9 +60,9 @@ def run(
     from spn_data.area.area import area as names_of
     from spn_data.errors import StageError
     from spn_data.storage.record import content_fingerprint
-    from spn_model.bundle_checks import ExportOptions
-    from spn_model.export import export as work
-    from spn_model.export import is_made_of
+    from spn_model.export.bundle_checks import ExportOptions
+    from spn_model.export.bundle_export import export as work
+    from spn_model.export.bundle_export import is_made_of
     from spn_model.models.checkpoint import load
 
     area = options.open_area(area_folder)
@@ -116,7 +116,7 @@ def _evaluation(path: Path, name: str, fingerprint: str) -> dict[str, Any] | Non
 
 
 def _show(made: Exported) -> None:
-    from spn_model.model_card import loss_percent
+    from spn_model.export.model_card import loss_percent
 
     unit = "m" if made.units == "m" else "units"
     rows = []

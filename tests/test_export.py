@@ -20,9 +20,9 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
 from spn_data.storage.record import write_json
-from spn_model.bundle_checks import ExportOptions
-from spn_model.export import Exported, export
-from spn_model.graphs import _CellMeans, deployment, reference, write_graph
+from spn_model.export.bundle_checks import ExportOptions
+from spn_model.export.bundle_export import Exported, export
+from spn_model.export.graphs import _CellMeans, deployment, reference, write_graph
 from spn_model.models import checkpoint
 from spn_model.models.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
@@ -185,12 +185,13 @@ def test_what_stands_is_not_replaced(made, hall, network, tmp_path):
 
 def test_a_graph_that_computes_something_else_is_not_written(hall, network, tmp_path, monkeypatch):
     """Where parity fails there is no bundle, and nothing half-made."""
-    monkeypatch.setattr("spn_model.graphs.MEAN", (0.48, 0.45, 0.41))
+    monkeypatch.setattr("spn_model.export.graphs.MEAN", (0.48, 0.45, 0.41))
     broken = tmp_path / "graph.onnx"
     write_graph(broken, deployment(network.member, (320, 180)))
     monkeypatch.undo()
     monkeypatch.setattr(
-        "spn_model.export.write_graph", lambda path, deployed: path.write_bytes(broken.read_bytes())
+        "spn_model.export.bundle_export.write_graph",
+        lambda path, deployed: path.write_bytes(broken.read_bytes()),
     )
     options = replace(OPTIONS, int8=False)
     with pytest.raises(GeometryError, match="computes something else"):

@@ -30,8 +30,8 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
 from spn_data.storage.record import write_json
-from spn_model.bundle_checks import ExportOptions
-from spn_model.export import export
+from spn_model.export.bundle_checks import ExportOptions
+from spn_model.export.bundle_export import export
 from spn_model.onboard import lines
 from spn_model.onboard.bundle import read_bundle, sha256_of
 from spn_model.onboard.localizer import SAMPLE_STEP_PX, Localizer, Located

@@ -12,8 +12,8 @@ from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
 from spn_model.pretrained.weights import of_name
 
 if TYPE_CHECKING:
-    from spn_model.bundle_checks import GroupErrors
-    from spn_model.export import Exported
+    from spn_model.export.bundle_checks import GroupErrors
+    from spn_model.export.bundle_export import Exported
 
 
 def model_card(

@@ -19,8 +19,8 @@ from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.record import write_json
-from spn_model.bundle_checks import judged_groups
 from spn_model.evaluation.validation import spread_rows
+from spn_model.export.bundle_checks import judged_groups
 from spn_model.onboard.bundle import GRAPHS, read_bundle
 
 _SIZE = (1280, 720)

@@ -14,7 +14,7 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.work.timing import Progress
 from spn_model.evaluation.validation import spread_rows
-from spn_model.graphs import Deployment, reference
+from spn_model.export.graphs import Deployment, reference
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, INT8
 from spn_model.onboard.localizer import Localizer

@@ -19,17 +19,18 @@ from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.files import exchange, write_whole
 from spn_data.storage.record import content_fingerprint, write_json
 from spn_data.work.timing import Progress
-from spn_model.bundle_checks import (
+from spn_model.evaluation.evaluate import check_world
+from spn_model.evaluation.validation import spread_rows
+from spn_model.export.bundle_checks import (
     ExportOptions,
     GroupErrors,
     Parity,
     compare_with_pytorch,
     measure_errors,
 )
-from spn_model.evaluation.evaluate import check_world
-from spn_model.evaluation.validation import spread_rows
-from spn_model.graphs import Deployment, deployment, write_graph
-from spn_model.model_card import model_card
+from spn_model.export.graphs import Deployment, deployment, write_graph
+from spn_model.export.model_card import model_card
+from spn_model.export.quantization import quantize
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import (
     CARD,
@@ -44,7 +45,6 @@ from spn_model.onboard.bundle import (
     sha256_of,
     verified,
 )
-from spn_model.quantization import quantize
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
