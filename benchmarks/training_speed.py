@@ -6,7 +6,8 @@
 Four loops take the same steps of a recipe's last stage in turns, so that what else the machine does meets all
 of them:
 
-loop      `spn_model.training.train.run_stage`, as `spn-model train` runs it: batches made ahead, log, state saved
+loop      `spn_model.training.train.run_stage`, as `spn-model train` runs it: batches made ahead, log,
+          state saved
 bare      the same batches, made before and kept in memory: the limit that computing sets
 in turns  each batch is made, then used: what making ahead saves
 plain     as published PoseNet code feeds a network: each image of a batch is read from its JPEG in

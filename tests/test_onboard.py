@@ -116,7 +116,7 @@ def test_an_image_without_a_pose_has_a_reason(bundle, flown, tmp_path):
 
 
 def test_the_view_on_board_is_that_of_the_data_set(flown):
-    """From 1280 x 720 to 480 x 270, images equal those of spn_data.geometry.rendering to a grey level in the mean."""
+    """From 1280 x 720 to 480 x 270, images equal those of spn_data.geometry.rendering to a grey level."""
     lens = Camera("OPENCV", 1280, 720, np.array([820, 822, 645, 355, -0.11, 0.06, 1e-3, -5e-4]))
     view = canonical_camera([lens], RenderingOptions())
     assert (view.width, view.height) == (480, 270)

@@ -36,8 +36,8 @@ class Frames:
     video_frame : (N,) int, index among that file's decoded frames; -1 for a photo.
     time_s : (N,) seconds since the sequence's first frame.
     status : (N,) str, a FrameStatus; reason : (N,) str.
-    sharpness : (N,) grey levels (`spn_data.capture.selection`); motion_px : (N,) motion of the image since the frame
-    chosen before, full-size pixels; width, height : (N,) int, upright image, 0 where unreadable.
+    sharpness : (N,) grey levels (`spn_data.capture.selection`); motion_px : (N,) motion of the image since
+    the frame chosen before, full-size pixels; width, height : (N,) int, upright image, 0 where unreadable.
     lat_lon_deg (N, 2) WGS84, rel_alt_m (N,), abs_alt_m (N,), sigma_m (N, 3) east, north, up,
     gimbal_deg (N, 3) heading, pitch, roll : telemetry at the frame's time, as in `Telemetry`.
     """

@@ -15,7 +15,8 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
-from spn_data.split.groups import Split, audit
+from spn_data.split import audit
+from spn_data.split.groups import Split
 from spn_data.storage.record import StageRecord
 
 REGISTERED, FAILED = LabelStatus.REGISTERED.value, LabelStatus.FAILED.value

@@ -13,7 +13,8 @@ from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportD
 from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import Finding, Level, Verdict
-from spn_data.split.groups import LEFT_OUT, audit
+from spn_data.split import audit
+from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import statements
 from spn_data.storage.record import StageRecord
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from spn_data.report.data import STRATA, CoverageFacts, ReportData
-from spn_data.split.groups import OPTIMISTIC, TRAIN, VALIDATION, audit
+from spn_data.split import audit
+from spn_data.split.groups import OPTIMISTIC, TRAIN, VALIDATION
 
 
 class Level(StrEnum):

@@ -87,8 +87,9 @@ def call(expected: dict[str, str], function: Callable[..., Any], arguments: tupl
 def fingerprint() -> dict[str, str]:
     """Of all that decides what a pure call gives: this package's code, libraries, Python."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.relative_to(Path(__file__).parent).as_posix().encode())
+    package = Path(__file__).resolve().parents[1]
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     python = ".".join(platform.python_version_tuple()[:2])
     libraries = {name: version(name) for name in _LIBRARIES}

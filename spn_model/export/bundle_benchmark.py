@@ -106,7 +106,7 @@ def flown_frames(folder: Path, dataset: Path, scratch: Path, count: int) -> tupl
 def _timed(
     folder: Path, precision: str, frames: Sequence[Path], camera: Path, options: BenchmarkOptions
 ) -> dict[str, Any]:
-    root = str(Path(__file__).resolve().parents[1])
+    root = str(Path(__file__).resolve().parents[2])
     threads = str(options.threads)
     environment = {
         **os.environ,

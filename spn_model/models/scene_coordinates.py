@@ -178,7 +178,7 @@ class SceneCoordinatesMember(Member):
 
     @property
     def decoding_options(self) -> DecodingOptions:
-        """What `spn_model.onboard.decoding.decode` needs, with what was measured: all that differs on board."""
+        """What `spn_model.onboard.decoding.decode` needs, with what was measured."""
         return replace(
             self.decoding,
             cells_per_observation=self.decoding.cells_per_observation * self.covariance_scale,

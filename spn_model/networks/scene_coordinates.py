@@ -1,7 +1,8 @@
 """Scene coordinates: for each cell of 8 x 8 pixels, the point of the scene that it shows, and how surely.
 
 Shotton et al. 2013, "Scene coordinate regression forests"; Brachmann et al. 2017, "DSAC", as one small
-convolutional network on SqueezeNet 1.1 (Iandola et al. 2016). The pose follows by `spn_model.onboard.decoding`.
+convolutional network on SqueezeNet 1.1 (Iandola et al. 2016). The pose follows by
+`spn_model.onboard.decoding`.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from spn_data.errors import InputError
 from spn_data.work.timing import Progress
 
-SHIPPED = Path(__file__).parent / "pretrained"
+SHIPPED = Path(__file__).parent
 _TIMEOUT_S = 30.0
 _CHUNK_BYTES = 2**20
 

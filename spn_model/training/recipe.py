@@ -75,8 +75,8 @@ class Stage:
 class Recipe:
     """A kind of network with its options, the weights it starts from, and its stages.
 
-    weights : "published" for those that the kind is known with, "none", a name of `spn_model.pretrained.weights` or a
-    file.
+    weights : "published" for those that the kind is known with, "none", a name of
+    `spn_model.pretrained.weights` or a file.
     """
 
     kind: str
