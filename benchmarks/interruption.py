@@ -61,7 +61,7 @@ class Run:
     def __init__(self, sources: list[Path], area: Path, options: list[str]):
         self.log = area.with_suffix(".log")
         self._from = self.log.stat().st_size if self.log.exists() else 0
-        command = [sys.executable, "-c", "from cli.data import main; main()", "reconstruct"]
+        command = [sys.executable, "-c", "from spn_cli.data import main; main()", "reconstruct"]
         with self.log.open("a") as out:
             self.process = subprocess.Popen(
                 [*command, *map(str, sources), "--area", str(area), "--threads", "1", *options],

@@ -97,8 +97,7 @@ def flight2(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished_area(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole area of the first short flight; no test may change it."""
     from click.testing import CliRunner
-
-    from cli.data import main
+    from spn_cli.data import main
 
     area = tmp_path_factory.mktemp("finished") / "area"
     options = ["--max-features", "800", "--threads", "1", "--fov", "72"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("spn_data", "spn_model", "cli")
+PACKAGES = ("spn_data", "spn_model", "cli/spn_cli")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAMES = [path.relative_to(ROOT).as_posix() for path in MODULES]
 
@@ -82,15 +82,15 @@ def test_the_terminal_belongs_to_cli(library):
     assert _outside(found, "cli/") == set()
 
 
-@pytest.mark.parametrize("library", ["torch", "spn_model", "cli"])
+@pytest.mark.parametrize("library", ["torch", "spn_model", "spn_cli"])
 def test_spn_data_stands_alone(library):
     """spn_data imports no torch, no network and no command line."""
     assert {n for n in _importers(library) if n.startswith("spn_data/")} == set()
 
 
 def test_spn_model_knows_no_command_line():
-    """spn_model does not import cli, nor pycolmap by any way."""
-    found = _importers("cli") | _importers("pycolmap") | _importers("spn_data.colmap")
+    """spn_model does not import spn_cli, nor pycolmap by any way."""
+    found = _importers("spn_cli") | _importers("pycolmap") | _importers("spn_data.colmap")
     assert {n for n in found if n.startswith("spn_model/")} == set()
 
 
@@ -184,7 +184,7 @@ def test_help_is_quick(command):
     heavy = ("torch", "pycolmap", "cv2", "av", "scipy")
     loaded = _run(
         "import sys\n"
-        f"from cli.{command} import main\n"
+        f"from spn_cli.{command} import main\n"
         "try:\n"
         "    main(['--help'])\n"
         "except SystemExit as end:\n"
@@ -199,7 +199,7 @@ def test_help_of_every_command_is_quick():
     """--help of a subcommand loads neither torch nor pycolmap."""
     loaded = _run(
         "import sys\n"
-        "from cli.data import main\n"
+        "from spn_cli.data import main\n"
         "for name in main.commands:\n"
         "    try:\n"
         "        main([name, '--help'])\n"

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.console import Group
+from spn_cli.data import main
 
-from cli.console import Group
-from cli.data import main
 from spn_data.area.area import FRAMES, MODEL, Area
 from spn_data.errors import StageError
 from spn_data.storage.record import VERSION
@@ -249,7 +249,7 @@ def limited(bytes_a_file: int) -> Callable[[], None]:
 
 def test_frames_that_cannot_be_written_are_one_line(flight1: Path, tmp_path: Path) -> None:
     """A limit on the size of files stands for a disk that refuses; then it goes on."""
-    command = [sys.executable, "-c", "from cli.data import main; main()", "reconstruct"]
+    command = [sys.executable, "-c", "from spn_cli.data import main; main()", "reconstruct"]
     arguments = [str(flight1), "--area", str(tmp_path / "area"), *FAST]
     result = subprocess.run(
         [*command, *arguments],

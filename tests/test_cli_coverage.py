@@ -12,8 +12,8 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.area.area import EVALUATION, FRAMES, GEO, Area
 from spn_data.coverage.nearest_frame import CoverageOptions, strata_of
 from spn_data.coverage.sequence_table import COLUMNS

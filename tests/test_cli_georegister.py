@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.area.area import GEO, MODEL, Area
 from spn_data.colmap.model import read_scene
 from spn_data.errors import FormatError, InputError

@@ -11,10 +11,9 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-
-from cli import options
-from cli.data import main
-from cli.model import main as model_main
+from spn_cli import options
+from spn_cli.data import main
+from spn_cli.model import main as model_main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

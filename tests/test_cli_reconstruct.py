@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main
 
 import spn_data.reconstruction.reconstruct
-from cli.data import main
 from spn_data.area.area import FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native

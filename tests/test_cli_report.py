@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.colmap.model import read_scene
 from tests.report_data import unpack
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.area.area import MODEL, Area
 from spn_data.simulate import preset, simulate
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.area.area import EVALUATION, FRAMES, MODEL, SPLIT, Area
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset

@@ -14,9 +14,9 @@ import click
 import pytest
 import torch
 from click.testing import CliRunner, Result
+from spn_cli.model import main
+from spn_cli.train import train
 
-from cli.model import main
-from cli.train import train
 from spn_model.models.checkpoint import load
 from spn_model.training.training_state import COLUMNS
 from tests.training_world import write_field

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from spn_cli.data import main
 
 import spn_data
-from cli.data import main
 from spn_data.area.area import EVALUATION, MODEL, Area
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main as data_main
+from spn_cli.model import main
 
-from cli.data import main as data_main
-from cli.model import main
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference

@@ -13,9 +13,9 @@ import onnxruntime
 import pytest
 import torch
 from click.testing import CliRunner
+from spn_cli.model import main
 from torch import nn
 
-from cli.model import main
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
+from spn_cli.data import main
+from spn_cli.export import FORMATS
 
-from cli.data import main
-from cli.export import FORMATS
 from spn_data.area.area import EVALUATION, Area, StageWork
 from spn_data.colmap import pycolmap
 from spn_data.dataset.nvm import read_nvm

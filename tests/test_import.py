@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from spn_cli.data import main
+from spn_cli.import_ import import_
 
-from cli.data import main
-from cli.import_ import import_
 from spn_data.dataset.cambridge import read_cambridge, write_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role

@@ -20,8 +20,8 @@ import pytest
 import torch
 from click.testing import CliRunner
 from onnx import TensorProto, helper
+from spn_cli.model import main
 
-from cli.model import main
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera

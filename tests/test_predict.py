@@ -16,8 +16,8 @@ import piexif
 import pytest
 from click.testing import CliRunner, Result
 from PIL import Image
+from spn_cli.model import main
 
-from cli.model import main
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from spn_cli.data import main
 
-from cli.data import main
 from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
@@ -488,7 +488,7 @@ def test_a_killed_run_goes_on_to_the_same_labels(
     bare: Path, flight2: Path, registered: Path, step: str
 ) -> None:
     """SIGKILL while features are found, or matched with the map: the next run starts from what is there."""
-    command = [sys.executable, "-c", "from cli.data import main; main()", "register"]
+    command = [sys.executable, "-c", "from spn_cli.data import main; main()", "register"]
     command += [str(flight2 / "flight2.mp4"), "--name", "medium", "--area", str(bare), *FAST]
     log = bare.parent / "log"
     with log.open("w") as out:

@@ -200,7 +200,7 @@ def test_limits_of_the_verdict_are_documented():
 
 def test_options_are_documented_with_their_defaults():
     """docs/report.md has a row for each option of `spn-data report`, and no other."""
-    from cli.report import report
+    from spn_cli.report import report
 
     text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \| ([^|]+) \|", text, re.MULTILINE))

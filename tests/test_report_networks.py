@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from spn_cli.data import main as data_main
+from spn_cli.model import main
 
-from cli.data import main as data_main
-from cli.model import main
 from spn_data.area.area import Area
 from spn_data.inputs.network_runs import read_runs
 from spn_data.report.html import render

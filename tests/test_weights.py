@@ -20,8 +20,8 @@ import pytest
 import torch
 from click.testing import CliRunner
 from safetensors.torch import save_file
+from spn_cli.model import main
 
-from cli.model import main
 from spn_data.errors import InputError
 from spn_model.networks.registry import build
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
@@ -594,7 +594,7 @@ def test_listing_and_help_load_no_torch():
     """They answer at once."""
     code = (
         "import sys\n"
-        "from cli.model import main\n"
+        "from spn_cli.model import main\n"
         "for words in (['weights'], ['weights', 'fetch', '--help']):\n"
         "    try:\n"
         "        main(words)\n"

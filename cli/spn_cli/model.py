@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from cli.benchmark_model import benchmark
-from cli.console import Group
-from cli.evaluate import evaluate
-from cli.export_model import export
-from cli.predict import predict
-from cli.train import train
-from cli.weights import weights
+from spn_cli.benchmark_model import benchmark
+from spn_cli.console import Group
+from spn_cli.evaluate import evaluate
+from spn_cli.export_model import export
+from spn_cli.predict import predict
+from spn_cli.train import train
+from spn_cli.weights import weights
 
 
 @click.group(cls=Group)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_benchmark import Cost
@@ -67,7 +67,7 @@ def run(
     threads: int,
     as_json: bool,
 ) -> None:
-    from spn_data.area.area import area as names_of
+    from spn_data.area import area as names_of
     from spn_model.export.bundle_benchmark import BenchmarkOptions, flown_frames
     from spn_model.export.bundle_benchmark import benchmark as work
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from cli import options, page, show
+from spn_cli import options, page, show
 from spn_data.capture.selection import SelectionOptions
 from spn_data.matching.features import FeatureOptions
 from spn_data.pipeline.frames_stage import FramesOptions

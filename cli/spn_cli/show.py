@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
-from cli import console, show_labels
+from spn_cli import console, show_labels
 from spn_data.area.area import (
     CHECKPOINT,
     COMPARED,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_export import Exported
@@ -57,7 +57,7 @@ def run(
     calibration_images: int,
     overwrite: bool,
 ) -> None:
-    from spn_data.area.area import area as names_of
+    from spn_data.area import area as names_of
     from spn_data.errors import StageError
     from spn_data.storage.record import content_fingerprint
     from spn_model.export.bundle_checks import ExportOptions

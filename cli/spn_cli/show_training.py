@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from cli import console
+from spn_cli import console
 
 if TYPE_CHECKING:
     from spn_model.training.recipe import Recipe

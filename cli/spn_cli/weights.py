@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from cli import console
+from spn_cli import console
 
 
 @click.group(invoke_without_command=True)

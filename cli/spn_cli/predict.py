@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 _REASONS_SHOWN = 6
 _SEEN = 0.98  # of the network's view, below which the user is told

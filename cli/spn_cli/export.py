@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 FORMATS = ("tum", "nerfstudio", "kapture", "geojson", "kml", "colmap-text", "colmap", "nvm", "all")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cli import console
+from spn_cli import console
 from spn_data.area.area import FRAMES, Area
 from spn_data.errors import InUseError, SpnError
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cli import console
+from spn_cli import console
 
 
 @click.command(name="import")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 from spn_data.errors import StageError
 from spn_data.storage.files import LOCK, locked
 
@@ -96,9 +96,9 @@ def run(
     threads: int | None,
     overwrite: bool,
 ) -> None:
-    from cli import page
-    from cli.show_training import Following, errors_table
-    from spn_data.area.area import area as names
+    from spn_cli import page
+    from spn_cli.show_training import Following, errors_table
+    from spn_data.area import area as names
     from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
     from spn_data.storage.record import StageRecord, content_fingerprint, versions

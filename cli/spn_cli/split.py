@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options, page
-from cli.audit import show_findings
+from spn_cli import console, options, page
+from spn_cli.audit import show_findings
 
 if TYPE_CHECKING:
     from spn_data.pipeline.split_stage import SplitStageOptions
@@ -158,7 +158,7 @@ def _options(
 
 
 def _show(record: StageRecord) -> None:
-    from cli import show_labels
+    from spn_cli import show_labels
 
     counts = record.counts
     sizes = ", ".join(f"{width}x{height}" for width, height in counts["image_px"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from cli import console
+from spn_cli import console
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
 from spn_model.evaluation.evaluate import Comparison, Judged

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 
 @click.command()
@@ -74,8 +74,8 @@ def run(
     threads: int | None,
     seed: int,
 ) -> None:
-    from cli import page, show_networks
-    from spn_data.area.area import area as names_of
+    from spn_cli import page, show_networks
+    from spn_data.area import area as names_of
     from spn_data.errors import InputError, StageError
     from spn_data.storage.record import content_fingerprint
     from spn_model.evaluation.comparison_files import network_facts, of_network, write_comparison

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cli import console
+from spn_cli import console
 from spn_data.area.area import DENSE, EVALUATION, SPLIT
 from spn_data.storage.record import StageRecord
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import click
 
-from cli import options
-from cli.audit import audit
-from cli.console import Group
-from cli.coverage import coverage
-from cli.export import export
-from cli.import_ import import_
-from cli.register import register
-from cli.report import report
-from cli.split import split
+from spn_cli import options
+from spn_cli.audit import audit
+from spn_cli.console import Group
+from spn_cli.coverage import coverage
+from spn_cli.export import export
+from spn_cli.import_ import import_
+from spn_cli.register import register
+from spn_cli.report import report
+from spn_cli.split import split
 
 
 @click.group(cls=Group)
@@ -86,7 +86,7 @@ def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen
     Example:
         spn-data reconstruct video/ --area fields/north --fov 72
     """
-    from cli.reconstruct import run
+    from spn_cli.reconstruct import run
 
     run(inputs, area_folder, add=add, **chosen)
 
@@ -102,7 +102,7 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
     Example:
         spn-data georegister --area fields/north --gnss-sigma 0.03 0.05 --overwrite
     """
-    from cli import page, show
+    from spn_cli import page, show
     from spn_data.pipeline.geo_stage import georegister as stage
 
     area = options.open_area(area_folder)
@@ -135,7 +135,7 @@ def status(area_folder: Path) -> None:
     Example:
         spn-data status --area fields/north
     """
-    from cli import show
+    from spn_cli import show
 
     show.status(options.open_area(area_folder))
 
@@ -178,6 +178,6 @@ def simulate(out: Path, preset: str, seed: int, **chosen: Any) -> None:
     Example:
         spn-data simulate flights/ --preset demo --seed 1
     """
-    from cli.simulate import run
+    from spn_cli.simulate import run
 
     run(out, preset, seed, **chosen)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cli import console, options, page
+from spn_cli import console, options, page
 
 if TYPE_CHECKING:
     from spn_data.coverage.sequence_table import Coverage

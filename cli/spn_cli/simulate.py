@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cli import console
+from spn_cli import console
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.presets import MappingPaths
 from spn_data.simulate.presets import preset as named

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cli import options
+from spn_cli import options
 
 
 @click.command()
@@ -90,7 +90,7 @@ def run(
 ) -> None:
     import os
 
-    from cli import page, show
+    from spn_cli import page, show
     from spn_data.area.area import EVALUATION, GEO
     from spn_data.pipeline.evaluation_stage import RegisterStageOptions
     from spn_data.pipeline.evaluation_stage import register as stage

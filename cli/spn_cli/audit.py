@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cli import console, options
+from spn_cli import console, options
 
 if TYPE_CHECKING:
     from spn_data.split.audit import Finding

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cli import options, page
+from spn_cli import options, page
 
 
 @click.command()
