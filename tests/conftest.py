@@ -21,9 +21,9 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="module")
 def tiny_kind() -> Iterator[None]:
-    """Recipes and checkpoints know the small network of `tests.training_world`."""
+    """Recipes and checkpoints know the small network of `tests.worlds.training_world`."""
     from spn_model.models.registry import KINDS
-    from tests.training_world import register_tiny
+    from tests.worlds.training_world import register_tiny
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("spn_model.models.registry.KINDS", dict(KINDS))
@@ -33,8 +33,8 @@ def tiny_kind() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of the coloured field of `tests.training_world`."""
-    from tests.training_world import write_field
+    """Data set of the coloured field of `tests.worlds.training_world`."""
+    from tests.worlds.training_world import write_field
 
     return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
 

@@ -1,0 +1,279 @@
+"""Help of the commands, and the command lines of the docs: all there, and all of them would run."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+from importlib.metadata import version
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from spn_cli import options
+from spn_cli.data import main
+from spn_cli.model import main as model_main
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+COMMANDS = sorted(main.commands)
+GEO_PARAMETERS = set(inspect.signature(options.geo_options).parameters)
+
+
+def model_commands(group: click.Group = model_main) -> dict[str, click.Command]:
+    """Commands of spn-model and of its groups, by their words."""
+    found: dict[str, click.Command] = {}
+    for name, command in group.commands.items():
+        found[name] = command
+        if isinstance(command, click.Group):
+            found |= {f"{name} {inner}": c for inner, c in model_commands(command).items()}
+    return found
+
+
+def command_for(words: list[str], program: click.Group = main) -> click.Command:
+    """Resolve and parse the words after a program's name, run nothing. Raises click's usage errors."""
+    while words and words[0] in ("-v", "--verbose"):
+        words = words[1:]
+    if words in (["--help"], ["--version"]):
+        return program
+    group = click.Context(program, info_name="spn")
+    name, command, rest = program.resolve_command(group, list(words))
+    assert command is not None
+    if isinstance(command, click.Group) and rest:
+        return command_for(rest, command)
+    context = command.make_context(name, rest, parent=group)
+    if set(context.params) >= GEO_PARAMETERS:
+        options.geo_options(**{name: context.params[name] for name in GEO_PARAMETERS})
+    return command
+
+
+def command_lines(text: str, program: str = "spn-data") -> list[tuple[str, bool]]:
+    """(words after the program, whether they are a whole line): of fenced lines, and of inline code."""
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    fenced = "\n".join(block for language, block in blocks if language in ("", "sh"))
+    found = re.findall(rf"^(?:\S*/)?{program}( .*)$", fenced, re.MULTILINE)
+    outside = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    inline = re.findall(rf"`{program}( [^`\n]+)`", outside)
+    return [(line.strip(), True) for line in found] + [(line.strip(), False) for line in inline]
+
+
+def test_the_commands_are_those_of_this_version():
+    """A command that comes or goes is noticed here, and then told in the README."""
+    assert COMMANDS == [
+        "audit",
+        "coverage",
+        "export",
+        "georegister",
+        "import",
+        "reconstruct",
+        "register",
+        "report",
+        "simulate",
+        "split",
+        "status",
+    ]
+
+
+def test_help_lists_the_commands_in_the_order_of_work():
+    """`spn-data --help` begins with what a user does first."""
+    shown = CliRunner().invoke(main, ["--help"])
+    assert shown.exit_code == 0
+    listed = re.findall(r"^  (\w+) {2,}\S", shown.output.split("Commands:")[1], re.MULTILINE)
+    assert listed == [
+        "reconstruct",
+        "georegister",
+        "register",
+        "coverage",
+        "split",
+        "audit",
+        "import",
+        "export",
+        "report",
+        "status",
+        "simulate",
+    ]
+
+
+@pytest.mark.parametrize("group", [main, model_main])
+def test_version_is_that_of_the_package(group):
+    """--version tells what is installed."""
+    shown = CliRunner().invoke(group, ["--version"])
+    assert shown.exit_code == 0
+    assert version("squeezeposenet-toolkit") in shown.output
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_ends_with_examples_that_parse(name):
+    """Every command's help has an example, and the example is a command that click accepts."""
+    text = main.commands[name].help
+    assert text is not None
+    examples = re.findall(r"^\s+spn-data (.+)$", text.split("Example:")[1], re.MULTILINE)
+    assert examples
+    for example in examples:
+        assert command_for(shlex.split(example)) is main.commands[name]
+
+
+@pytest.mark.parametrize("name", sorted(model_commands()))
+def test_help_of_the_model_commands_is_whole(name):
+    """One sentence first, examples that click accepts at the end, and a page that shows the command."""
+    command = model_commands()[name]
+    text = command.help or ""
+    first = text.split("\n\n")[0]
+    assert first.endswith(".")
+    assert len(first) < 120
+    examples = re.findall(r"^\s+spn-model (.+)$", text.split("Example:")[1], re.MULTILINE)
+    assert command in [command_for(shlex.split(example), model_main) for example in examples]
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert any(line.startswith(name) for line, _ in command_lines(pages, "spn-model"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_model_commands_in_the_docs_parse(page):
+    """Every spn-model command that README and docs show is one that click accepts.
+
+    `\u2026`, `A|B` and words in capitals stand for something: only command and options are checked then.
+    """
+    known = model_commands()
+    for line, whole in command_lines(page.read_text(encoding="utf-8"), "spn-model"):
+        if re.search(r"[\u2026|]|\b[A-Z]{2,}\b|\bN\b", line):
+            command = next(c for n, c in known.items() if line.split()[0] == n)
+            nested = command.commands.values() if isinstance(command, click.Group) else ()
+            flags = {flag for c in (command, *nested) for p in c.params for flag in p.opts}
+            assert {word for word in line.split() if word.startswith("-")} <= flags, line
+            continue
+        try:
+            command_for(shlex.split(line), model_main)
+        except click.MissingParameter:
+            assert not whole, f"{page.name}: {line}"
+        except click.UsageError as error:
+            pytest.fail(f"{page.name}: spn-model {line}: {error.format_message()}")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*main.commands.values(), *model_commands().values()],
+    ids=[*main.commands, *model_commands()],
+)
+def test_every_option_has_help(command):
+    """No option is left without a sentence."""
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help, parameter.name
+            assert len(parameter.help) > 8, parameter.name
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_fits_a_sentence(name):
+    """The first line of a command's help is one sentence."""
+    first = (main.commands[name].help or "").split("\n\n")[0]
+    assert first.endswith(".")
+    assert len(first) < 120
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["reconstruct", "video", "--area", "a", "--no-such-option"],
+        ["reconstruct", "--area", "a"],
+        ["reconstruct", "video", "--fov", "300"],
+        ["reconstruct", "video", "--fov", "flight=wide"],
+        ["georegister", "--takeoff-alt", "112.4"],
+        ["no-such-command"],
+    ],
+)
+def test_the_check_itself_refuses_what_click_refuses(words):
+    """A wrong line in the docs would be found: parsing alone refuses it."""
+    with pytest.raises(click.UsageError):
+        command_for(words)
+
+
+def test_a_wrong_option_exits_with_2():
+    """click's own usage errors keep click's exit code."""
+    assert CliRunner().invoke(main, ["reconstruct", "video", "--frames", "1"]).exit_code == 2
+
+
+def test_an_error_of_the_users_data_is_one_line_and_exits_with_1(tmp_path):
+    """An empty folder is told in one line that names it."""
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    ran = CliRunner().invoke(main, ["reconstruct", str(folder), "--area", str(tmp_path / "area")])
+    assert ran.exit_code == 1
+    assert ran.output.splitlines() == [
+        f"Error: {folder}: holds no video and no photo; the folder is empty"
+    ]
+
+
+def test_command_lines_are_found():
+    """Fenced and inline commands are seen, prose is not."""
+    text = "Use `spn-data status` or\n```sh\n.venv/bin/spn-data --help\n```\nspn-data is a name.\n"
+    assert command_lines(text) == [("--help", True), ("status", False)]
+    assert sum(len(command_lines(page.read_text(encoding="utf-8"))) for page in PAGES) > 10
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_in_the_docs_parse(page):
+    """Every command that README and docs show is one that click accepts, with its options and values.
+
+    `\u2026`, `A|B` and words in capitals stand for something: only command and options are checked then.
+    """
+    for line, whole in command_lines(page.read_text(encoding="utf-8")):
+        words = shlex.split(line)
+        if re.search(r"[\u2026|]|\b[A-Z]{2,}\b|\bN\b", line):
+            names = [word for word in words if re.fullmatch(r"[a-z]+", word)]
+            command = main.commands[names[0]] if names else main
+            known = {flag for p in (*main.params, *command.params) for flag in p.opts}
+            assert {word for word in words if word.startswith("-")} <= known, f"{page.name}: {line}"
+        else:
+            try:
+                command_for(words)
+            except click.MissingParameter:
+                assert not whole, f"{page.name}: {line}"
+            except click.UsageError as error:
+                pytest.fail(f"{page.name}: spn-data {line}: {error.format_message()}")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_is_in_the_readme(name):
+    """A stranger meets every command in the README or, for the simulator, in the page that it links."""
+    page = "docs/simulator.md" if name == "simulate" else "README.md"
+    lines = command_lines((ROOT / page).read_text(encoding="utf-8"))
+    assert any(name in line.split() for line, _ in lines)
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "georegister"])
+def test_every_option_is_documented(name):
+    """docs/reconstruct.md has a row for every option, with the default that help shows."""
+    text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
+    for parameter in main.commands[name].params:
+        if not isinstance(parameter, click.Option):
+            continue
+        flag = parameter.opts[-1]
+        assert flag in rows
+        if parameter.show_default is True:
+            shown = rows[flag].strip("` ")
+            if isinstance(parameter.default, int | float):
+                assert float(shown) == parameter.default, flag
+            else:
+                assert shown == parameter.default, flag
+
+
+def test_no_option_is_documented_that_is_not_there():
+    """docs/reconstruct.md has no row for an option that reconstruct lacks."""
+    text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
+    rows = set(re.findall(r"^\| `(--[a-z-]+)` ", text, re.MULTILINE))
+    assert rows == {
+        flag for p in main.commands["reconstruct"].params for flag in p.opts if flag[:2] == "--"
+    }
+
+
+def test_every_option_of_simulate_is_documented():
+    """docs/simulator.md names every option of simulate."""
+    text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+    missing = [
+        parameter.opts[-1]
+        for parameter in main.commands["simulate"].params
+        if isinstance(parameter, click.Option) and f"`{parameter.opts[-1]}" not in text
+    ]
+    assert missing == []

@@ -1,0 +1,115 @@
+"""`spn-data report` on a real area: what is on the disk is what the page shows, stale stages included."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from spn_cli.data import main
+
+from spn_data.colmap.model import read_scene
+from tests.worlds.report_data import unpack
+
+
+def run(area: Path, *options: str) -> Result:
+    return CliRunner().invoke(main, ["report", "--area", str(area), *options])
+
+
+def given(page: Path) -> dict:
+    """What the page's script is given."""
+    (text,) = re.findall(
+        r'<script type="application/json" id="data">(.*?)</script>', page.read_text("ascii")
+    )
+    return json.loads(text)
+
+
+@pytest.fixture
+def area(finished_area: Path, tmp_path: Path) -> Path:
+    """A copy that may be changed, without its database and images."""
+    copy = tmp_path / "area"
+    shutil.copytree(finished_area, copy, ignore=shutil.ignore_patterns("*.jpg", "*.db"))
+    return copy
+
+
+def test_the_page_holds_what_the_area_holds(area):
+    """All candidates of frames.csv, with the poses of the model and the residuals of geo.json."""
+    before = sorted(path for path in area.rglob("*") if path.is_file())
+    ran = run(area)
+    assert ran.exit_code == 0, ran.output
+    after = sorted(path for path in area.rglob("*") if path.is_file())
+    assert after == before
+
+    frames = given(area / "report.html")["frames"]
+    with (area / "1-frames" / "frames.csv").open(newline="") as file:
+        assert sorted(frames["name"]) == sorted(row["name"] for row in csv.DictReader(file))
+    scene = read_scene(area / "3-geo")
+    centers = dict(zip(frames["name"], unpack(frames["center"]).reshape(-1, 3), strict=True))
+    found = np.array([centers[name] for name in scene.names])
+    np.testing.assert_allclose(found, scene.poses.centers, atol=1e-5)
+    assert np.isfinite(found).all()
+    assert np.isfinite(list(centers.values())).all(axis=1).sum() == len(scene.names)
+
+    geo = json.loads((area / "3-geo" / "geo.json").read_text())
+    residuals = dict(zip(frames["name"], unpack(frames["gnss_m"]).reshape(-1, 3), strict=True))
+    np.testing.assert_allclose(
+        [residuals[name] for name in geo["frames"]], geo["residuals_m"], atol=1e-5
+    )
+
+
+def test_the_command_tells_the_verdict(area):
+    """What the page says first is said on the terminal too, with the next step."""
+    ran = run(area)
+    assert "Not ready to train: 1 thing to do first: see" in ran.output
+    assert "Next: Split the frames: spn-data split" in ran.output
+
+
+def test_a_stale_stage_is_named_and_left_out(area):
+    """After the model was made anew, the old place in the world is not shown as if it still held."""
+    path = area / "2-model" / "stage.json"
+    record = json.loads(path.read_text())
+    record["counts"]["points"] += 1
+    path.write_text(json.dumps(record))
+    ran = run(area)
+    assert ran.exit_code == 0, ran.output
+    assert "Not ready to train: 2 things to do first: see" in ran.output
+    page = (area / "report.html").read_text("ascii")
+    assert "3-geo is out of date: 2-model was made anew since." in page
+    assert given(area / "report.html")["units"] == "model"
+
+
+def test_an_area_without_a_model_has_a_report(area):
+    """Chosen frames alone make a page that says what is next."""
+    shutil.rmtree(area / "3-geo")
+    shutil.rmtree(area / "2-model")
+    ran = run(area)
+    assert ran.exit_code == 0, ran.output
+    assert "Next: Make the model: spn-data reconstruct" in ran.output
+    assert given(area / "report.html")["points"] is None
+
+
+def test_a_folder_that_is_no_area_is_refused(tmp_path):
+    """Without frames there is nothing to report; the line says what to run."""
+    folder = tmp_path / "area"
+    ran = run(folder)
+    assert ran.exit_code == 1
+    assert ran.output.splitlines() == [
+        f"Error: {folder} holds no frames; run spn-data reconstruct first"
+    ]
+    assert not folder.exists()
+
+
+def test_damaged_residuals_are_an_error(area):
+    """Residuals that are not those of the frames are refused, not shown with the wrong frames."""
+    path = area / "3-geo" / "geo.json"
+    value = json.loads(path.read_text())
+    value["frames"] = value["frames"][1:]
+    path.write_text(json.dumps(value))
+    ran = run(area)
+    assert ran.exit_code == 1
+    assert "its residuals are not those of its frames" in ran.output

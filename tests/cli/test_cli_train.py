@@ -1,0 +1,218 @@
+"""`spn-model train`: a run's folder, going on, refusing what would be lost."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import signal
+import threading
+from pathlib import Path
+
+import click
+import pytest
+import torch
+from click.testing import CliRunner, Result
+from spn_cli.model import main
+from spn_cli.train import train
+
+from spn_model.models.checkpoint import load
+from spn_model.training.training_state import COLUMNS
+from tests.worlds.training_world import write_field
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
+
+TOML = """\
+kind = "tiny"
+weights = "none"
+
+[[stages]]
+name = "head"
+images = 40
+batch = 5
+rate = 0.02
+options = { frozen = true }
+
+[[stages]]
+name = "all"
+images = 120
+batch = 6
+rate = 0.02
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with dataset.h5 and tiny.toml."""
+    write_field(tmp_path / "dataset.h5", 12, 3)
+    (tmp_path / "tiny.toml").write_text(TOML)
+    return tmp_path
+
+
+def trained(place: Path, *words: str) -> Result:
+    given = ["--area", str(place / "area"), "--recipe", str(place / "tiny.toml"), "--device", "cpu"]
+    fixed = ["--threads", "1", "--precision", "float32", "--validations", "2", *words]
+    return CliRunner().invoke(main, ["train", str(place / "dataset.h5"), *given, *fixed])
+
+
+def test_a_run_has_all_that_it_takes_to_repeat_it(place):
+    """Checkpoint, log and configuration lie in runs/<recipe>; the table of errors ends the output."""
+    ran = trained(place, "--seed", "3")
+    assert ran.exit_code == 0, ran.output
+    folder = place / "area" / "runs" / "tiny"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".lock",
+        "checkpoint.safetensors",
+        "config.json",
+        "last.safetensors",
+        "log.csv",
+    ]
+    config = json.loads((folder / "config.json").read_text())
+    assert config["options"]["seed"] == 3
+    assert [stage["images"] for stage in config["options"]["stages"]] == [40, 120]
+    assert config["facts"]["steps"] == 8 + 20
+    assert config["inputs"].keys() == {"data set"}
+    assert load(folder / "checkpoint.safetensors").facts["seed"] == 3
+    table = ran.output[ran.output.index("Errors") :]
+    assert "validation, kept" in table
+    assert "3 of 3" in table
+    assert "Next: spn-model evaluate --run tiny" in table
+
+
+def test_a_finished_run_is_left_as_it_is(place):
+    """The same command shows the table again and writes nothing; --overwrite of the same too."""
+    trained(place)
+    checkpoint = place / "area" / "runs" / "tiny" / "checkpoint.safetensors"
+    before = checkpoint.stat().st_mtime_ns
+    for words in ((), ("--overwrite",)):
+        again = trained(place, *words)
+        assert again.exit_code == 0
+        assert "is trained already" in again.output
+        assert "validation, kept" in again.output
+    assert checkpoint.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--seed", "1"), "was made with seed = 0, now 1"),
+        (("--images", "80"), "was made with stages = "),
+        (("--validations", "3"), "was made with validations = 2, now 3"),
+        (("--precision", "bfloat16"), "was made with precision = 'float32', now 'bfloat16'"),
+    ],
+)
+def test_another_option_over_a_run_is_refused(place, words, told):
+    """It says what differs; --overwrite trains anew, another --run stands beside it."""
+    assert trained(place).exit_code == 0
+    refused = trained(place, *words)
+    assert refused.exit_code == 1
+    assert told in refused.output
+    assert "--overwrite trains anew, another --run leaves it" in refused.output
+    assert trained(place, *words, "--run", "b").exit_code == 0
+    anew = trained(place, *words, "--overwrite")
+    assert anew.exit_code == 0
+    assert "is trained already" in trained(place, *words).output
+
+
+def test_another_data_set_over_a_run_is_refused(place):
+    """Frames that changed would make another network."""
+    assert trained(place).exit_code == 0
+    write_field(place / "dataset.h5", 13, 3)
+    refused = trained(place)
+    assert refused.exit_code == 1
+    assert "saw another data set" in refused.output
+
+
+def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
+    """The step is finished, the end says how to go on, and weights are those of one piece."""
+    whole = trained(place, "--run", "whole", "--images", "1600")
+    assert whole.exit_code == 0
+    folder = place / "area" / "runs" / "cut"
+
+    def interrupt() -> None:
+        while not (folder / "checkpoint.safetensors").exists():
+            if not alive.wait(0.002):
+                continue
+            return
+        os.kill(os.getpid(), signal.SIGINT)
+
+    alive = threading.Event()
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    try:
+        cut = trained(place, "--run", "cut", "--images", "1600")
+    finally:
+        alive.set()
+        thread.join()
+    assert cut.exit_code == 130, cut.output
+    assert "the same command goes on from here" in cut.output
+    assert (folder / "state.safetensors").exists()
+    resumed = trained(place, "--run", "cut", "--images", "1600")
+    assert resumed.exit_code == 0, resumed.output
+    assert "Going on from where it was stopped" in resumed.output
+    both = [
+        load(place / "area" / "runs" / name / "last.safetensors").member.network.state_dict()
+        for name in ("whole", "cut")
+    ]
+    assert all(torch.equal(both[0][name], both[1][name]) for name in both[0])
+    assert not (folder / "state.safetensors").exists()
+
+
+def test_a_full_disk_is_one_line(place, monkeypatch):
+    """The file that could not be written is named, and that the same command goes on."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("spn_model.training.training_record.save_state", lambda *_: os.fsync(-1))
+    monkeypatch.setattr("os.fsync", full)
+    ran = trained(place)
+    assert ran.exit_code == 1
+    assert "No space left on device" in ran.output
+    assert "make room, and the same command goes on" in ran.output
+
+
+def test_what_nothing_can_be_trained_with_leaves_no_run(place):
+    """A recipe that is none, a device that is not there, a bad name, a stage's unknown option."""
+    (place / "bad.toml").write_text(TOML.replace("frozen = true", "frosen = true"))
+    for words, told in (
+        (("--recipe", "nothing"), "there is no recipe 'nothing'"),
+        (("--device", "tpu"), "there is no device 'tpu'"),
+        (("--pretrain", str(place / "none.h5")), None),
+        (("--run", "../up"), "cannot name a run"),
+        (("--recipe", str(place / "bad.toml")), "has no option 'frosen'"),
+    ):
+        ran = trained(place, *words)
+        assert ran.exit_code == (0 if told is None else 1), ran.output
+        if told is not None:
+            assert told in ran.output
+            assert len(ran.output.strip().splitlines()) == 1
+    mended = trained(place, "--recipe", str(place / "bad.toml"), "--seed", "9")
+    assert "has no option 'frosen'" in mended.output  # and not: stands already
+
+
+def test_an_area_without_a_split_is_refused(place):
+    """The line says which command makes it."""
+    ran = CliRunner().invoke(main, ["train", "--area", str(place / "area")])
+    assert ran.exit_code == 1
+    assert "5-split is missing; run spn-data split first" in ran.output
+
+
+def test_options_are_documented_with_their_defaults():
+    """docs/training.md has a row for every option and no other."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "training.md"
+    rows = dict(re.findall(r"^\| `(--[a-z]+)` \|([^|]*)\|", page.read_text(), re.MULTILINE))
+    options = {p.opts[-1]: p for p in train.params if isinstance(p, click.Option)}
+    assert rows.keys() == options.keys()
+    for flag, option in options.items():
+        if option.show_default is True:
+            assert rows[flag].strip("` ") == str(option.default), flag
+
+
+def test_columns_of_the_log_are_documented():
+    """docs/training.md names every column of log.csv and no other."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "training.md"
+    part = page.read_text().split("Columns of `log.csv`")[1].split("Judged are")[0]
+    cells = "".join(re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE))
+    assert sorted(re.findall(r"`(\w+)`", cells)) == sorted(COLUMNS)

@@ -1,0 +1,123 @@
+"""The check of labels against the flight's own fixes, which they were made without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spn_data.geometry.geodesy import HeightReference
+from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.georegistration.result import GeoFit
+from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.labels.labels import Labels, LabelStatus
+from spn_data.telemetry.track import Telemetry
+from tests.worlds.report_data import geo_fit
+
+N = 60
+TIMES = np.arange(N) * 0.5
+
+
+def positions(time_s: np.ndarray) -> np.ndarray:
+    """A winding flight."""
+    return np.column_stack(
+        [12 * np.sin(0.3 * time_s), 9 * np.cos(0.17 * time_s), 8 + 2 * np.sin(0.23 * time_s)]
+    )
+
+
+def labelled(failed: int = 0) -> Labels:
+    has = np.arange(N) >= failed
+    poses = Poses.from_rotations(
+        positions(TIMES), rotations_from_angles(np.tile([20.0, -30, 0], (N, 1)))
+    )
+    return Labels(
+        names=np.array([f"low/{k:06d}.jpg" for k in range(N)]),
+        sequences=np.full(N, "low"),
+        cameras=np.full(N, "low"),
+        sources=np.full(N, "low.mp4"),
+        video_frame=np.arange(N),
+        dense=np.zeros(N, bool),
+        time_s=TIMES,
+        status=np.where(has, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
+        reason=np.where(has, "", "no feature"),
+        poses=Poses(
+            np.where(has[:, None], poses.centers, np.nan),
+            np.where(has[:, None], poses.quats_wxyz, np.nan),
+        ),
+        covariance=np.full((N, 6, 6), np.nan),
+        inliers=np.full(N, 100),
+        coverage=np.full(N, 0.5),
+        error_px=np.full(N, 0.4),
+    )
+
+
+def track(
+    geo: GeoFit, offset_m: tuple[float, float, float], *, late_s: float = 0.0, kind: str = "dji-srt"
+) -> Telemetry:
+    """Fixes beside the flight, ten a second, the clock of the telemetry behind by `late_s`."""
+    time_s = np.arange(-20, 10 * N) * 0.1
+    rng = np.random.default_rng(4)
+    enu = positions(time_s + late_s) + offset_m + rng.normal(0, 0.05, (len(time_s), 3))
+    lat_lon_alt = geo.origin.wgs84_from_enu(enu)
+    return Telemetry.from_columns(
+        time_s,
+        lat_lon_deg=lat_lon_alt[:, :2],
+        abs_alt_m=lat_lon_alt[:, 2],
+        abs_reference=HeightReference.ELLIPSOID,
+        kind=kind,
+    )
+
+
+def check(labels: Labels, telemetry: Telemetry, geo: GeoFit) -> GnssCheck:
+    found = check_gnss(labels, telemetry, geo)
+    assert found is not None
+    return found
+
+
+def test_a_shared_offset_is_told_apart_from_scatter() -> None:
+    """One metre east and half a metre low, with centimetres of noise; it is no contradiction."""
+    geo = geo_fit(3)
+    found = check(labelled(), track(geo, (1.0, 0.0, -0.5)), geo)
+    assert (found.offset_e_m, found.offset_n_m) == pytest.approx((1.0, 0.0), abs=0.05)
+    assert found.offset_u_m == pytest.approx(-0.5, abs=0.05)
+    assert 0.01 < found.scatter_h_m < 0.2
+    assert found.fixes == N
+    assert not found.contradicts
+    assert "1.0" in found.tell()
+    assert "-0.5" in found.tell()
+
+
+def test_an_offset_beyond_what_gnss_can_err_is_a_contradiction() -> None:
+    """Thirty metres beside, or thirty above."""
+    geo = geo_fit(3)
+    for offset in ((30.0, 0.0, 0.0), (0.0, 0.0, 30.0)):
+        found = check(labelled(), track(geo, offset), geo)
+        assert found.contradicts
+        assert "more than the map's place and GNSS account for" in found.tell()
+
+
+def test_a_clock_that_is_behind_is_no_scatter() -> None:
+    geo = geo_fit(3)
+    found = check(labelled(), track(geo, (0.0, 0.0, 0.0), late_s=0.6), geo)
+    assert found.time_offset_s == pytest.approx(0.6, abs=0.1)
+    assert found.scatter_h_m < 0.2
+
+
+def test_heights_that_count_from_elsewhere_are_not_compared() -> None:
+    """Fixes above sea level against an area above the ellipsoid: horizontally only."""
+    geo = geo_fit(3)
+    amsl = replace(track(geo, (0.5, 0.0, 40.0)), abs_reference=HeightReference.AMSL)
+    found = check(labelled(), amsl, geo)
+    assert found.offset_u_m is None
+    assert found.scatter_v_m is None
+    assert not found.contradicts
+    assert "no height to compare" in found.tell()
+
+
+def test_too_few_labels_or_fixes_are_no_check() -> None:
+    geo = geo_fit(3)
+    telemetry = track(geo, (0.0, 0.0, 0.0))
+    assert check_gnss(labelled(failed=N - 4), telemetry, geo) is None
+    blind = replace(telemetry, lat_lon_deg=np.full((len(telemetry.time_s), 2), np.nan))
+    assert check_gnss(labelled(), blind, geo) is None

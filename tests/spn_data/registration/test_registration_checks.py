@@ -1,0 +1,358 @@
+"""Which poses become labels: every reason to refuse, and neighbours that confirm or contradict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spn_data.geometry.pose import pose_errors
+from spn_data.labels.map_points import MapPoints
+from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge, same_pose
+from spn_data.registration.register import accept
+from spn_data.registration.register_options import CheckOptions, RegisterOptions
+from spn_data.registration.solution import Sequence, Solution, settle, without
+from spn_data.registration.solve import solve
+from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
+
+OPTIONS = RegisterOptions()
+
+
+def evidence(count: int = 3, pairs: dict[tuple[int, int], float] | None = None) -> Evidence:
+    """Frames of which all is well. pairs : agreement of neighbours; all agree if None."""
+    if pairs is None:
+        pairs = {(k, k + 1): 1.0 for k in range(count - 1)}
+    keys = sorted(pairs)
+    return Evidence(
+        direct=np.full(count, 200),
+        putative=np.full(count, 400),
+        inliers=np.full(count, 220),
+        coverage=np.full(count, 0.6),
+        rival=np.zeros(count, np.int64),
+        depth=np.full(count, 10.0),
+        sigma=np.full(count, 0.01),
+        sigma_deg=np.full(count, 0.02),
+        pairs=np.array(keys, np.int64).reshape(-1, 2),
+        matches=np.full(len(keys), 100),
+        agreement=np.array([pairs[key] for key in keys]),
+    )
+
+
+def with_frame(found: Evidence, row: int, **values: Any) -> Evidence:
+    """The evidence with other values for one frame."""
+    columns = {}
+    for name, value in values.items():
+        column = getattr(found, name).copy()
+        column[row] = value
+        columns[name] = column
+    return replace(found, **columns)
+
+
+def judged(found: Evidence, posed: np.ndarray | None = None) -> Verdict:
+    return judge(
+        np.ones(len(found.direct), bool) if posed is None else posed, found, CheckOptions()
+    )
+
+
+def test_frames_of_which_all_is_well_are_accepted() -> None:
+    verdict = judged(evidence())
+    assert verdict.accepted.all()
+    assert verdict.reason == ("", "", "")
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"inliers": 29}, "only 29 map points agree (30 are needed)"),
+        ({"coverage": 0.07}, "the map points that agree cover 7% of the image (8% are needed)"),
+        ({"sigma": 0.13}, "its position is uncertain by 1.3% of the distance"),
+        ({"sigma": np.nan}, "its position is uncertain by nan% of the distance"),
+        ({"sigma_deg": 0.6}, "its rotation is uncertain by 0.60 deg"),
+    ],
+)
+def test_what_no_neighbour_can_make_good(values: dict[str, float], reason: str) -> None:
+    """Too few or crowded points, or a pose that they leave open, fail though all neighbours agree."""
+    verdict = judged(with_frame(evidence(), 1, **values))
+    assert verdict.accepted.tolist() == [True, False, True]
+    assert verdict.reason[1] == reason
+
+
+NEED_SUPPORT = [
+    ({"rival": 101}, "ambiguous: 200 map points agree with the pose and 101 with another"),
+    ({"direct": 29}, "only 29 map points found in it agree (30 are needed)"),
+    ({"putative": 1334}, "only 200 of its 1334 matches with the map agree"),
+]
+
+
+@pytest.mark.parametrize(("values", "reason"), NEED_SUPPORT)
+def test_what_a_neighbour_can_make_good_fails_without_one(
+    values: dict[str, int], reason: str
+) -> None:
+    """Two poses that go with the image, or few of its own matches: refused where no neighbour speaks."""
+    alone = evidence(3, {(0, 2): 1.0})
+    verdict = judged(with_frame(alone, 1, **values))
+    assert verdict.accepted.tolist() == [True, False, True]
+    assert verdict.reason[1] == f"{reason}, and no neighbour confirms its pose"
+
+
+@pytest.mark.parametrize(("values", "reason"), NEED_SUPPORT)
+def test_a_neighbour_that_stands_makes_it_good(values: dict[str, int], reason: str) -> None:
+    assert judged(with_frame(evidence(), 1, **values)).accepted.all()
+
+
+def test_support_reaches_along_a_chain_but_must_begin_somewhere() -> None:
+    """Four weak frames hang on one that stands; without it they only confirm each other, and all fail."""
+    weak = evidence(5)
+    for row in range(1, 5):
+        weak = with_frame(weak, row, direct=5)
+    assert judged(weak).accepted.all()
+    assert not judged(with_frame(weak, 0, direct=5)).accepted.any()
+
+
+def test_a_frame_whose_neighbours_contradict_it_is_ambiguous_and_they_are_not() -> None:
+    """The majority holds: one against four fails, and takes none of them along."""
+    pairs = {(i, j): 0.0 if 2 in (i, j) else 1.0 for i in range(5) for j in range(i + 1, 5)}
+    verdict = judged(evidence(5, pairs))
+    assert verdict.accepted.tolist() == [True, True, False, True, True]
+    assert verdict.reason[2] == "ambiguous: 4 of 4 neighbours contradict its pose"
+
+
+def test_where_no_majority_holds_all_fail() -> None:
+    """Two that contradict each other, and two camps of two."""
+    verdict = judged(evidence(2, {(0, 1): 0.1}))
+    assert not verdict.accepted.any()
+    assert verdict.reason == ("ambiguous: 1 of 1 neighbours contradict its pose",) * 2
+    camps = {(0, 1): 1.0, (2, 3): 1.0, (0, 2): 0.0, (1, 3): 0.0}
+    assert not judged(evidence(4, camps)).accepted.any()
+
+
+def test_a_neighbour_with_few_matches_or_no_pose_of_its_own_does_not_testify() -> None:
+    few = replace(evidence(2, {(0, 1): 0.0}), matches=np.array([29]))
+    assert judged(few).accepted.all()
+    refused = with_frame(evidence(2, {(0, 1): 0.0}), 0, inliers=3)
+    assert judged(refused).accepted.tolist() == [False, True]
+    unknown = replace(evidence(2), agreement=np.array([np.nan]))
+    assert judged(unknown, np.array([True, False])).accepted.tolist() == [True, False]
+
+
+def test_a_frame_without_a_pose_says_why() -> None:
+    found = with_frame(evidence(), 1, putative=0)
+    verdict = judged(found, np.array([False, False, True]))
+    assert verdict.reason[0] == "no pose agrees with its 400 matches with the map"
+    assert verdict.reason[1] == "no feature matches a point of the map"
+    assert verdict.accepted.tolist() == [False, False, True]
+
+
+def solved(made: Flight, putative: list[np.ndarray]) -> tuple[Sequence, Solution, Evidence]:
+    sequence = made.sequence(putative)
+    solution = solve(sequence, LENS, True, OPTIONS)
+    covariances = np.tile(1e-6 * np.eye(6), (len(made.poses), 1, 1))
+    found = gather_evidence(sequence, solution, covariances, made.pairs, OPTIONS)
+    return sequence, solution, found
+
+
+def test_a_flight_along_the_facade_stands() -> None:
+    """Right matches: every frame is within centimetres, all neighbours agree, nothing rivals."""
+    made = flight()
+    _, solution, found = solved(made, made.matched())
+    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
+    assert found.agreement.min() > 0.95
+    assert found.rival.max() == 0
+    assert np.array_equal(found.putative, [len(shows) for shows in made.shows])
+    assert np.all((found.depth > 8) & (found.depth < 11))
+
+
+@pytest.mark.parametrize("columns", [1, -1])
+def test_a_frame_at_the_wrong_window_is_ambiguous(columns: int) -> None:
+    """Its own matches agree with a pose one window along the flight, where epipolar lines stay the same."""
+    made = flight()
+    sequence, solution, found = solved(made, made.matched({3: columns}))
+    away = solution.poses.centers[3] - made.poses.centers[3]
+    assert away == pytest.approx([columns * PITCH_M, 0, 0], abs=0.15)
+    assert found.direct[3] > 0.9 * len(sequence.putative[3])
+    assert found.rival[3] == 0
+    verdict = judge(solution.posed, found, CheckOptions())
+    assert verdict.accepted.tolist() == [k != 3 for k in range(8)]
+    assert verdict.reason[3] == "ambiguous: 6 of 6 neighbours contradict its pose"
+
+
+def test_a_frame_that_fits_two_windows_is_settled_by_its_neighbours_or_not_at_all() -> None:
+    """Half of its matches go to one window, half to the next: alone it fails, with neighbours it stands."""
+    made = flight()
+    right, wrong = made.matched()[3], made.matched({3: 1})[3]
+    both = np.concatenate([right[::2], wrong[1::2]])
+    alone = Flight(made.poses[3:4], made.points, made.pixels[3:4], made.shows[3:4])
+    _, solution, found = solved(alone, [both[np.argsort(both[:, 0])]])
+    assert found.rival[0] > 0.8 * found.direct[0]
+    verdict = judge(solution.posed, found, CheckOptions())
+    assert verdict.reason[0].startswith("ambiguous: ")
+    assert verdict.reason[0].endswith("with another, and no neighbour confirms its pose")
+    putative = made.matched()
+    putative[3] = np.concatenate([right[: len(right) * 3 // 5], wrong[len(right) * 3 // 5 :]])
+    _, solution, found = solved(made, putative)
+    assert found.rival[3] > 0.5 * found.direct[3]
+    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
+
+
+def test_a_frame_without_matches_is_carried_by_its_neighbours() -> None:
+    """It finds nothing of the map by itself; what its neighbours know of their common features places it."""
+    made = flight()
+    putative = made.matched()
+    putative[3] = np.zeros((0, 2), np.int64)
+    _, solution, found = solved(made, putative)
+    assert found.direct[3] == 0
+    assert found.inliers[3] > A_COLUMN
+    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
+
+
+def test_random_matches_give_no_label() -> None:
+    """Features matched with any points of the map, as of another place: every frame fails."""
+    made = flight()
+    rng = np.random.default_rng(1)
+    putative = [
+        np.column_stack([np.arange(len(p)), rng.integers(0, len(made.points), len(p))])
+        for p in made.pixels
+    ]
+    _, solution, found = solved(made, putative)
+    verdict = judge(solution.posed, found, CheckOptions())
+    assert not verdict.accepted.any()
+    assert all(verdict.reason)
+
+
+def test_a_second_pose_that_is_the_same_is_no_rival() -> None:
+    """Half of the features 9 px off, as leaves in the wind: their pose is turned by less than 2 degrees."""
+    made = flight(1)
+    pixels = made.pixels[0].copy()
+    pixels[::2, 0] += 9
+    moved = replace(made, pixels=[pixels])
+    _, _, found = solved(moved, made.matched())
+    assert found.direct[0] < 0.7 * len(pixels)
+    assert found.rival[0] == 0
+    near, far = (
+        replace(made.poses, centers=made.poses.centers + np.array([x, 0, 0])) for x in (0.2, 0.3)
+    )
+    assert same_pose(made.poses, near, 10.0, CheckOptions())
+    assert not same_pose(made.poses, far, 10.0, CheckOptions())
+
+
+def test_a_lens_that_is_not_known_is_found() -> None:
+    """From a focal length of a narrow lens and no distortion; one that is held stays to the bit."""
+    made = flight()
+    start = replace(LENS, params=np.array([900.0, 160, 120, 0, 0]))
+    sequence = made.sequence(made.matched())
+    found = solve(sequence, start, False, OPTIONS)
+    assert found.camera.focal_px[0] == pytest.approx(LENS.focal_px[0], rel=0.005)
+    assert pose_errors(found.poses, made.poses)[0].max() < 0.06
+    held = solve(sequence, LENS, False, replace(OPTIONS, hold_lens=True))
+    assert np.array_equal(held.camera.params, LENS.params)
+    assert pose_errors(held.poses, made.poses)[0].max() < 0.03
+
+
+def test_what_no_map_point_explains_becomes_a_point_of_the_sequence_where_it_is() -> None:
+    """Two thirds of the facade are not in the map: tracks of them are triangulated, and help the frames."""
+    made = flight()
+    putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
+    _, solution, _ = solved(made, putative)
+    assert len(solution.own_points) > 60
+    for row, point in enumerate(solution.own_points):
+        mine = np.flatnonzero(solution.own == row)
+        shown = {int(made.shows[solution.frame[k]][solution.feature[k]]) for k in mine}
+        assert len(shown) == 1
+        assert len(mine) >= 2
+        assert np.linalg.norm(point - made.points[shown.pop()]) < 0.5
+    assert pose_errors(solution.poses, made.poses)[0].max() < 0.15
+
+
+def test_points_that_only_one_frame_sees_leave_with_the_others() -> None:
+    """Without frames 3 to 7, each own point that is left has two frames of the rest."""
+    made = flight()
+    putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
+    _, solution, _ = solved(made, putative)
+    left = without(solution, np.arange(8) > 2)
+    assert left.posed.tolist() == [k <= 2 for k in range(8)]
+    assert left.frame.max() == 2
+    counts = np.bincount(left.own[left.own >= 0], minlength=len(left.own_points))
+    assert len(left.own_points) < len(solution.own_points)
+    assert counts.min() >= 2
+
+
+def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One fails at first, another once that one is gone: each keeps its own reason."""
+    rounds = iter([({3}, "first"), ({3, 5}, "second"), ({3, 5}, "third")])
+
+    def scripted(posed: np.ndarray, *_: object) -> Verdict:
+        failing, reason = next(rounds)
+        return Verdict(
+            np.array([k not in failing for k in range(8)]),
+            tuple(reason if k in failing else "" for k in range(8)),
+        )
+
+    monkeypatch.setattr("spn_data.registration.register.judge", scripted)
+    made = flight()
+    found = accepted(made, made.matched())
+    assert [found.reason[k] for k in (3, 5, 6)] == ["first", "second", ""]
+    assert found.solution.posed.tolist() == [k not in (3, 5) for k in range(8)]
+
+
+class _Perfect:
+    """A map without errors."""
+
+    sigma_px = 0.3
+
+    def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
+        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
+
+
+def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyped-def]
+    sequence = made.sequence(putative)
+    solution = solve(sequence, LENS, True, OPTIONS)
+    points = MapPoints(
+        np.arange(100, 100 + len(made.points)),
+        made.points,
+        np.zeros((len(made.points), 3), np.uint8),
+        np.full(len(made.points), 5),
+    )
+    return accept(sequence, solution, made.pairs, _Perfect(), points, OPTIONS)  # type: ignore[arg-type]
+
+
+def test_what_failed_pulls_at_nothing_that_stands() -> None:
+    """Two frames at the wrong window leave the least squares: the rest is as if they had not been there."""
+    made = flight(10)
+    found = accepted(made, made.matched({3: 1, 7: -1}))
+    stands = [k not in (3, 7) for k in range(10)]
+    assert found.solution.posed.tolist() == stands
+    assert found.reason[3].startswith("ambiguous: ")
+    assert found.inliers[3] > 50, "what is told of a frame is what held when it failed"
+    error_m = pose_errors(found.solution.poses[np.array(stands)], made.poses[np.array(stands)])[0]
+    assert error_m.max() < 0.05
+    assert np.isnan(found.solution.poses.centers[[3, 7]]).all()
+    assert np.isnan(found.covariances[[3, 7]]).all()
+    assert np.linalg.eigvalsh(found.covariances[stands]).min() > 0
+    assert not np.isin(found.seen.frame_idx, [3, 7]).any()
+    assert found.seen.point_ids.min() >= 100
+
+
+def test_where_nothing_stands_there_is_no_covariance() -> None:
+    made = flight(3)
+    found = accepted(made, [np.zeros((0, 2), np.int64)] * 3)
+    assert not found.solution.posed.any()
+    assert found.covariance is None
+    assert found.reason == ("no feature matches a point of the map",) * 3
+
+
+def test_a_frame_of_which_hardly_any_measurement_agrees_loses_its_pose() -> None:
+    """Moved far off before the least squares, nothing of it agrees any more, and the others stay."""
+    made = flight()
+    sequence, solution, _ = solved(made, made.matched())
+    centers = solution.poses.centers.copy()
+    centers[3] += [0, 40, 0]
+    moved = replace(solution, poses=replace(solution.poses, centers=centers))
+    again = settle(sequence, moved, OPTIONS)
+    assert again.posed.tolist() == [k != 3 for k in range(8)]
+    assert np.isnan(again.poses.centers[3]).all()
+    assert not (again.frame == 3).any()

@@ -1,0 +1,301 @@
+"""The report in a real browser: it draws, says nothing on the console, sorts, filters and is quick."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spn_data.report.html import render
+from tests.worlds.report_data import area
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: chromium)"),
+]
+
+# What the driver chatters about, which no page can do anything about.
+HARMLESS = ("GL Driver Message",)
+
+# Runs in the page after its own script, and leaves what it measured in the document.
+PROBE = """<script>
+const found = {};
+const pixels = canvas => {
+  const flat = document.createElement("canvas");
+  flat.width = canvas.width; flat.height = canvas.height;
+  flat.getContext("2d").drawImage(canvas, 0, 0);
+  const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+  const colors = new Map();
+  for (let k = 0; k < data.length; k += 4) {
+    const color = data[k] << 16 | data[k + 1] << 8 | data[k + 2];
+    colors.set(color, (colors.get(color) || 0) + 1);
+  }
+  const most = Math.max(...colors.values());
+  return {colors: colors.size, drawn: 1 - most / (data.length / 4)};
+};
+const rows = () => [...document.querySelectorAll("#table tbody tr[data-row]")];
+const column = k => rows().map(row => row.cells[k].textContent);
+const heads = () => [...document.querySelectorAll("#table thead th")];
+const report = () => {
+  const out = document.createElement("pre");
+  out.id = "found";
+  out.textContent = JSON.stringify(found);
+  window.top.document.body.append(out);
+};
+%s
+</script>"""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What a browser made of a page. found : what the probe measured; console : what the page said there."""
+
+    found: dict[str, Any]
+    console: list[str]
+    dom: str
+
+
+def visit(
+    tmp_path: Path,
+    page: str,
+    probe: str = "",
+    *,
+    before: str = "",
+    phone: bool = False,
+    when_loaded: bool = False,
+) -> Visit:
+    """Open a page in headless Chromium, run a probe in it, and read the document that it leaves.
+
+    when_loaded : the probe waits for the page's images too.
+    """
+    if before:
+        page = page.replace("<body>", f"<body><script>{before}</script>", 1)
+    probe = f"{probe}\nreport();"
+    if when_loaded:
+        probe = f'window.addEventListener("load", () => {{ {probe} }});'
+    page = page.replace("</body>", PROBE % probe + "</body>")
+    if phone:  # a window of Chromium has a least width, a frame has none
+        page = (
+            f'<body><iframe srcdoc="{html.escape(page)}" width="390" height="844"></iframe></body>'
+        )
+    file = tmp_path / "report.html"
+    file.write_text(page, encoding="utf-8")
+    assert CHROMIUM is not None
+    command = [
+        *(CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run"),
+        *(
+            "--enable-unsafe-swiftshader",
+            "--enable-logging=stderr",
+            "--disable-background-networking",
+        ),
+        *(f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1440,900", "--dump-dom"),
+        file.as_uri(),
+    ]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, errors="replace")
+    said = re.findall(r":CONSOLE[:(]\d+\)?\] (.*)", ran.stderr)
+    console = [line for line in said if not any(part in line for part in HARMLESS)]
+    (found,) = re.findall(r'<pre id="found">(.*?)</pre>', ran.stdout, re.DOTALL) or ["{}"]
+    return Visit(json.loads(html.unescape(found)), console, ran.stdout)
+
+
+def test_the_page_draws_and_says_nothing(tmp_path):
+    """WebGL draws points, cameras and grid; turning changes the picture; the console stays empty."""
+    seen = visit(
+        tmp_path,
+        render(area()),
+        """
+        const view = document.getElementById("view");
+        found.kind = document.documentElement.dataset.drawn;
+        found.before = pixels(view);
+        const first = view.toDataURL();
+        const corner = view.getBoundingClientRect();
+        const at = (type, x, y) => view.dispatchEvent(new PointerEvent(type, {pointerId: 1,
+          clientX: corner.left + x, clientY: corner.top + y, bubbles: true, buttons: 1}));
+        view.setPointerCapture = () => {};
+        at("pointerdown", 500, 200); at("pointermove", 600, 260); at("pointerup", 600, 260);
+        window.spnReport.view.draw();
+        found.turned = view.toDataURL() !== first;
+        found.layers = [...document.querySelectorAll("#legend label")].map(l => l.textContent);
+        const points = document.querySelector("#legend input");
+        points.click();
+        window.spnReport.view.draw();
+        found.without = pixels(view);
+        found.strips = [...document.querySelectorAll(".lane canvas")].map(pixels);
+        found.wide = document.documentElement.scrollWidth;
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["kind"] == "webgl"
+    assert seen.found["before"]["colors"] > 100
+    assert seen.found["before"]["drawn"] > 0.02
+    assert seen.found["turned"]
+    assert seen.found["layers"] == [
+        "points",
+        "mapping cameras",
+        "evaluation: medium",
+        "GNSS fixes",
+        "fly again",
+        "grid, 10 m",
+        "north",
+    ]
+    assert seen.found["without"]["colors"] < seen.found["before"]["colors"] / 2
+    assert all(strip["drawn"] > 0.02 for strip in seen.found["strips"])
+    assert seen.found["wide"] <= 1440
+
+
+def test_the_table_sorts_and_filters(tmp_path):
+    """A click on a column sorts, another turns the order; what is unknown stays last; words filter."""
+    data = area()
+    backwards = data.frames.select(np.arange(len(data.frames))[::-1])  # frames without a pose first
+    seen = visit(
+        tmp_path,
+        render(replace(data, frames=backwards)),
+        """
+        found.heads = heads().map(h => h.textContent);
+        const sigma = found.heads.indexOf("sigma, m");
+        const click = k => heads()[k].querySelector("button").click();
+        const body = document.querySelector("#table .rows");
+        click(sigma);
+        found.up = column(sigma);
+        found.aria = heads()[sigma].getAttribute("aria-sort");
+        click(sigma);
+        found.down = column(sigma);
+        const search = document.querySelector("#table input");
+        search.value = "ambiguous";
+        search.dispatchEvent(new Event("input"));
+        found.failed = column(0);
+        found.count = document.querySelector("#table .note").textContent;
+        document.querySelector("#table tbody tr[data-row]").click();
+        found.picked = document.getElementById("picked").textContent;
+        """,
+    )
+    assert seen.console == []
+    up, down = ([float(v) for v in seen.found[way]] for way in ("up", "down"))
+    assert up == sorted(up)
+    assert down == sorted(down, reverse=True)
+    assert (up[0], down[0]) == (0.01, 0.05)
+    assert seen.found["aria"] == "ascending"
+    assert seen.found["failed"] == ["medium/000039.jpg", "medium/000038.jpg"]
+    assert seen.found["count"] == "2 of 190 frames"
+    assert "medium/000039.jpg" in seen.found["picked"]
+    assert "ambiguous" in seen.found["picked"]
+
+
+def test_a_frame_is_told_and_found_from_its_strip(tmp_path):
+    """Pointing at a failed frame's tick tells why; a click shows it in the table, and marks the strip."""
+    seen = visit(
+        tmp_path,
+        render(area()),
+        """
+        const strip = document.querySelectorAll(".lane canvas")[1];
+        const corner = strip.getBoundingClientRect();
+        const at = type => strip.dispatchEvent(new PointerEvent(type,
+          {clientX: corner.left + strip.clientWidth - 4, clientY: corner.top + 10, bubbles: true}));
+        at("pointermove");
+        found.tip = document.getElementById("tip").textContent;
+        const before = strip.toDataURL();
+        at("click");
+        found.marked = strip.toDataURL() !== before;
+        found.row = [...document.querySelectorAll("#table tr.picked")].map(r => r.cells[0].textContent);
+        found.picked = document.getElementById("picked").textContent;
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["tip"] == "medium/000039.jpg at 19.5 s: failed: ambiguous"
+    assert seen.found["marked"]
+    assert seen.found["row"] == ["medium/000039.jpg"]
+    assert seen.found["picked"].startswith("medium/000039.jpg")
+
+
+def test_a_page_without_a_model_is_quiet_too(tmp_path):
+    """Frames alone, without any pose, are listed and drawn over time, and nothing fails."""
+    data = area()
+    frames = data.frames.select(~data.frames.evaluation)
+    unknown = replace(
+        frames.poses,
+        centers=np.full((len(frames), 3), np.nan),
+        quats_wxyz=np.full((len(frames), 4), np.nan),
+    )
+    frames = replace(frames, status=np.full(len(frames), "chosen"), poses=unknown)
+    nothing = {"geo": None, "points": None, "coverage": None, "split": None, "audit": None}
+    data = replace(data, frames=frames, units="model", model_record=None, **nothing)
+    seen = visit(
+        tmp_path,
+        render(data),
+        """
+        found.rows = rows().length;
+        found.strips = [...document.querySelectorAll(".lane canvas")].map(pixels);
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["rows"] > 5
+    assert all(strip["drawn"] > 0.02 for strip in seen.found["strips"])
+
+
+def test_without_webgl_a_plain_canvas_draws(tmp_path):
+    """Where the browser gives no WebGL, the view is drawn all the same, and says so."""
+    seen = visit(
+        tmp_path,
+        render(area()),
+        """
+        found.kind = document.documentElement.dataset.drawn;
+        found.view = pixels(document.getElementById("view"));
+        found.note = document.getElementById("fallback").textContent;
+        """,
+        before="""const usual = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+          return kind === "webgl" ? null : usual.call(this, kind, ...more); };""",
+    )
+    assert seen.console == []
+    assert seen.found["kind"] == "2d"
+    assert seen.found["view"]["colors"] > 100
+    assert "no WebGL" in seen.found["note"]
+
+
+def test_a_large_area_loads_in_three_seconds(tmp_path):
+    """1,000 cameras and 100,000 points are shown within 3 s of opening the file, the better of two visits."""
+    page = render(area(cameras=1000, map_points=100_000))
+    visits = [
+        visit(
+            tmp_path,
+            page,
+            """
+            found.milliseconds = Number(document.documentElement.dataset.milliseconds);
+            found.view = pixels(document.getElementById("view"));
+            """,
+        )
+        for _ in range(2)
+    ]
+    assert all(seen.console == [] and seen.found["view"]["drawn"] > 0.02 for seen in visits)
+    assert min(seen.found["milliseconds"] for seen in visits) < 3000
+    assert len(page) < 4_000_000
+
+
+def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
+    """At 390 pixels nothing but tables in their own frames is wider than the screen."""
+    seen = visit(
+        tmp_path,
+        render(area()),
+        """
+        found.window = window.innerWidth;
+        found.wide = document.documentElement.scrollWidth;
+        found.view = pixels(document.getElementById("view"));
+        """,
+        phone=True,
+    )
+    assert seen.console == []
+    assert seen.found["window"] == 390
+    assert seen.found["wide"] <= 390
+    assert seen.found["view"]["drawn"] > 0.02

@@ -1,0 +1,269 @@
+"""The page's part on networks: their errors beside what needs none, from files that may be hostile."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from spn_cli.data import main as data_main
+from spn_cli.model import main
+
+from spn_data.area.area import Area
+from spn_data.inputs.network_runs import read_runs
+from spn_data.report.html import render
+from tests.spn_data.report.test_report_browser import CHROMIUM, visit
+from tests.worlds.judged_world import write_judged, write_network
+from tests.worlds.report_data import area as made_up_area
+
+pytestmark = pytest.mark.usefixtures("tiny_kind")
+
+IMAGE = re.compile(r'<img alt="([^"]*)" width="(\d+)" src="data:image/svg\+xml;base64,([\w+/=]+)">')
+ALERT = "<script>document.title='hacked';console.log('hacked')</script>"
+HOSTILE_SVG = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 50" onload="console.log(\'hacked\')">'
+    f'{ALERT}<image href="https://example.org/x.png" width="9" height="9"/>'
+    '<foreignObject width="9" height="9"><body xmlns="http://www.w3.org/1999/xhtml">'
+    '<img src="x" onerror="console.log(\'hacked\')"/></body></foreignObject></svg>'
+)
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An area with two networks, evaluated together; no test may change it."""
+    root = tmp_path_factory.mktemp("networks") / "area"
+    dataset = write_judged(root / "5-split" / "dataset.h5")
+    for seed, name in enumerate(("first", "second")):
+        (root / "runs" / name).mkdir(parents=True)
+        write_network(root / "runs" / name / "checkpoint.safetensors", dataset, seed=seed)
+    words = ["--area", str(root), "--run", "first", "--run", "second", "--device", "cpu"]
+    ran = CliRunner().invoke(main, ["evaluate", str(dataset), *words, "--threads", "1"])
+    assert ran.exit_code == 0, ran.output
+    return root
+
+
+@pytest.fixture
+def root(evaluated: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(evaluated, tmp_path / "area"))
+
+
+def page(root: Path) -> str:
+    """The page of an area with these networks."""
+    runs, broken = read_runs(Area(root))
+    html = render(replace(made_up_area(), runs=runs, broken_runs=broken))
+    (section,) = re.findall(r'<section id="networks">.*?</section>', html, re.DOTALL)
+    assert html.count("<script") == 2
+    return section
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    table = json.loads(path.read_text())
+    change(table)
+    path.write_text(json.dumps(table))
+
+
+def test_networks_stand_beside_what_needs_none(root):
+    """One table a group, both networks and all baselines in it, with the figures of metrics.json."""
+    shown = page(root)
+    for group, frames in (("low", 4), ("medium", 7)):
+        assert f"<h3>{group}: {frames} test frames</h3>" in shown
+    table = shown[shown.index("<h3>medium") : shown.index("<h3>validation")]
+    order = ["<b>first</b>", "<b>second</b>", "mean training", "retrieval, GeM", "retrieval, VLAD"]
+    places = [table.index(f"<td>{words}") for words in [*order, "nearest training pose"]]
+    assert places == sorted(places)
+    assert table.count("(the better)") == 1
+    assert "SqueezePoseNet, in the paper*" in table
+    metrics = json.loads((root / "runs" / "first" / "metrics.json").read_text())
+    one = metrics["groups"]["medium"]["first"]
+    told = f"{one['position']['median']:.2f} m, {one['rotation_deg']['median']:.1f}&deg;"
+    assert table.count(told) == 1
+
+
+def test_a_short_training_is_called_short(root):
+    """Forty images are no training to judge a kind of network by, and the page says so."""
+    shown = page(root)
+    assert "A short training: first (40 images), second (40 images)." in shown
+    table = shown[shown.index('class="trained"') : shown.index("</table>")]
+    (first, _) = re.findall(r"<tr><td>(.*?)</td></tr>", table)
+    titles = re.findall(r"<th>(.*?)</th>", table)
+    told = dict(zip(titles, first.split("</td><td>"), strict=True))
+    assert told["trained for"] == told["kept after"] == "0.1 min"
+    assert told["images seen"] == "40"
+    assert told["a pose takes"].endswith(" ms")
+
+
+def test_figures_are_images_and_nothing_else(root):
+    """Each figure is an <img> with the file's own bytes in it: no figure is part of the page."""
+    shown = page(root)
+    images = IMAGE.findall(shown)
+    assert shown.count("<img") == len(images) == shown.count("src=")
+    assert "<svg" not in shown
+    folder = root / "runs" / "compared" / "figures"
+    files = {path.read_bytes() for path in (root / "runs").glob("*/figures/*.svg")}
+    assert {base64.b64decode(content) for _, _, content in images} == files
+    first = base64.b64decode(images[0][2])
+    assert first == (folder / "low-trajectories.svg").read_bytes()
+    assert images[0][:2] == ("low: trajectories", "1000")
+
+
+def test_what_was_judged_on_other_frames_is_told(root):
+    """After another split, or another training, the page does not pass old figures off as today's."""
+    write_judged(root / "5-split" / "dataset.h5", {"train": 9, "medium": 4})
+    assert "earlier data set than the area holds now: first, second." in page(root)
+    write_network(root / "runs/first/checkpoint.safetensors", root / "5-split/dataset.h5", seed=7)
+    shown = page(root)
+    assert "first: trained since it was judged" in shown
+    assert "compared: trained since it was judged" in shown
+    assert "second: trained since it was judged" not in shown
+    assert "Figures of <b>second</b>" in shown
+    assert "Figures of <b>first</b>" not in shown
+
+
+def _nested(table: dict[str, Any]) -> None:
+    table["facts"]["runs"]["first"]["training"] = json.loads("[" * 90 + "]" * 90)
+
+
+DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {
+    "another version": lambda t: t.update(version=2),
+    "no groups": lambda t: t.pop("groups"),
+    "groups that are none": lambda t: t.update(groups=[1, 2]),
+    "text for a number": lambda t: t["groups"]["medium"]["first"]["position"].update(median="1"),
+    "a number that is none": lambda t: t["groups"]["medium"]["first"].update(frames=float("nan")),
+    "a number for text": lambda t: t["facts"].update(dataset=7),
+    "a name that leads out": lambda t: t["facts"]["runs"].update(
+        {"../../x": t["facts"]["runs"]["first"]}
+    ),
+    "nested lists": _nested,
+}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_a_damaged_metrics_json_is_told_and_the_rest_shown(root, what):
+    """One run that cannot be read is named with the remedy; the page and the other run stand."""
+    rewrite(root / "runs" / "first" / "metrics.json", DAMAGE[what])
+    shown = page(root)
+    assert "metrics.json: cannot be shown" in shown
+    assert "run spn-model evaluate again" in shown
+    assert "<b>second</b>" in shown
+
+
+@pytest.mark.parametrize("content", ["", "{", "[" * 100_000, '{"version": 1e999}', "\x00"])
+def test_what_is_no_json_is_told(root, content):
+    """Empty, cut, bottomless: a line, and never a crash."""
+    (root / "runs" / "first" / "metrics.json").write_text(content)
+    assert "metrics.json: cannot be shown" in page(root)
+
+
+def test_numbers_that_are_none_are_not_shown_as_numbers(root):
+    """NaN and infinity, which some JSON holds, are as unknown as null."""
+
+    def change(table: dict[str, Any]) -> None:
+        table["groups"]["medium"]["first"]["position"].update(median=float("nan"), p95=float("inf"))
+
+    rewrite(root / "runs" / "first" / "metrics.json", change)
+    table = page(root).split("<h3>medium")[1].split("</table>")[0]
+    (row,) = re.findall(r"<tr><td><b>first</b>.*?</tr>", table)
+    assert row.count("<td>&ndash;</td>") == 2
+    assert not re.search(r"\b(nan|inf)\b", row)
+
+
+def test_runs_with_other_columns_share_a_table(root):
+    """A run that counts other limits or axes leaves cells empty; it neither shifts nor breaks the table."""
+
+    def change(table: dict[str, Any]) -> None:
+        one = table["groups"]["medium"]["second"]
+        one["within"], one["axes"] = one["within"][1:] * 4, []
+
+    rewrite(root / "runs" / "second" / "metrics.json", change)
+    table = page(root).split("<h3>medium")[1].split("</table>")[0]
+    (row,) = re.findall(r"<tr><td><b>second</b>.*?</tr>", table)
+    assert row.count("<td>") == table.count("<th>")
+    assert row.count("<td>&ndash;</td>") == 2
+
+
+def test_no_text_of_metrics_becomes_markup(root):
+    """Names of methods, groups, kinds and notes with tags in them are shown as they are."""
+
+    def change(table: dict[str, Any]) -> None:
+        table["groups"][ALERT] = table["groups"].pop("medium")
+        table["facts"]["roles"][ALERT] = ALERT
+        table["groups"]["low"][ALERT] = table["groups"]["low"]["first"]
+        table["groups"]["low"]["first"]["axes"][2]["axis"] = ALERT
+        table["facts"]["runs"]["first"]["kind"] = ALERT
+        table["facts"]["notes"] = [ALERT]
+        table["units"] = ALERT
+        for row in table["paper"]["table_1"]:
+            row.update(network=ALERT, sequence=ALERT)
+
+    rewrite(root / "runs" / "first" / "metrics.json", change)
+    shown = page(root)
+    assert "<script" not in shown
+    assert shown.count("&lt;script&gt;") >= 7
+
+
+def test_figures_that_are_none_of_ours_are_left_out(root):
+    """Links, other files and far too large ones are counted, not shown."""
+    folder = root / "runs" / "first" / "figures"
+    before = len(IMAGE.findall(page(root)))
+    (root / "secret.svg").write_text('<svg viewBox="0 0 9 9"></svg>')
+    (folder / "link.svg").symlink_to(root / "secret.svg")
+    (folder / "page.svg").write_text("<html><svg viewBox='0 0 9 9'>")
+    (folder / "large.svg").write_bytes(b'<svg viewBox="0 0 9 9">' + b" " * 3_000_001)
+    shown = page(root)
+    assert "3 figures are left out: too large, or no figures." in shown
+    assert len(IMAGE.findall(shown)) == before
+
+
+def test_status_lists_runs(root):
+    """`spn-data status` tells which networks there are and which are not evaluated yet."""
+    area = root
+    (area / ".1-frames.partial").mkdir()
+    (area / "runs" / "second" / "metrics.json").unlink()
+    (area / "runs" / "begun").mkdir()
+    shutil.rmtree(area / "5-split")
+    env = {"COLUMNS": "200"}
+    shown = CliRunner().invoke(data_main, ["status", "--area", str(area)], env=env).output
+    lines = {line.split()[0]: line for line in shown.splitlines() if "runs/" in line}
+    assert "complete" in lines["runs/first"]
+    assert "evaluated" in lines["runs/first"]
+    assert "not evaluated: spn-model evaluate --run second" in lines["runs/second"]
+    assert "unfinished" in lines["runs/begun"]
+    assert "side by side" in lines["runs/compared"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: chromium)")
+def test_a_hostile_figure_runs_nothing_in_a_browser(root, tmp_path):
+    """Scripts, handlers and links of an SVG do nothing as an image: it is drawn, and the console is empty."""
+    figures = root / "runs" / "compared" / "figures"
+    shutil.rmtree(figures)
+    figures.mkdir()
+    (figures / "low-trajectories.svg").write_text(HOSTILE_SVG)
+    runs, broken = read_runs(Area(root))
+    seen = visit(
+        tmp_path,
+        render(replace(made_up_area(), runs=runs, broken_runs=broken)),
+        """
+        const images = [...document.querySelectorAll("#networks img")];
+        found.title = document.title;
+        found.shown = images.filter(image => image.complete && image.naturalWidth > 0).length;
+        found.all = images.length;
+        found.inside = images.every(image => image.src.startsWith("data:"));
+        found.first = atob(images[0].src.split(",")[1]).includes("hacked");
+        found.wide = document.documentElement.scrollWidth <= window.innerWidth;
+        """,
+        when_loaded=True,
+    )
+    assert seen.found["first"]
+    assert seen.console == []
+    assert seen.found["title"] == "north"
+    assert seen.found["inside"]
+    assert seen.found["wide"]
+    assert seen.found["shown"] == seen.found["all"] > 10

@@ -1,0 +1,474 @@
+"""Pose regressors behind the seam: what they are shown is true, what is frozen stays, and they learn it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.errors import InputError
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_model.evaluation.calibration import calibrate
+from spn_model.evaluation.dropout import dropout_estimates
+from spn_model.examples.training_set import TrainingSet
+from spn_model.models.registry import make
+from spn_model.models.regression import RegressionMember
+from spn_model.models.regression_examples import example
+from spn_model.networks.normalization import InsertedBatchNorm
+from spn_model.networks.pose_loss import beta_weighted, residuals
+from tests.worlds.box_world import CAMERA, seen_by, write_box
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STILL = {"augmentation": False, "dropout": False}
+LEARNED = {**STILL, "loss": "learned"}
+CACHED = {"freeze_trunk": True, "cached_features": 1, "dropout": False}
+NARROW = 64
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_box(tmp_path_factory.mktemp("hall") / "dataset.h5", train=16)
+
+
+@pytest.fixture(scope="module")
+def data(hall: Path) -> TrainingSet:
+    with Dataset(hall) as dataset:
+        return TrainingSet(dataset.groups["train"])
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory: pytest.TempPathFactory) -> TrainingSet:
+    path = write_box(tmp_path_factory.mktemp("four") / "dataset.h5", train=4)
+    with Dataset(path) as dataset:
+        return TrainingSet(dataset.groups["train"])
+
+
+def made(
+    network: str = "squeezeposenet", width: int = NARROW, **options: object
+) -> RegressionMember:
+    """With published weights where they come with the package, else weights drawn by the seed."""
+    values = {"network": network, "width": width, "network_options": options}
+    member = make("regression", values, seed=0)
+    assert isinstance(member, RegressionMember)
+    if network == "squeezeposenet":
+        member.load_pretrained(member.weights_name)
+    return member
+
+
+def begun(data: TrainingSet, stage: dict[str, object], **options: object) -> RegressionMember:
+    member = made(**options)
+    member.fit(data)
+    member.begin_stage(stage, data)
+    return member
+
+
+def train(member: RegressionMember, data: TrainingSet, steps: int, rate: float) -> list[float]:
+    """Steps on all images at once; the rate rises for 20 steps, and falls along a cosine. The losses."""
+    groups = [{**group, "lr": rate * group["rate"]} for group in member.parameter_groups()]
+    optimizer = torch.optim.AdamW(groups, weight_decay=0, fused=True)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda k: min(1, (k + 1) / 20) * (1 + np.cos(np.pi * k / steps)) / 2
+    )
+    generator, rows = np.random.default_rng(0), np.arange(len(data))
+    member.network.train()
+    losses = []
+    for step in range(steps):
+        loss, _ = member.loss(member.batch(data, rows, generator, step / steps))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        losses.append(loss.item())
+    member.network.eval()
+    return losses
+
+
+def all_images(data: TrainingSet) -> np.ndarray:
+    return np.stack([data.image(row) for row in range(len(data))])
+
+
+def worst(member: RegressionMember, data: TrainingSet) -> tuple[float, float]:
+    """Largest errors on the training images, in metres and degrees."""
+    found = member.estimate(all_images(data), data.intrinsics)
+    error_m, error_deg = pose_errors(found.poses, data.poses)
+    return float(error_m.max()), float(error_deg.max())
+
+
+def trunk_state(member: RegressionMember) -> dict[str, torch.Tensor]:
+    state = member.network.regressor.features.state_dict()
+    return {name: tensor.clone() for name, tensor in state.items()}
+
+
+def changed(member: RegressionMember, before: dict[str, torch.Tensor]) -> set[str]:
+    now = trunk_state(member)
+    return {name for name, tensor in before.items() if not torch.equal(tensor, now[name])}
+
+
+def test_it_learns_sixteen_images(data):
+    """Augmentation and dropout off, learned weights: every one of 16 images to 0.1 m and 1 degree."""
+    member = begun(data, LEARNED)
+    start_m, start_deg = worst(member, data)
+    assert start_m > 4
+    assert start_deg > 15
+    train(member, data, 140, 5e-4)
+    error_m, error_deg = worst(member, data)
+    assert error_m < 0.1
+    assert error_deg < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stage", "steps", "rate"),
+    [({"beta": 500.0}, 350, 5e-4), ({"loss": "reprojection"}, 500, 5e-4)],
+)
+def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
+    """The paper's loss with its beta, and the reprojection error alone."""
+    member = begun(data, {**STILL, **stage})
+    train(member, data, steps, rate)
+    error_m, error_deg = worst(member, data)
+    assert error_m < 0.1
+    assert error_deg < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("network", "stages"),
+    [
+        ("posenet", [(LEARNED, 80, 1e-3)]),
+        ("vgg16", [({**LEARNED, **CACHED}, 300, 1e-3), (LEARNED, 15, 3e-6)]),
+    ],
+)
+def test_large_networks_learn_four_images(four, network, stages):
+    """From weights drawn at random: every one of 4 images to 0.5 m and 3 degrees."""
+    member = made(network, width=64)
+    member.fit(four)
+    for stage, steps, rate in stages:
+        member.begin_stage(stage, four)
+        train(member, four, steps, rate)
+    error_m, error_deg = worst(member, four)
+    assert error_m < 0.5
+    assert error_deg < 3
+
+
+def test_it_starts_at_the_mean_pose(data):
+    """Before training every image has the mean of the training centres, and about their mean orientation."""
+    found = begun(data, {}).estimate(all_images(data), data.intrinsics)
+    assert found.poses.centers == pytest.approx(
+        np.tile(data.poses.centers.mean(axis=0), (16, 1)), abs=1e-5
+    )
+    assert pose_errors(found.poses, data.poses)[1].max() < 45
+    # As unsure as the training poses are spread, and by one radian.
+    spread = ((data.poses.centers - data.poses.centers.mean(axis=0)) ** 2).sum(axis=1).mean()
+    assert np.diag(found.covariance[0]) == pytest.approx([spread] * 3 + [1] * 3, rel=1e-4)
+
+
+def test_fitting_keeps_the_pretrained_features(data):
+    """Features are the same before and after the normalisations are measured: they start as the identity."""
+    member = made()
+    images = member.normalised(torch.from_numpy(all_images(data)[:, ::2, ::2].copy()))
+    with torch.no_grad():
+        layers = [m for m in member.network.modules() if isinstance(m, InsertedBatchNorm)]
+        hooks = [layer.register_forward_hook(lambda layer, x, y: x[0]) for layer in layers]
+        without = member.network.regressor.trunk(images)[0]
+        for hook in hooks:
+            hook.remove()
+        member.fit(data)
+        after = member.network.regressor.trunk(images)[0]
+    assert len(layers) == 25
+    assert torch.allclose(without, after, rtol=1e-4, atol=1e-4)
+    # A fresh normalisation in eval mode would be the identity too, but not what its statistics call for.
+    for layer in layers:
+        assert layer.running_mean.abs().max() > 0.1
+        assert torch.equal(layer.bias, layer.running_mean)
+
+
+def test_another_data_set_moves_the_targets_alone(data, four):
+    """A network that was fitted before keeps its normalisations and heads, and aims about the new centre."""
+    member = begun(data, LEARNED)
+    train(member, data, 2, 1e-3)
+    state = {k: v.clone() for k, v in member.network.state_dict().items()}
+    member.fit(four)
+    now = member.network.state_dict()
+    moved = {name for name, tensor in state.items() if not torch.equal(tensor, now[name])}
+    assert moved == {"targets.center", "targets.scale", "targets.hemisphere"}
+
+
+@pytest.mark.parametrize("batch_statistics", [False, True])
+def test_a_frozen_trunk_stays_as_it_is(data, batch_statistics):
+    """Not a weight and not a statistic of it moves, while the added layers learn."""
+    stage = {**STILL, "freeze_trunk": True, "batch_statistics": batch_statistics}
+    member = begun(data, stage)
+    before = trunk_state(member)
+    head = member.network.regressor.x.weight.clone()
+    losses = train(member, data, 10, 1e-4)
+    assert changed(member, before) == set()
+    assert not torch.equal(head, member.network.regressor.x.weight)
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("batch_statistics", [False, True])
+def test_stored_statistics_move_only_where_that_is_chosen(data, batch_statistics):
+    """Training all layers changes every weight; running statistics only with batch_statistics."""
+    member = begun(data, {**STILL, "batch_statistics": batch_statistics})
+    before = trunk_state(member)
+    train(member, data, 2, 1e-2)
+    moved = changed(member, before)
+    assert {name for name in before if name.endswith(("weight", "bias"))} <= moved
+    assert any("running" in name for name in moved) == batch_statistics
+
+
+def test_dropout_can_be_off(data):
+    """Off, the same batch has the same loss; on, it has not."""
+    for dropout in (False, True):
+        member = begun(data, {"augmentation": False, "dropout": dropout})
+        nn.init.normal_(member.network.regressor.x.weight)
+        member.network.train()
+        batch = member.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
+        first, second = (member.loss(batch)[0].item() for _ in range(2))
+        assert (first == second) == (not dropout)
+
+
+@pytest.mark.parametrize("width", [0, 160])
+def test_a_turned_camera_sees_what_its_label_says(data, width):
+    """Rendered at its pose, an example looks as it does, wherever the real camera saw the place."""
+    member = begun(data, {"look": False, "tilt_deg": 15.0, "roll_deg": 20.0}, width=width)
+    rows = np.array([2, 7])
+    batch = member.batch(data, rows, np.random.default_rng(1), 0.5)
+    poses = member.network.targets.decode(batch["x"].numpy(), batch["q"].numpy())
+    assert pose_errors(poses, data.poses[rows])[1].min() > 5
+    assert poses.centers == pytest.approx(data.poses.centers[rows], abs=1e-5)
+    for k in range(2):
+        rendered, _ = seen_by(poses[k : k + 1])
+        image = batch["images"][k].numpy()
+        if width:
+            rendered = cv2.resize(rendered, (160, 90), interpolation=cv2.INTER_AREA)
+        inside = cv2.erode((image.sum(axis=2) > 0).astype(np.uint8), np.ones((5, 5))) > 0
+        assert inside.mean() > 0.4
+        away = np.abs(image.astype(int) - rendered)[inside]
+        assert np.median(away) <= 2
+        assert away.mean() < (5 if width else 3)  # warping small images blurs them
+
+
+def test_a_batch_is_a_function_of_its_arguments(data):
+    """The same draws give the same batch, others another; the reprojection error is 0 at the true poses."""
+    member = begun(data, {"loss": "reprojection", "points": 50})
+    rows = np.array([3, 3, 8])
+    one, same, other = (
+        member.batch(data, rows, np.random.default_rng(seed), 0.0) for seed in (5, 5, 6)
+    )
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not torch.equal(one["images"], other["images"])
+    assert not torch.equal(one["images"][0], one["images"][1])
+    assert one["images"].shape == (3, 36, NARROW, 3)
+    assert one["points"].shape == (3, 50, 3)
+    assert one["seen"].sum(dim=1).min() > 20
+    # Every point lies inside the turned image, by the data set's own K.
+    poses = member.network.targets.decode(one["x"].numpy(), one["q"].numpy())
+    for k in range(3):
+        xyz = (
+            one["points"][k].numpy()[one["seen"][k].numpy()] + member.network.targets.center.numpy()
+        )
+        pixels = CAMERA.project((xyz - poses.centers[k]) @ poses.rotations[k].T)
+        assert ((pixels > -0.01) & (pixels < [320.01, 180.01])).all()
+
+
+@pytest.mark.parametrize("network", ["squeezeposenet", "posenet"])
+def test_stored_features_are_those_of_their_images(data, network):
+    """Features of the cache are what the trunk makes of the variant, with its own label."""
+    member = begun(data, CACHED, network=network)
+    rows = np.array([4, 0, 11])
+    batch = member.batch(data, rows, np.random.default_rng(0), 0.0)
+    varied = [
+        example(data, int(row), NARROW, member._stage, np.random.default_rng((int(row), 0)))
+        for row in rows
+    ]
+    member.network.train()
+    with torch.no_grad():
+        images = torch.from_numpy(np.stack([image for image, _ in varied]))
+        features = member.network.regressor.trunk(member.normalised(images))
+    assert len(features) == (3 if network == "posenet" else 1)
+    for k, part in enumerate(features):
+        assert torch.allclose(batch[f"features{k}"], part, rtol=1e-3, atol=1e-3)
+    x, q = member.network.targets.encode(Poses.concatenate(pose for _, pose in varied))
+    assert (batch["x"].numpy() == x).all()
+    assert (batch["q"].numpy() == q).all()
+    assert "images" not in batch
+
+
+def test_variants_of_stored_features_differ(data):
+    """With 3 variants of each image, draws of one row find 3 different labels, each with its features."""
+    member = begun(data, {**CACHED, "cached_features": 3})
+    batch = member.batch(data, np.full(40, 5), np.random.default_rng(0), 0.0)
+    labels = {tuple(q) for q in batch["q"].tolist()}
+    both = {(*q, *f) for q, f in zip(batch["q"].tolist(), batch["features0"].tolist(), strict=True)}
+    assert len(labels) == len(both) == 3
+
+
+def test_positions_count_in_metres(data):
+    """The paper's loss of a batch is that of the estimates in metres, however large the inner unit is."""
+    member = begun(data, STILL)
+    with torch.no_grad():
+        member.network.regressor.x.bias.copy_(torch.tensor([0.5, -1.0, 0.25]))
+    batch = member.batch(data, np.arange(16), np.random.default_rng(0), 0.0)
+    loss, figures = member.loss(batch)
+    found = member.estimate(all_images(data), data.intrinsics)
+    apart = np.linalg.norm(found.poses.centers - data.poses.centers, axis=1)
+    q = member.network.regressor.q.bias.detach()
+    expected = apart.mean() + 500 * np.linalg.norm(batch["q"].numpy() - q.numpy(), axis=1).mean()
+    assert (loss - figures["likelihood"]).item() == pytest.approx(expected, rel=1e-5)
+    assert apart.min() > 1
+
+
+def test_stating_uncertainty_changes_no_pose(data):
+    """Gradients of all layers but `uncertainty` are those of the paper's loss alone."""
+    member = begun(data, STILL)
+    network = member.network
+    nn.init.normal_(network.regressor.x.weight, std=0.01)
+    nn.init.normal_(network.uncertainty.weight, std=0.01)
+    batch = member.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
+    member.loss(batch)[0].backward()
+    assert network.uncertainty.weight.grad.abs().max() > 0
+    found = {n: p.grad.clone() for n, p in network.regressor.named_parameters()}
+    network.zero_grad()
+    x, q = network.outputs(network.regressor.trunk(member.normalised(batch["images"]))).estimates[0]
+    beta_weighted(x, q, batch["x"], batch["q"], 500.0).mean().backward()
+    for name, parameter in network.regressor.named_parameters():
+        assert torch.allclose(found[name], parameter.grad, rtol=1e-4, atol=1e-5), name
+
+
+def test_stated_covariances_become_those_of_the_errors(data):
+    """Poses held, `uncertainty` alone learns: squared distances of the errors become those they should be."""
+    member = begun(data, {**CACHED, "cached_features": 4})
+    for group in member.parameter_groups():
+        if group["name"] != "uncertainty":
+            for parameter in group["params"]:
+                parameter.requires_grad_(False)
+    train(member, data, 150, 2e-2)
+    found = member.estimate(all_images(data), data.intrinsics)
+    errors = residuals(
+        *(
+            torch.from_numpy(a)
+            for poses in (found.poses, data.poses)
+            for a in (poses.centers, poses.quats_wxyz)
+        )
+    ).numpy()
+    ratio = calibrate(errors, found.covariance).ratio
+    assert 0.2 < ratio < 3
+    member.set_covariance_scale(4.0)
+    member.set_covariance_scale(0.5)
+    again = member.estimate(all_images(data), data.intrinsics)
+    assert again.covariance == pytest.approx(2 * found.covariance, rel=1e-4)
+    assert (again.poses.centers == found.poses.centers).all()
+
+
+def test_its_state_is_the_whole_member(data):
+    """Made anew from its options and given its state, it estimates the same, one image or many at a time."""
+    member = begun(data, LEARNED)
+    train(member, data, 3, 1e-3)
+    member.set_covariance_scale(3.0)
+    anew = make("regression", member.options, seed=9)
+    anew.network.load_state_dict(member.network.state_dict())
+    found = member.estimate(all_images(data), data.intrinsics)
+    for row in (0, 9):
+        one = anew.estimate(data.image(row)[None], data.intrinsics[row : row + 1])
+        assert one.poses.centers[0] == pytest.approx(found.poses.centers[row], abs=1e-4)
+        assert one.poses.quats_wxyz[0] == pytest.approx(found.poses.quats_wxyz[row], abs=1e-5)
+        assert one.covariance[0] == pytest.approx(found.covariance[row], rel=1e-3)
+    none = anew.estimate(np.zeros((0, 180, 320, 3), np.uint8), np.zeros((0, 3, 3)))
+    assert len(none.poses) == 0
+
+
+def test_an_answer_that_is_no_pose_is_said_to_be_none(data):
+    """NaN and a reason, not a pose."""
+    member = begun(data, STILL)
+    with torch.no_grad():
+        member.network.regressor.x.bias[1] = torch.nan
+    found = member.estimate(all_images(data)[:2], data.intrinsics[:2])
+    assert np.isnan(found.poses.centers).all()
+    assert np.isnan(found.covariance).all()
+    assert found.reasons.tolist() == ["the network's answer is no pose"] * 2
+
+
+def test_dropout_tells_a_covariance_too(data):
+    """Kendall and Cipolla's sampling gives a full covariance, and a mean near the estimate."""
+    member = begun(data, LEARNED)
+    train(member, data, 20, 1e-3)
+    images, matrices = all_images(data)[:2], data.intrinsics[:2]
+    plain = member.estimate(images, matrices)
+    sampled = dropout_estimates(member, images, matrices, 12)
+    assert (np.linalg.eigvalsh(sampled.covariance) > 0).all()
+    spread = np.sqrt(np.einsum("nii->n", sampled.covariance[:, :3, :3]))
+    apart = pose_errors(sampled.poses, plain.poses)[0]
+    assert (apart < 2 * spread).all()
+    assert not any(module.training for module in member.network.modules())
+
+
+@pytest.mark.parametrize(
+    ("stage", "said"),
+    [
+        ({"rate": 1.0}, "'rate' is not known"),
+        ({"loss": "huber"}, "one of beta, learned, reprojection"),
+        ({"beta": -1}, "beta is -1.0"),
+        ({"tilt_deg": 80}, "tilt_deg is 80.0"),
+        ({"freeze_trunk": 1}, "needs a bool"),
+        ({"cached_features": 4}, "needs freeze_trunk"),
+        ({**CACHED, "cached_features": 4, "augmentation": False}, "without augmentation"),
+        ({**CACHED, "cached_features": 10_000}, "allowed"),
+    ],
+)
+def test_wrong_stages_are_refused(data, stage, said):
+    """Names, values and combinations of a recipe's stage that cannot be, with what is wrong."""
+    member = made("posenet", width=64)
+    member.fit(data)
+    with pytest.raises(InputError, match=said):
+        member.begin_stage(stage, data)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"network": "alexnet"}, "there is no network 'alexnet'"),
+        ({"width": 12}, "width is 12"),
+        ({"height": 100}, "'height' is not known"),
+        ({"network_options": {"slope": 2.0}}, "slope"),
+        ({"network_options": 3}, "needs a table"),
+    ],
+)
+def test_wrong_networks_are_refused(options, said):
+    """The same of what makes a network."""
+    with pytest.raises(InputError, match=said):
+        make("regression", options)
+
+
+def test_what_cannot_be_trained_on_is_refused(tmp_path, data):
+    """No points for the reprojection error, images of an unknown camera, images that are too small."""
+    with Dataset(write_box(tmp_path / "dataset.h5", train=2, points=0)) as dataset:
+        bare = TrainingSet(dataset.groups["train"])
+    bare.has_points = False
+    member = made()
+    member.fit(bare)
+    with pytest.raises(InputError, match="needs map points"):
+        member.begin_stage({"loss": "reprojection"}, bare)
+    bare.intrinsics = np.full((2, 3, 3), np.nan)
+    with pytest.raises(InputError, match="set tilt_deg and roll_deg to 0"):
+        member.begin_stage({}, bare)
+    member.begin_stage({"tilt_deg": 0, "roll_deg": 0}, bare)
+    with pytest.raises(
+        InputError, match="images of 30 x 17 are too small: squeezeposenet needs 21"
+    ):
+        made(width=30).fit(data)
+
+
+def test_input_is_sized_alike_in_training_and_estimates(data):
+    """A width gives images in proportion, smaller or larger; 0 leaves them as they are."""
+    for width, size in ((60, (34, 60)), (0, (180, 320)), (400, (225, 400))):
+        member = made(width=width)
+        member.begin_stage(STILL, data)
+        batch = member.batch(data, np.array([1]), np.random.default_rng(0), 0.0)
+        assert batch["images"].shape[1:3] == size

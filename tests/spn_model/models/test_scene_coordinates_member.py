@@ -1,0 +1,368 @@
+"""The scene-coordinate member: what it is shown is true, it learns it, and says when it sees nothing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.errors import GeometryError, InputError
+from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
+from spn_model.examples.training_set import TrainingSet
+from spn_model.models.member import PoseEstimates
+from spn_model.models.scene_coordinates import SceneCoordinatesMember
+from spn_model.models.scene_examples import StageOptions
+from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX
+from spn_model.onboard.decoding import decode
+from spn_model.training.covariance_scale import measured_scale
+from spn_model.training.precision import bfloat16_is_fast
+from tests.worlds.box_world import CAMERA, seen_by, write_box
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STILL = {
+    "tilt_deg": 0,
+    "roll_deg": 0,
+    "zoom_min": 1,
+    "zoom_max": 1,
+    "size_min": 1,
+    "size_max": 1,
+    "ramp_share": 0,
+    "look": False,
+}
+VIEWS = {"views_share": 0.5, "views_rise": 0.3}
+# No higher than the hall.
+HIGH = {"views_share": 1.0, "views_rise": 0.3, "views_height": 0.3}
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_box(tmp_path_factory.mktemp("hall") / "dataset.h5", train=16)
+
+
+@pytest.fixture(scope="module")
+def data(hall: Path) -> TrainingSet:
+    with Dataset(hall) as dataset:
+        return TrainingSet(dataset.groups["train"])
+
+
+def fitted(
+    data: TrainingSet, stage: dict[str, object], *, shrink: int = 1
+) -> SceneCoordinatesMember:
+    member = SceneCoordinatesMember.make({"shrink": shrink}, seed=0)
+    member.load_pretrained(member.weights_name)
+    member.fit(data)
+    member.begin_stage(stage, data)
+    return member
+
+
+def test_a_batch_depends_on_its_arguments_alone(data):
+    """The same rows, generator and progress give the same tensors, whatever batches came before."""
+    first, second = fitted(data, VIEWS), fitted(data, VIEWS)
+    for k in range(4):
+        second.batch(data, np.arange(4), np.random.default_rng(100 + k), 0.9)
+    rows = np.array([3, 1, 4, 1, 5])
+    a, b = (m.batch(data, rows, np.random.default_rng(7), 0.6) for m in (first, second))
+    assert all(torch.equal(a[name], b[name]) for name in ("images", "targets", "known"))
+    other = first.batch(data, rows, np.random.default_rng(8), 0.6)
+    assert other["images"].shape != a["images"].shape or not torch.equal(
+        other["images"], a["images"]
+    )
+
+
+def test_images_follow_the_zoom(data):
+    """Turns and zooms grow at a stage's beginning; small images are more of them, at most twice as many."""
+    rows = np.arange(6)
+    small = fitted(data, STILL | {"size_min": 0.5, "size_max": 0.5})
+    batch = small.batch(data, rows, np.random.default_rng(0), 0.5)
+    assert batch["images"].shape == (12, 90, 160, 3)
+    full = fitted(data, STILL).batch(data, rows, np.random.default_rng(0), 0.1)
+    assert full["images"].shape == (6, 180, 320, 3)
+    assert np.array_equal(full["images"][2], data.image(2))
+    free = {"zoom_min": 0.5, "zoom_max": 2.0, "size_min": 0.1, "size_max": 9.0, "ramp_share": 0.5}
+    zooming = fitted(data, free)
+    widths = {
+        progress: [
+            zooming.batch(data, rows[:1], np.random.default_rng(k), progress)["images"].shape[2]
+            for k in range(12)
+        ]
+        for progress in (0.0, 0.9)
+    }
+    assert np.ptp(np.log(widths[0.0])) < 0.5 * np.ptp(np.log(widths[0.9]))
+
+
+@pytest.mark.parametrize(
+    ("stage", "known_share", "shrink"),
+    [
+        ({}, 0.25, 1),
+        (HIGH, 0.2, 1),
+        (HIGH, 0.2, 2),
+        ({"views_share": 1.0, "views_rise": 0.3, "views_fused": False}, 0.2, 1),
+        ({"views_share": 1.0, "views_rise": 0.3, "views_fused": False}, 0.2, 2),
+        ({"surfaces": False}, 0.15, 1),
+    ],
+    ids=["surfaces", "views", "reduced views", "moved images", "reduced moved images", "points"],
+)
+def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
+    """A pose made of the targets alone is that of a camera that would take this very image.
+
+    For turned and zoomed images its centre is the training camera's: 2 cm in a hall of 20 m. What lies at
+    the image's edges, where the training image ends, is left out of the comparison.
+    """
+    zoom = 0.8
+    member = fitted(
+        data,
+        {"zoom_min": zoom, "zoom_max": zoom, "ramp_share": 0, "look": False} | stage,
+        shrink=shrink,
+    )
+    zoom /= shrink
+    rows = np.arange(6)
+    batch = member.batch(data, rows, np.random.default_rng(0), 0.5)
+    height, width = batch["images"].shape[1:3]
+    lens = Camera("SIMPLE_PINHOLE", width, height, np.array([230.0 * zoom, width / 2, height / 2]))
+    moved = []
+    for row, image, targets, known in zip(
+        rows,
+        batch["images"].numpy(),
+        batch["targets"].numpy(),
+        batch["known"].numpy(),
+        strict=False,
+    ):
+        assert known.mean() > known_share
+        log_scale = np.where(known, -5.0, 5.0).astype(np.float32)
+        coordinates = np.where(known, targets, np.float32(np.nan))
+        found = decode(
+            coordinates, log_scale, lens.matrix, first_px=FIRST_CELL_PX, stride_px=STRIDE_PX
+        )
+        expected, _ = seen_by(found.poses, lens)
+        off = np.abs(image.astype(float) - expected).max(axis=2)
+        rows_of, columns_of = (np.argwhere(known).T * 8 + 7)[:, :]
+        if stage.get("surfaces", True):  # points lie up to half a cell beside its middle
+            assert np.median(off[rows_of, columns_of]) < 12
+        moved.append(np.linalg.norm(found.poses.centers[0] - data.poses.centers[row]))
+    if stage.get("views_share"):
+        assert np.median(moved) > 0.3
+    else:
+        assert np.median(moved) < (0.02 if stage.get("surfaces", True) else 0.2)
+
+
+def test_far_points_are_no_targets(data):
+    """A point at the end of the world has no cell, one of the hall keeps its own."""
+    member = fitted(data, STILL)
+    everywhere = member.batch(data, np.arange(6), np.random.default_rng(0), 0.5)["known"]
+    member.network.spread.mul_(0.25)
+    member.begin_stage(STILL, data)
+    near = member.batch(data, np.arange(6), np.random.default_rng(0), 0.5)
+    assert 0 < near["known"].sum() < 0.9 * everywhere.sum()
+    off = (near["targets"] - member.network.center[:, None, None]).norm(dim=1)[near["known"]]
+    assert float(off.max()) < 4 * float(member.network.spread)
+
+
+def test_a_batch_without_targets_teaches_nothing(data):
+    """Its loss is 0 and so are all gradients, rather than not a number."""
+    member = fitted(data, STILL)
+    batch = member.batch(data, np.arange(2), np.random.default_rng(0), 0.5)
+    loss, figures = member.loss(batch | {"known": torch.zeros_like(batch["known"])})
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert figures == {}
+    assert all(float(p.grad.abs().max()) == 0 for p in member.parameter_groups()[0]["params"])
+
+
+def test_frozen_layers_are_in_no_group(data):
+    """SqueezeNet's first layers stay as published, its others learn at their own rate."""
+    member = fitted(data, {"freeze_layers": 13})
+    assert [group["name"] for group in member.parameter_groups()] == ["added"]
+    member.begin_stage({"freeze_layers": 5, "features_rate": 0.1}, data)
+    groups = {group["name"]: group for group in member.parameter_groups()}
+    assert groups["pretrained"]["rate"] == 0.1
+    assert len(groups["pretrained"]["params"]) == 36
+    assert len(groups["added"]["params"]) == 24
+
+
+def test_published_weights_are_loaded(data):
+    """Shipped features replace what the seed drew; the head stays as drawn, and differs by seed."""
+    member, other = (SceneCoordinatesMember.make({}, seed) for seed in (0, 1))
+    head, features = member.network.fine.weight.clone(), member.network.features[0].weight.clone()
+    member.load_pretrained("squeezenet1_1-features")
+    assert not torch.equal(member.network.features[0].weight, features)
+    assert torch.equal(member.network.fine.weight, head)
+    assert not torch.equal(other.network.fine.weight, head)
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ({"tilt": 3}, "'tilt' is not known"),
+        ({"tilt_deg": "3"}, "tilt_deg is '3', needs a float"),
+        ({"look": 1}, "look is 1, needs a bool"),
+        ({"zoom_min": 2.0, "zoom_max": 1.0}, "zoom_max is 1.0, needs to lie from 2.0 to 10"),
+        ({"freeze_layers": 14}, "freeze_layers is 14"),
+        ({"tilt_deg": float("nan")}, "needs a finite number"),
+        ({"views_share": 0.5, "surfaces": False}, "needs surfaces"),
+    ],
+)
+def test_stages_that_make_no_sense_are_refused(data, stage, message):
+    """An option that is not known, of another type or out of bounds is told by name."""
+    with pytest.raises(InputError, match=message):
+        SceneCoordinatesMember.make({}).begin_stage(stage, data)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
+    """Where each cell shows what the image shows at its stated pixel, the pose is exact."""
+    member = fitted(data, STILL, shrink=shrink)
+    images = torch.zeros(1, 3, 180, 320)
+    rows, columns = member.network(images)[1].shape[2:]
+    first, stride = member.network.first_cell_px, member.network.stride_px
+    # An image of its own pixels' places: cell 0 lies on pixel 7 of the reduced one, cell 1 on pixel 15.
+    places = (torch.arange(320) + 0.5).expand(1, 3, 180, 320)
+    seen = member.network.reduced(places)[0, 0, 0]
+    assert [float(seen[7]), float(seen[15])] == [first, first + stride]
+    # A camera of which each pixel is a cell.
+    near = Camera(
+        "PINHOLE",
+        columns,
+        rows,
+        np.array([230, 230, 160 - first + stride / 2, 90 - first + stride / 2]) / stride,
+    )
+    _, shown = seen_by(data.poses[:1], near)
+    found = member.decode(
+        shown.transpose(2, 0, 1).astype(np.float32), np.full((rows, columns), -5.0), CAMERA.matrix
+    )
+    error_m, error_deg = pose_errors(found.poses, data.poses[:1])
+    assert error_m < 1e-3
+    assert error_deg < 1e-2
+
+
+def test_images_that_are_too_small_once_reduced_are_refused(data):
+    """The message tells the size, and what to do."""
+    member = fitted(data, STILL, shrink=2)
+    with pytest.raises(InputError, match=r"100 x 180, reduced by 2, .* or shrink = 1"):
+        member.estimate(np.zeros((1, 180, 100, 3), np.uint8), CAMERA.matrix[None])
+
+
+def test_the_page_tells_all_options_and_their_defaults():
+    """docs/scene-coordinates.md has each option of a stage, with its default."""
+    page = (Path(__file__).parents[3] / "docs" / "scene-coordinates.md").read_text()
+    told = {}
+    for line in page.splitlines():
+        cells = [re.findall("`([^`]*)`", cell) for cell in line.split("|")]
+        if len(cells) == 5 and cells[1]:
+            told |= dict(zip(cells[1], cells[2], strict=True))
+    defaults = {f.name: f.default for f in fields(StageOptions)}
+    assert told.keys() == defaults.keys()
+    for name, default in defaults.items():
+        expected = str(default).lower() if isinstance(default, bool) else f"{default:g}"
+        assert told[name].removesuffix(".0") == expected, name
+
+
+def test_options_of_decoding_make_the_member():
+    """What `options` gives makes the member anew; an unknown one is refused."""
+    member = SceneCoordinatesMember.make({"cells": 300, "shrink": 1})
+    assert SceneCoordinatesMember.make(member.options).network.shrink == 1
+    assert SceneCoordinatesMember.make(member.options).decoding == member.decoding
+    assert member.decoding.cells == 300
+    with pytest.raises(InputError, match="'cell' is not known"):
+        SceneCoordinatesMember.make({"cell": 300})
+
+
+def test_images_without_points_cannot_be_learnt_from(tmp_path):
+    """Too few map points are told, with what to do."""
+    with Dataset(write_box(tmp_path / "few.h5", train=2, points=20)) as dataset:
+        few = TrainingSet(dataset.groups["train"])
+    with pytest.raises(InputError, match=r"see 40 map points.*train another network"):
+        SceneCoordinatesMember.make({}).fit(few)
+
+
+def test_an_image_of_nothing_has_no_pose(data):
+    """Neither a grey image nor an unknown camera makes a pose: NaN, each with its reason."""
+    member = fitted(data, STILL)
+    grey = np.full((2, 180, 320, 3), 128, np.uint8)
+    intrinsics = np.stack([CAMERA.matrix, np.full((3, 3), np.nan)])
+    found = member.estimate(grey, intrinsics)
+    assert np.isnan(found.poses.centers).all()
+    assert np.isnan(found.covariance).all()
+    assert "0 cells are sure of what they show" in found.reasons[0]
+    assert found.reasons[1] == "its camera is not known"
+
+
+def estimates(true: Poses, errors: np.ndarray, covariance: np.ndarray) -> PoseEstimates:
+    """Estimates that err by (N, 6) from the truth."""
+    turned = rotations_from_vectors(-errors[:, 3:]) @ true.rotations
+    poses = Poses.from_rotations(true.centers - errors[:, :3], turned)
+    return PoseEstimates(poses, covariance, np.full(len(errors), ""))
+
+
+def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
+    """Errors twice as large as stated give a factor of 4, whatever a few wrong poses do."""
+    rng = np.random.default_rng(0)
+    n = 400
+    true = Poses.from_rotations(rng.normal(size=(n, 3)), np.repeat(np.eye(3)[None], n, axis=0))
+    root = rng.normal(size=(n, 6, 6)) * [[0.1], [0.1], [0.1], [0.01], [0.01], [0.01]]
+    errors = 2 * np.einsum("nij,nj->ni", root, rng.normal(size=(n, 6)))
+    errors[:8, 0] = 1000
+    covariance = root @ root.swapaxes(1, 2)
+    found = estimates(true, errors, covariance)
+    found.poses.centers[9:20] = np.nan
+    assert measured_scale(found, true) == pytest.approx(4, rel=0.2)
+    few = PoseEstimates(found.poses[:19], covariance[:19], found.reasons[:19])
+    with pytest.raises(GeometryError, match="9 images"):
+        measured_scale(few, true[:19])
+
+
+def test_the_scale_of_covariances_is_part_of_the_state(data):
+    """Setting it twice multiplies; covariances of decoded poses grow by it; a state carries it along."""
+    member = fitted(data, STILL)
+    _, shown = seen_by(data.poses[:1])
+    coordinates = shown[7::8, 7::8].transpose(2, 0, 1).astype(np.float32)
+    coordinates += np.random.default_rng(0).normal(0, 0.05, coordinates.shape).astype(np.float32)
+    log_scale = np.full(coordinates.shape[1:], -3.0, np.float32)
+    before = member.decode(coordinates, log_scale, CAMERA.matrix)
+    member.set_covariance_scale(3.0)
+    member.set_covariance_scale(2.0)
+    other = SceneCoordinatesMember.make({"shrink": 1})
+    other.network.load_state_dict(member.network.state_dict())
+    after = other.decode(coordinates, log_scale, CAMERA.matrix)
+    assert other.covariance_scale == 6
+    assert after.covariance == pytest.approx(6 * before.covariance)
+    assert np.array_equal(after.poses.centers, before.poses.centers)
+
+
+def test_bfloat16_is_for_processors_that_have_it():
+    """A device of unknown kind computes in float32; the answer for this processor is a plain bool."""
+    assert bfloat16_is_fast("cpu") in (True, False)
+    assert not bfloat16_is_fast("abacus")
+
+
+@pytest.mark.slow
+def test_it_learns_sixteen_images_by_heart(data):
+    """Shown 16 images without augmentation it finds them to 0.1 m and 1 degree."""
+    member = fitted(data, STILL)
+    member.bfloat16 = bfloat16_is_fast("cpu")
+    groups = [{**group, "lr": 0.0} for group in member.parameter_groups()]
+    optimizer = torch.optim.AdamW(groups, weight_decay=0)
+    generator = np.random.default_rng(0)
+    steps = 250
+    for step in range(steps):
+        rate = 2e-3 * min(1, (step + 1) / 20) * (1 + np.cos(np.pi * step / steps)) / 2
+        for group in optimizer.param_groups:
+            group["lr"] = rate * group["rate"]
+        loss, _ = member.loss(
+            member.batch(data, generator.permutation(16)[:4], generator, step / steps)
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(member.network.parameters(), 5.0)
+        optimizer.step()
+    images = np.stack([data.image(k) for k in range(16)])
+    found = member.estimate(images, data.intrinsics)
+    error_m, error_deg = pose_errors(found.poses, data.poses)
+    assert np.median(error_m) < 0.1
+    assert np.median(error_deg) < 1

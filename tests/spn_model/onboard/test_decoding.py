@@ -1,0 +1,166 @@
+"""Poses from scene coordinates: exact, robust, honest about themselves, and light enough for a drone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spn_data.errors import GeometryError
+from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
+from spn_model.onboard.decoding import DecodingOptions, decode
+
+MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])
+GRID = (59, 33)  # cells of a 480 x 270 image, the first at (7.5, 7.5), 8 px apart
+TRUE = Poses.from_rotations([[310.0, -4.0, 12.0]], rotations_from_vectors([[1.9, 0.3, -0.2]]))
+STILL = DecodingOptions(cells_per_observation=1.0)
+
+
+def decoded(xyz: np.ndarray, log_scale: np.ndarray, options: DecodingOptions | None = None):
+    return decode(xyz, log_scale, MATRIX, first_px=7.5, stride_px=8.0, options=options)
+
+
+def scene(seed: int) -> np.ndarray:
+    """(3, h, w) exact coordinates of cells, at uneven depths."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(GRID[0]) * 8 + 7.5, np.arange(GRID[1]) * 8 + 7.5)
+    rays = np.stack([(x - 240) / 328, (y - 135) / 328, np.ones_like(x)])
+    in_camera = rays * rng.uniform(5, 25, x.shape)
+    xyz = np.einsum("ij,jhw->ihw", TRUE.rotations[0].T, in_camera)
+    return xyz + TRUE.centers[0][:, None, None]
+
+
+def laplace(rng: np.random.Generator, scale: np.ndarray) -> np.ndarray:
+    """(3, h, w) errors whose density falls with exp(-length / scale)."""
+    direction = rng.normal(size=(3, *scale.shape))
+    direction /= np.linalg.norm(direction, axis=0)
+    return direction * rng.gamma(3.0, scale)
+
+
+def test_exact_coordinates_give_the_exact_pose():
+    """Half pixels, axes and signs: 1e-6 m and degrees, far from the world's origin."""
+    estimate = decoded(scene(0), np.full(GRID[::-1], -3.0))
+    error_m, error_deg = pose_errors(estimate.poses, TRUE)
+    assert error_m[0] < 1e-6
+    assert error_deg[0] < 1e-6
+    assert estimate.inliers == estimate.used == 700
+
+
+def test_most_cells_may_be_wrong():
+    """Six of ten cells somewhere else, as sure of themselves as the others, leave the pose as it is."""
+    rng = np.random.default_rng(1)
+    xyz = scene(1)
+    wrong = rng.random(GRID[::-1]) < 0.6
+    xyz[:, wrong] += rng.normal(0, 15, (3, np.count_nonzero(wrong)))
+    estimate = decoded(xyz, np.full(GRID[::-1], -3.0))
+    error_m, error_deg = pose_errors(estimate.poses, TRUE)
+    assert error_m[0] < 0.02
+    assert error_deg[0] < 0.1
+    assert 0.3 * 700 < estimate.inliers < 0.5 * 700
+
+
+def test_the_surest_cells_are_taken():
+    """Cells that say that they know nothing may hold anything."""
+    xyz, log_scale = scene(2), np.full(GRID[::-1], -3.0)
+    xyz[:, :20] = 1e4
+    log_scale[:20] = 3.0
+    error_m, _ = pose_errors(decoded(xyz, log_scale).poses, TRUE)
+    assert error_m[0] < 1e-6
+
+
+def test_certainty_weighs():
+    """Where half of the cells are 20 times better and say so, the pose is better than if they were silent."""
+    rng = np.random.default_rng(3)
+    told, silent = [], []
+    for seed in range(10):
+        scale = np.where(rng.random(GRID[::-1]) < 0.5, 0.02, 0.4)
+        xyz = scene(seed) + laplace(rng, scale)
+        for found, said in ((told, scale), (silent, np.full_like(scale, 0.2))):
+            options = replace(STILL, cells=2000)
+            found.append(pose_errors(decoded(xyz, np.log(said), options).poses, TRUE)[0][0])
+    assert np.mean(told) < 0.6 * np.mean(silent)
+
+
+def test_covariance_is_that_of_the_errors():
+    """Independent errors of the stated scale: normalised squares of the pose's error average near 6.
+
+    The order is centre, then rotation vector in the camera frame with R_true = exp(v) R.
+    """
+    rng = np.random.default_rng(4)
+    squares = []
+    for seed in range(60):
+        scale = np.exp(rng.uniform(-4, -1, GRID[::-1]))
+        estimate = decoded(scene(seed) + laplace(rng, scale), np.log(scale), STILL)
+        turn = rotation_vectors(TRUE.rotations @ estimate.poses.rotations.transpose(0, 2, 1))[0]
+        error = np.concatenate([TRUE.centers[0] - estimate.poses.centers[0], turn])
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert 4.6 < np.mean(squares) < 7.4
+
+
+def test_covariance_knows_which_way_is_weak():
+    """Before a flat wall a slide hides behind a turn: camera moved right, points turned right."""
+    x, y = np.meshgrid(np.arange(GRID[0]) * 8 + 7.5, np.arange(GRID[1]) * 8 + 7.5)
+    xyz = np.stack([(x - 240) / 328, (y - 135) / 328, np.ones_like(x)]) * 10.0
+    scale = np.full(GRID[::-1], 0.1)
+    xyz += laplace(np.random.default_rng(9), scale)
+    covariance = decoded(xyz, np.log(scale), replace(STILL, cells=2000)).covariance
+    sigma = np.sqrt(np.diag(covariance))
+    assert sigma[0] > 2 * sigma[2]
+    assert np.abs(covariance - covariance.T).max() < 1e-9 * covariance.max()
+    assert covariance[0, 4] / (sigma[0] * sigma[4]) > 0.9
+    assert covariance[1, 3] / (sigma[1] * sigma[3]) < -0.9
+
+
+def test_wider_scatter_than_stated_widens_the_covariance():
+    """Cells that are four times worse than they say are not believed."""
+    rng = np.random.default_rng(5)
+    said = np.full(GRID[::-1], 0.02)
+    honest = decoded(scene(5) + laplace(rng, said), np.log(said), STILL).covariance
+    boastful = decoded(scene(5) + laplace(rng, 4 * said), np.log(said), STILL).covariance
+    assert np.trace(boastful[:3, :3]) > 2 * np.trace(honest[:3, :3])
+
+
+def test_neighbours_that_err_alike_count_less():
+    """The covariance grows with the number of cells that tell as much as one."""
+    log_scale = np.full(GRID[::-1], -3.0)
+    xyz = scene(6) + laplace(np.random.default_rng(6), np.exp(log_scale))
+    one = decoded(xyz, log_scale, STILL).covariance
+    many = decoded(xyz, log_scale, replace(STILL, cells_per_observation=9.0)).covariance
+    assert many == pytest.approx(9 * one)
+
+
+def test_nonsense_gives_no_pose():
+    """Random coordinates raise GeometryError with the count, instead of some pose."""
+    xyz = np.random.default_rng(7).normal(0, 10, (3, *GRID[::-1]))
+    with pytest.raises(GeometryError, match=r"\d+ of 700 cells agree on a pose, need \d+"):
+        decoded(xyz, np.zeros(GRID[::-1]), DecodingOptions(min_inliers=60))
+
+
+def test_cells_without_a_number_are_left_out():
+    """NaN coordinates are no cells; where too few are left, the error says how many."""
+    xyz, log_scale = scene(8), np.full(GRID[::-1], -3.0)
+    xyz[:, 5:9] = np.nan
+    error_m, _ = pose_errors(decoded(xyz, log_scale).poses, TRUE)
+    assert error_m[0] < 1e-6
+    xyz[:, 1:] = np.nan
+    xyz[:, 0, 5:] = np.inf
+    with pytest.raises(GeometryError, match="5 cells are sure of what they show, need 12"):
+        decoded(xyz, log_scale, replace(STILL, cells=3000))
+
+
+def test_decoding_needs_neither_torch_nor_pycolmap():
+    """On board there is NumPy and OpenCV."""
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = sys.modules['pycolmap'] = sys.modules['scipy'] = None\n"
+        "import spn_model.onboard.decoding\n"
+    )
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr

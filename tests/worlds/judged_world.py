@@ -1,0 +1,45 @@
+"""The coloured field with evaluation flights, and checkpoints of small networks that were fitted to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import DatasetInfo, Role
+from spn_data.dataset.hdf5_writer import DatasetWriter
+from spn_model.examples.training_set import TrainingSet
+from spn_model.models.checkpoint import Checkpoint, load, save
+from spn_model.models.registry import make
+from spn_model.onboard.view import View
+from tests.worlds.training_world import INFO, frame
+
+ROLES = {
+    "train": Role.TRAIN,
+    "validation": Role.VALIDATION,
+    "medium": Role.TEST,
+    "low": Role.TEST,
+}
+
+
+def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: Any) -> Path:
+    """A data set with two evaluation flights; medium's frames are of two strata. changes : of DatasetInfo."""
+    info: DatasetInfo = replace(INFO, **changes)
+    wanted = counts or {"train": 12, "validation": 3, "medium": 7, "low": 4}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with DatasetWriter(path, info, ROLES) as writer:
+        for group, count in wanted.items():
+            for k in range(count):
+                stratum = "" if group == "train" else "medium" if k % 2 else "low"
+                writer.append(group, replace(frame(group, k), stratum=stratum))
+    return path
+
+
+def write_network(path: Path, dataset: Path, seed: int = 0, **options: Any) -> Checkpoint:
+    """A network of the kind tiny, whose targets are those of the data set and whose weights are drawn."""
+    member = make("tiny", options, seed=seed)
+    with Dataset(dataset) as data:
+        member.fit(TrainingSet(data.groups["train"]))
+        save(path, member, View.of(data), {"images_shown": 40, "train_s": 3.0})
+    return load(path)
