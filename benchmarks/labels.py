@@ -37,14 +37,14 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
     truth = flights / "truth"
     world_from_map = Similarity.fit(mapping.poses.centers, true_poses(mapping, truth).centers)
     figures = {"mapping": figures_of(mapping, world_from_map, truth)}
-    for name in np.unique(labelled.dense.sequences).tolist():
-        mine = labelled.dense.select(labelled.dense.sequences == name)
+    for name in np.unique(labelled.tracked.sequences).tolist():
+        mine = labelled.tracked.select(labelled.tracked.sequences == name)
         figures[f"{name} (between)"] = figures_of(mine, world_from_map, truth)
     for name, labels in labelled.evaluation.items():
-        figures[name] = figures_of(labels.select(~labels.dense), world_from_map, truth)
-        if labels.dense.any():
+        figures[name] = figures_of(labels.select(~labels.tracked), world_from_map, truth)
+        if labels.tracked.any():
             figures[f"{name} (between)"] = figures_of(
-                labels.select(labels.dense), world_from_map, truth
+                labels.select(labels.tracked), world_from_map, truth
             )
             figures[f"{name} (all frames)"] = figures_of(labels, world_from_map, truth)
         figures[name]["focal_error"] = focal_error(labelled, name, truth)

@@ -28,7 +28,7 @@ FORMATS = ("tum", "nerfstudio", "kapture", "geojson", "kml", "colmap-text", "col
     help="Sequence to export; may be repeated.  [default: all]",
 )
 @click.option(
-    "--all-frames", is_flag=True, help="Dense frames too, in formats that list no images."
+    "--all-frames", is_flag=True, help="Tracked frames too, in formats that list no images."
 )
 @click.option("--no-images", is_flag=True, help="Copy no images beside the poses.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier export in that folder.")

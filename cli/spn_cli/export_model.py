@@ -12,7 +12,7 @@ import click
 from spn_cli import console, options
 
 if TYPE_CHECKING:
-    from spn_model.export.bundle_export import Exported
+    from spn_model.export.exported import Exported
 
 
 @click.command("export")

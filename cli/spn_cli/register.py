@@ -94,7 +94,7 @@ def run(
     from spn_data.area.area import EVALUATION, GEO
     from spn_data.pipeline.evaluation_stage import RegisterStageOptions
     from spn_data.pipeline.evaluation_stage import register as stage
-    from spn_data.pipeline.tracking_stage import densify, sequences_with_video
+    from spn_data.pipeline.tracking_stage import sequences_with_video, track_sequence
     from spn_data.registration.register_options import RegisterOptions
     from spn_data.work.cluster import dispatch_to
 
@@ -132,7 +132,7 @@ def run(
                 names = [record.stage.removeprefix(f"{EVALUATION}/")]
             if all_frames:
                 for sequence in names or sequences_with_video(area):
-                    between = densify(
+                    between = track_sequence(
                         area,
                         sequence,
                         live.progress,

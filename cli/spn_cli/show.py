@@ -11,7 +11,6 @@ from spn_cli import console, show_labels
 from spn_data.area.area import (
     CHECKPOINT,
     COMPARED,
-    DENSE,
     EVALUATION,
     FRAMES,
     GEO,
@@ -20,6 +19,7 @@ from spn_data.area.area import (
     RUNS,
     STAGES,
     STATE,
+    TRACKED,
     Area,
 )
 from spn_data.errors import StageError
@@ -101,7 +101,12 @@ class Live:
         if group == EVALUATION:
             show_labels.evaluation(record, self.unit)
         else:
-            tables = {FRAMES: frames, MODEL: model, GEO: georegistration, DENSE: show_labels.dense}
+            tables = {
+                FRAMES: frames,
+                MODEL: model,
+                GEO: georegistration,
+                TRACKED: show_labels.tracked,
+            }
             tables[group](record)
 
     def made(self, record: StageRecord, before: Mapping[str, StageRecord]) -> None:

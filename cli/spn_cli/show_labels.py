@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from spn_cli import console
-from spn_data.area.area import DENSE, EVALUATION, SPLIT
+from spn_data.area.area import EVALUATION, SPLIT, TRACKED
 from spn_data.storage.record import StageRecord
 
 
@@ -36,7 +36,7 @@ def evaluation(record: StageRecord, unit: str) -> None:
     notes(record)
 
 
-def dense(record: StageRecord) -> None:
+def tracked(record: StageRecord) -> None:
     c = record.counts
     console.table(
         f"{record.stage}: frames between",
@@ -54,7 +54,7 @@ def summary(record: StageRecord) -> str:
     """What a stage holds, in a few words."""
     c = record.counts
     group = record.stage.partition("/")[0]
-    if group in (EVALUATION, DENSE):
+    if group in (EVALUATION, TRACKED):
         return f"{_share(c['registered'], c['frames'])} frames"
     assert group == SPLIT, group
     return ", ".join(f"{name} {n}" for name, n in c["groups"].items())

@@ -83,7 +83,13 @@ _METRES = options.Finite(0, 100_000)
     show_default=True,
     help="Metres in height from validation to training (height).",
 )
-@click.option("--no-dense", is_flag=True, help="Leave out frames that were not chosen for the map.")
+@click.option(
+    "--no-tracked",
+    "--no-dense",
+    "no_tracked",
+    is_flag=True,
+    help="Leave out video frames that were tracked between mapped ones.",
+)
 @click.option(
     "--size",
     "width_px",
@@ -107,7 +113,7 @@ _METRES = options.Finite(0, 100_000)
     "--video",
     "video_folder",
     type=click.Path(exists=True, path_type=Path),
-    help="Where the videos lie, of which dense frames are read.  [default: where they were]",
+    help="Where the videos lie, of which tracked frames are read.  [default: where they were]",
 )
 @options.seed
 def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chosen: Any) -> None:
@@ -143,14 +149,14 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
 
 
 def _options(
-    *, native: bool, width_px: int | None, cambridge: str, no_dense: bool, **chosen: Any
+    *, native: bool, width_px: int | None, cambridge: str, no_tracked: bool, **chosen: Any
 ) -> SplitStageOptions:
     from spn_data.pipeline.split_stage import CambridgeFrames, SplitStageOptions
     from spn_data.split.groups import Policy, SplitOptions
 
     chosen["validation"] = Policy(chosen["validation"])
     return SplitStageOptions(
-        split=SplitOptions(dense=not no_dense, **chosen),
+        split=SplitOptions(tracked=not no_tracked, **chosen),
         native=native,
         width_px=width_px,
         cambridge=CambridgeFrames(cambridge),

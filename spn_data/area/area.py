@@ -22,6 +22,7 @@ from spn_data.storage.record import (
     VERSION,
     StageRecord,
     check_version,
+    current_stage,
     difference,
     read_record,
     versions,
@@ -30,8 +31,11 @@ from spn_data.storage.record import (
 
 FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"
 STAGES = (FRAMES, MODEL, GEO)  # of the map; --add exchanges them together
-EVALUATION, DENSE = "4-eval", "4-dense"  # folders with one stage a sequence
-_GROUPS = (EVALUATION, DENSE)
+EVALUATION, TRACKED = "4-eval", "4-tracked"  # folders with one stage a sequence
+_GROUPS = (EVALUATION, TRACKED)
+_FORMER_GROUPS = {
+    TRACKED: "4-dense"
+}  # as version 0.1 called them; read and extended where they are
 RUNS = "runs"  # trained networks, a folder each; made by spn-model
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIGURES, BUNDLE = "errors.csv", "figures", "bundle"
@@ -109,7 +113,14 @@ class Area:
         self.facts = self._read_facts()
 
     def folder(self, stage: str) -> Path:
-        return self.root / stage
+        """Return the folder of a stage, which need not exist."""
+        group, _, name = stage.partition("/")
+        return self.group_folder(group) / name
+
+    def group_folder(self, group: str) -> Path:
+        """Return the folder of a stage or group; that of a former name where the area has one."""
+        former = self.root / _FORMER_GROUPS.get(group, group)
+        return former if former.is_dir() else self.root / group
 
     def has(self, stage: str) -> bool:
         """A stage folder that exists is complete."""
@@ -124,8 +135,8 @@ class Area:
         return folder.with_name(f".{folder.name}.partial")
 
     def sequences(self, group: str) -> tuple[str, ...]:
-        """Names of the complete stages of a group (EVALUATION or DENSE), or of RUNS, sorted."""
-        folder = self.root / group
+        """Names of the complete stages of a group (EVALUATION or TRACKED), or of RUNS, sorted."""
+        folder = self.group_folder(group)
         found = folder.iterdir() if folder.is_dir() else iter(())
         return tuple(sorted(p.name for p in found if p.is_dir() and not p.name.startswith(".")))
 
@@ -149,7 +160,7 @@ class Area:
         if stage == SPLIT:
             found = [s for s in self.stages() if s != SPLIT]
             return tuple(dict.fromkeys((FRAMES, MODEL, *found)))
-        if group == DENSE:
+        if group == TRACKED:
             evaluation = f"{EVALUATION}/{name}"
             return (MODEL, evaluation) if self.has(evaluation) else (FRAMES, MODEL)
         return {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL), EVALUATION: (MODEL,)}[group]
@@ -165,11 +176,12 @@ class Area:
         """Why a stage no longer fits what it was made from, or None."""
         record = self.record(stage)
         for name, fingerprint in record.upstream.items():
-            if not self.has(name):
+            if not self.has(current_stage(name)):
                 return f"{name} is missing"
-            if self.record(name).fingerprint() != fingerprint:
+            if self.record(current_stage(name)).fingerprint() != fingerprint:
                 return f"{name} was made anew since"
-        added = [name for name in self.upstream_names(stage) if name not in record.upstream]
+        known = {current_stage(name) for name in record.upstream}
+        added = [name for name in self.upstream_names(stage) if name not in known]
         return f"{added[0]} was added since" if added else None
 
     def upstream_of(self, stage: str) -> dict[str, str]:
@@ -282,7 +294,7 @@ class Area:
         for group in _GROUPS:
             names += [
                 f"{group}/{old.name.removeprefix('.old-')}"
-                for old in (self.root / group).glob(".old-*")
+                for old in self.group_folder(group).glob(".old-*")
             ]
         return [s for s in names if self._old(s).exists() and not self.folder(s).exists()]
 
@@ -353,7 +365,7 @@ def command_of(stage: str) -> str:
     commands = {
         GEO: "spn-data georegister",
         EVALUATION: f"spn-data register VIDEO --name {name}",
-        DENSE: f"spn-data register --all-frames --name {name}",
+        TRACKED: f"spn-data register --all-frames --name {name}",
         SPLIT: "spn-data split",
     }
     return commands.get(group, "spn-data reconstruct")

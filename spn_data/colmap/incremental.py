@@ -10,7 +10,7 @@ import contextlib
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import straighten
-from spn_data.colmap.mapping import MappingJob
+from spn_data.colmap.job import MappingJob
 from spn_data.work import child
 
 _SOLVED_EXACTLY = 1000  # images, by COLMAP

@@ -172,7 +172,7 @@ class DatasetGroup:
         return self._column("time_s")
 
     @cached_property
-    def dense(self) -> np.ndarray:
+    def tracked(self) -> np.ndarray:
         """(N,) bool: not chosen for the map."""
         return self._column("dense") != 0
 

@@ -161,7 +161,7 @@ class DatasetFrame:
     quat_wxyz: np.ndarray
     intrinsics: np.ndarray
     covariance: np.ndarray = field(default_factory=lambda: np.full((6, 6), np.nan))
-    dense: bool = False
+    tracked: bool = False
     stratum: str = ""
     image: np.ndarray | None = None
     valid: np.ndarray | None = None

@@ -185,7 +185,7 @@ class _Group:
             "sequences": [f.sequence.encode() for f in frames],
             "strata": [f.stratum.encode() for f in frames],
             "time_s": [f.time_s for f in frames],
-            "dense": [int(f.dense) for f in frames],
+            "dense": [int(f.tracked) for f in frames],
             "centers": [f.center for f in frames],
             "quats_wxyz": [f.quat_wxyz for f in frames],
             "covariance": [f.covariance for f in frames],

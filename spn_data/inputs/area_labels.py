@@ -1,4 +1,4 @@
-"""All labels of an area in the map's frame: mapping frames, dense frames, evaluation sequences."""
+"""All labels of an area in the map's frame: mapping frames, tracked frames, evaluation sequences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import DENSE, EVALUATION, FRAMES, GEO, MODEL, Area
+from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, TRACKED, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Observations, Scene, read_map
 from spn_data.errors import FormatError
@@ -19,7 +19,7 @@ from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import Labels, SeenPoints, read_labels, read_seen_points
 from spn_data.labels.map_points import MapPoints, covered_share
-from spn_data.pipeline.model_stage import read_reasons
+from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.storage.record import read_json
 from spn_data.uncertainty.map_covariance import MapCovariance
 
@@ -36,8 +36,8 @@ class LabelledArea:
     """Every frame with what became of it.
 
     units : "m" (East-North-Up about `origin`) or "model" (COLMAP's gauge; origin is None).
-    mapping : chosen frames of the mapping flights; dense : their other frames; evaluation : by sequence,
-    chosen and dense frames. Each with the map points that the frames see. cameras : by key, in pixels of
+    mapping : chosen frames of the mapping flights; tracked : their other frames; evaluation : by sequence,
+    chosen and tracked frames. Each with the map points that the frames see. cameras : by key, in pixels of
     the full-size images.
     """
 
@@ -47,16 +47,16 @@ class LabelledArea:
     cameras: dict[str, Camera]
     mapping: Labels
     mapping_seen: SeenPoints
-    dense: Labels
-    dense_seen: SeenPoints
+    tracked: Labels
+    tracked_seen: SeenPoints
     evaluation: dict[str, Labels]
     evaluation_seen: dict[str, SeenPoints]
 
     def parts(self) -> list[tuple[Labels, SeenPoints]]:
-        """Mapping, its dense frames, and each evaluation sequence."""
+        """Mapping, its tracked frames, and each evaluation sequence."""
         return [
             (self.mapping, self.mapping_seen),
-            (self.dense, self.dense_seen),
+            (self.tracked, self.tracked_seen),
             *((self.evaluation[n], self.evaluation_seen[n]) for n in self.evaluation),
         ]
 
@@ -67,18 +67,18 @@ def map_folder(area: Area) -> Path:
 
 
 def read_labelled_area(
-    area: Area, *, mapping_covariance: bool = True, dense: bool = True
+    area: Area, *, mapping_covariance: bool = True, tracked: bool = True
 ) -> LabelledArea:
     """All labels, in metres where the area is georegistered.
 
     mapping_covariance : false leaves the covariances of mapping frames unknown (NaN), which is quicker.
-    dense : false leaves out the frames between, and does not mind whether their stages are stale.
+    tracked : false leaves out the frames between, and does not mind whether their stages are stale.
 
     Raises StageError for a stage that is missing or stale, FormatError or InputError for a damaged file.
     """
     area.upstream_of(GEO)  # frames and model stand and fit each other
     for stage in area.stages():
-        if stage.partition("/")[0] in (GEO, EVALUATION, *([DENSE] if dense else [])):
+        if stage.partition("/")[0] in (GEO, EVALUATION, *([TRACKED] if tracked else [])):
             area.check_fresh(stage)
     scene, observations, points = read_map(map_folder(area))
     chosen = chosen_frames(area)
@@ -91,22 +91,22 @@ def read_labelled_area(
     }
     geo = read_geo(area)
     world_from_model = Similarity.identity() if geo is None else geo.world_from_model
-    between = area.sequences(DENSE) if dense else ()
+    between = area.sequences(TRACKED) if tracked else ()
     evaluation, evaluation_seen = {}, {}
     for name in area.sequences(EVALUATION):
         stage = f"{EVALUATION}/{name}"
         parts = [_read_stage(area, stage, world_from_model)]
         if name in between:
-            parts.append(_read_stage(area, f"{DENSE}/{name}", world_from_model))
+            parts.append(_read_stage(area, f"{TRACKED}/{name}", world_from_model))
         evaluation[name], evaluation_seen[name] = together(parts)
         cameras[name] = _read_camera(area.folder(stage) / CAMERA)
     of_mapping = [
-        _read_stage(area, f"{DENSE}/{name}", world_from_model)
+        _read_stage(area, f"{TRACKED}/{name}", world_from_model)
         for name in between
         if name not in evaluation
     ]
     nothing = (mapping.select(np.zeros(0, np.int64)), mapping_seen.select(np.zeros(0, np.int64)))
-    dense_labels, dense_seen = together(of_mapping) if of_mapping else nothing
+    tracked_labels, tracked_seen = together(of_mapping) if of_mapping else nothing
     return LabelledArea(
         units="m" if area.has(GEO) else "model",
         origin=None if geo is None else geo.origin,
@@ -114,8 +114,8 @@ def read_labelled_area(
         cameras=cameras,
         mapping=mapping,
         mapping_seen=mapping_seen,
-        dense=dense_labels,
-        dense_seen=dense_seen,
+        tracked=tracked_labels,
+        tracked_seen=tracked_seen,
         evaluation=evaluation,
         evaluation_seen=evaluation_seen,
     )
@@ -181,7 +181,7 @@ def _mapping_labels(
     labels = Labels.of_frames(
         chosen,
         scene.poses.at_rows(rows, n),
-        dense=False,
+        tracked=False,
         reason=[reasons.get(name, "") for name in chosen.names.tolist()],
         covariance=np.full((n, 6, 6), np.nan),
         inliers=inliers,

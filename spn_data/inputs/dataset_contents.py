@@ -62,7 +62,7 @@ def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
     strata = np.full(len(labels), "", dtype="<U6")
     if labelled.units == "m":
         others = group != TRAIN
-        training = labels.poses[(group == TRAIN) & ~labels.dense]
+        training = labels.poses[(group == TRAIN) & ~labels.tracked]
         strata[others] = strata_of(labels.poses[others], training)
     return GivenFrames(
         labels,
@@ -131,7 +131,7 @@ class RenderedFrames:
             quat_wxyz=labels.poses.quats_wxyz[row],
             intrinsics=renderer.target.matrix,
             covariance=labels.covariance[row],
-            dense=bool(labels.dense[row]),
+            tracked=bool(labels.tracked[row]),
             stratum=str(self._frames.strata[row]),
             image=cv2.cvtColor(renderer.render(image), cv2.COLOR_BGR2RGB),
             valid=self._valid_pixels(str(labels.sequences[row]), key),

@@ -19,7 +19,7 @@ from spn_data.geometry.camera_file import camera_from_json
 from spn_data.inputs.flight_telemetry import telemetry_of
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.initial_cameras import start_cameras
-from spn_data.pipeline.frames_stage import fingerprints
+from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.split.groups import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry

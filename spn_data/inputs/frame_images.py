@@ -1,4 +1,4 @@
-"""Full-size images of labelled frames: stored ones from their files, dense ones from the video."""
+"""Full-size images of labelled frames: stored ones from their files, tracked ones from the video."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def frame_images(
     videos = {  # all of them first: a missing one is told before any work
         sequence: find_videos(area, sequence, video_folder)
         for sequence in sequences
-        if labels.dense[labels.sequences == sequence].any()
+        if labels.tracked[labels.sequences == sequence].any()
     }
     for sequence in sequences:
         mine = np.flatnonzero(labels.sequences == sequence)
-        for row in mine[~labels.dense[mine]].tolist():
+        for row in mine[~labels.tracked[mine]].tolist():
             yield row, _stored(area, str(labels.names[row]), sequence)
-        dense = mine[labels.dense[mine]]
-        if len(dense):
-            yield from _decoded(videos[sequence], labels, dense)
+        tracked = mine[labels.tracked[mine]]
+        if len(tracked):
+            yield from _decoded(videos[sequence], labels, tracked)
 
 
 def image_path(area: Area, name: str, sequence: str) -> Path:

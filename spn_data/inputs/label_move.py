@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from spn_data.area.area import DENSE, EVALUATION, Area
+from spn_data.area.area import EVALUATION, TRACKED, Area
 from spn_data.inputs.area_labels import (
     POSES,
     REGISTRATION,
@@ -24,7 +24,7 @@ def move_labels(area: Area) -> tuple[str, ...]:
     A stage is exchanged whole: its poses always fit its registration.json.
     """
     moved = []
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         for name in area.sequences(group):
             stage = f"{group}/{name}"
             if area.stale_because(stage) is None and _move(area, stage):

@@ -36,7 +36,7 @@ class Labels:
 
     names : (N,) str, `<sequence>/<frame>.jpg`; unique. sequences, cameras : (N,) str, key of the lens.
     sources : (N,) str, name of the file that the frame is from; video_frame : (N,) int, index among its
-    decoded frames, -1 for a photo; dense : (N,) bool, a frame that was not chosen: its pixels are read
+    decoded frames, -1 for a photo; tracked : (N,) bool, a frame that was not chosen: its pixels are read
     from the video, those of the others from a stored image.
     time_s : (N,) seconds since the sequence's first frame.
     status : (N,) str, a LabelStatus; reason : (N,) str, why it failed, empty else.
@@ -52,7 +52,7 @@ class Labels:
     cameras: np.ndarray
     sources: np.ndarray
     video_frame: np.ndarray
-    dense: np.ndarray
+    tracked: np.ndarray
     time_s: np.ndarray
     status: np.ndarray
     reason: np.ndarray
@@ -90,7 +90,7 @@ class Labels:
         frames: Frames,
         poses: Poses,
         *,
-        dense: bool,
+        tracked: bool,
         reason: Sequence[str],
         covariance: np.ndarray,
         inliers: np.ndarray,
@@ -105,7 +105,7 @@ class Labels:
             cameras=frames.cameras,
             sources=frames.sources,
             video_frame=frames.video_frame,
-            dense=np.full(len(frames), dense),
+            tracked=np.full(len(frames), tracked),
             time_s=frames.time_s,
             status=np.where(registered, LabelStatus.REGISTERED.value, LabelStatus.FAILED.value),
             reason=np.array(reason, dtype=np.str_),
@@ -204,7 +204,7 @@ def write_labels(path: Path, labels: Labels) -> None:
         "camera": labels.cameras.tolist(),
         "source": labels.sources.tolist(),
         "video_frame": labels.video_frame.tolist(),
-        "dense": labels.dense.astype(np.int64).tolist(),
+        "dense": labels.tracked.astype(np.int64).tolist(),
         **{name: _cells(covariance[:, k]) for k, name in enumerate(_COVARIANCE_COLUMNS)},
     }
     write_csv(path, {name: columns[name] for name in _COLUMNS})
@@ -262,7 +262,7 @@ def _labels_of(rows: list[dict[str, Any]]) -> Labels:
         cameras=strings("camera"),
         sources=strings("source"),
         video_frame=numbers("video_frame", np.int64),
-        dense=numbers("dense", np.int64) != 0,
+        tracked=numbers("dense", np.int64) != 0,
         time_s=numbers("time_s", np.float64),
         status=strings("status"),
         reason=strings("reason"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area.area import DENSE, EVALUATION, FRAMES, MODEL, SPLIT, Area
+from spn_data.area.area import EVALUATION, FRAMES, MODEL, SPLIT, TRACKED, Area
 from spn_data.colmap.model import read_scene
 from spn_data.dataset.cambridge import NVM, read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
@@ -59,7 +59,7 @@ def audit(area: Area) -> tuple[Finding, ...]:
 def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Finding, ...]:
     """Check a split in a folder against the area's labels."""
     split = read_split(folder / SPLIT_FILE)
-    parts = {"mapping": labelled.mapping, "dense": labelled.dense, **labelled.evaluation}
+    parts = {"mapping": labelled.mapping, "tracked": labelled.tracked, **labelled.evaluation}
     covered = check_covered(parts, split)
     findings = [
         _check_not_in_map(area, labelled),
@@ -71,7 +71,7 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Find
     ]
     if covered.verdict is Verdict.FAIL:  # groups of frames that it does not know cannot be judged
         return tuple(findings)
-    flights = Labels.concatenate([labelled.mapping, labelled.dense])
+    flights = Labels.concatenate([labelled.mapping, labelled.tracked])
     flights = flights.select(flights.registered)
     findings += [
         check_blocks(flights, split),
@@ -96,7 +96,7 @@ def _check_copies(labelled: LabelledArea) -> list[Finding]:
     """Only where lengths are metres and there is something to compare."""
     if labelled.units != "m" or not labelled.evaluation:
         return []
-    mapping = Labels.concatenate([labelled.mapping, labelled.dense])
+    mapping = Labels.concatenate([labelled.mapping, labelled.tracked])
     return [check_copies(mapping, labelled.evaluation)]
 
 
@@ -116,7 +116,7 @@ def _check_files(
                 name: PoseList(tuple(group.names.tolist()), group.poses)
                 for name, group in dataset.groups.items()
             }
-            dense = {name: group.dense for name, group in dataset.groups.items()}
+            tracked = {name: group.tracked for name, group in dataset.groups.items()}
             marks = {name: g.points_for_training for name, g in dataset.groups.items()}
             given = _point_ids(dataset)
         findings = [
@@ -125,7 +125,7 @@ def _check_files(
             check_marks(marks),
         ]
         if (folder / CAMBRIDGE).is_dir():
-            findings += _check_cambridge(folder / CAMBRIDGE, lists, dense, split)
+            findings += _check_cambridge(folder / CAMBRIDGE, lists, tracked, split)
     except SpnError as error:
         return [Finding(check, Verdict.FAIL, "a file of the split cannot be read", (str(error),))]
     return findings
@@ -141,21 +141,21 @@ def _point_ids(dataset: Dataset) -> np.ndarray:
 
 
 def _check_cambridge(
-    folder: Path, stored: dict[str, PoseList], dense: dict[str, np.ndarray], split: Split
+    folder: Path, stored: dict[str, PoseList], tracked: dict[str, np.ndarray], split: Split
 ) -> list[Finding]:
-    """Lists hold every chosen frame of the data set; dense ones are in all lists or in none."""
+    """Lists hold every chosen frame of the data set; tracked ones are in all lists or in none."""
     files = sorted(path.name for path in folder.glob("dataset_*.txt"))
     lists = {file: read_cambridge(folder / file) for file in files}
     found = {file: PoseList(each.names, each.poses) for file, each in lists.items()}
     known = {name for each in lists.values() for name in each.names}
-    with_dense = any(
+    with_tracked = any(
         image_name(name) in known
         for group, each in stored.items()
-        for name in np.array(each.names)[dense[group]].tolist()
+        for name in np.array(each.names)[tracked[group]].tolist()
     )
     wanted: dict[str, PoseList] = {}
     for group, each in sorted(stored.items()):
-        kept = each.select(np.flatnonzero(~dense[group] | with_dense))
+        kept = each.select(np.flatnonzero(~tracked[group] | with_tracked))
         file = list_of(group)
         wanted[file] = kept if file not in wanted else wanted[file].with_more(kept)
     model = read_nvm(folder / NVM)
@@ -166,7 +166,7 @@ def _check_cambridge(
 def _check_map_unchanged(area: Area) -> Finding:
     """Each sequence's stage noted the map's hash before and after it was registered."""
     at: dict[str, MapHashes] = {}
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         for name in area.sequences(group):
             path = area.folder(f"{group}/{name}") / REGISTRATION
             noted = read_json(path)

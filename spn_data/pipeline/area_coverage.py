@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
+from spn_data.area.area import EVALUATION, GEO, MODEL, TRACKED, Area
 from spn_data.coverage.nearest_frame import CoverageOptions
 from spn_data.coverage.refly import FlyAgain, ReflyOptions, where_to_fly_again
 from spn_data.coverage.sequence_table import (
@@ -175,7 +175,7 @@ def _measured(
 def _mapping(labelled: LabelledArea, *, has_up: bool) -> MappingFrames:
     """The chosen frames of the mapping flights that have a pose, and what they saw.
 
-    Their dense frames are left out: whether poses were computed for those changes nothing in the flight.
+    Their tracked frames are left out: whether poses were computed for those changes nothing in the flight.
     """
     labels, seen = labelled.mapping, labelled.mapping_seen
     known = np.flatnonzero(labels.registered)
@@ -256,7 +256,7 @@ def _fingerprints(area: Area, *, of_plan: bool) -> dict[str, str]:
     if not of_plan:
         names = area.sequences(EVALUATION)
         kept += [f"{EVALUATION}/{name}" for name in names]
-        kept += [f"{DENSE}/{name}" for name in area.sequences(DENSE) if name in names]
+        kept += [f"{TRACKED}/{name}" for name in area.sequences(TRACKED) if name in names]
     return {stage: area.record(stage).fingerprint() for stage in kept}
 
 

@@ -56,7 +56,7 @@ _IMAGES = {
 }
 _NEED_ORIGIN = (Format.GEOJSON, Format.KML)
 _WITH_MAP = (Format.COLMAP_TEXT, Format.COLMAP)  # holds the map whole, whatever is chosen
-_WITH_DENSE = (Format.TUM, Format.GEOJSON, Format.KML)
+_WITH_TRACKED = (Format.TUM, Format.GEOJSON, Format.KML)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class ExportOptions:
     """What is exported.
 
     sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames).
-    all_frames : dense frames too, in formats that list no images.
+    all_frames : tracked frames too, in formats that list no images.
     images : copy the images that a format lists.
     """
 
@@ -104,10 +104,10 @@ def export(
     if format_name == Format.ALL and labelled.origin is None:
         left_out = {f.value: "needs a place in the world" for f in _NEED_ORIGIN}
         wanted = [f for f in wanted if f not in _NEED_ORIGIN]
-    if options.all_frames and format_name != Format.ALL and format_name not in _WITH_DENSE:
+    if options.all_frames and format_name != Format.ALL and format_name not in _WITH_TRACKED:
         raise StageError(
             f"{format_name.value} lists images, and --all-frames adds frames that are stored only in "
-            f"their video; export {', '.join(f.value for f in _WITH_DENSE)} with it"
+            f"their video; export {', '.join(f.value for f in _WITH_TRACKED)} with it"
         )
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -115,9 +115,9 @@ def export(
         counts: dict[str, int] = {}
         for one in wanted:
             folder = partial / one.value if format_name == Format.ALL else partial
-            dense = options.all_frames and one in _WITH_DENSE
+            tracked = options.all_frames and one in _WITH_TRACKED
             frames = chosen_frames(
-                labelled, options.sequences, dense=dense, whole_map=one in _WITH_MAP
+                labelled, options.sequences, tracked=tracked, whole_map=one in _WITH_MAP
             )
             counts = {name: len(rows) for name, rows in frames.sequences()}
             _write(area, one, folder, frames, images=options.images)
@@ -156,12 +156,12 @@ def chosen_frames(
     labelled: LabelledArea,
     sequences: Sequence[str],
     *,
-    dense: bool = False,
+    tracked: bool = False,
     whole_map: bool = False,
 ) -> ExportedFrames:
     """Frames with a pose, of the sequences named or of all, sorted by sequence and time.
 
-    dense : dense frames too; whole_map : all mapping frames, also those of other sequences.
+    tracked : tracked frames too; whole_map : all mapping frames, also those of other sequences.
     """
     known = sorted({s for labels, _ in labelled.parts() for s in labels.sequences.tolist()})
     for name in sequences:
@@ -169,7 +169,7 @@ def chosen_frames(
             raise StageError(f"there is no sequence {name!r}; there are {', '.join(known)}")
     kept = []
     for labels, seen in labelled.parts():
-        mask = labels.registered & (dense | ~labels.dense)
+        mask = labels.registered & (tracked | ~labels.tracked)
         if sequences:
             of_map = whole_map & ~np.isin(labels.sequences, list(labelled.evaluation))
             mask &= of_map | np.isin(labels.sequences, list(sequences))

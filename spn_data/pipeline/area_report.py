@@ -129,18 +129,18 @@ def frame_table(
     strata: Mapping[str, str],
     groups: Mapping[str, str],
 ) -> FrameTable:
-    """One row a frame: mapping candidates, mapping's dense frames, evaluation frames, in this order.
+    """One row a frame: mapping candidates, mapping's tracked frames, evaluation frames, in this order.
 
     labelled : None where there is no model; chosen frames are then just "chosen". residuals : (fix minus
     pose, is an outlier) by name; strata, groups : by name.
     """
     if labelled is None:
         return _of_candidates(candidates, candidates.names != "")
-    labelled_names = set(labelled.dense.names.tolist())
+    labelled_names = set(labelled.tracked.names.tolist())
     rest = ~candidates.chosen & ~np.isin(candidates.names, list(labelled_names))
     parts = [
         _of_labels(labelled.mapping, evaluation=False),
-        _of_labels(labelled.dense, evaluation=False),
+        _of_labels(labelled.tracked, evaluation=False),
         _of_candidates(candidates, rest),
         *(_of_labels(labels, evaluation=True) for labels in labelled.evaluation.values()),
     ]
@@ -157,7 +157,7 @@ def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
         sequences=labels.sequences,
         cameras=labels.cameras,
         evaluation=np.full(n, evaluation),
-        dense=labels.dense,
+        tracked=labels.tracked,
         time_s=labels.time_s,
         status=labels.status,
         reason=labels.reason,
@@ -180,7 +180,7 @@ def _of_candidates(frames: Frames, mask: np.ndarray) -> FrameTable:
         sequences=found.sequences,
         cameras=found.cameras,
         evaluation=np.zeros(n, bool),
-        dense=np.zeros(n, bool),
+        tracked=np.zeros(n, bool),
         time_s=found.time_s,
         status=found.status,
         reason=found.reason,

@@ -27,9 +27,9 @@ from spn_data.inputs.evaluation_source import find_source, take_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.labels.labels import Labels, sigmas, write_labels, write_seen_points
 from spn_data.labels.map_hash import map_hash
-from spn_data.pipeline.frames_stage import fingerprints
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.register import Registered, labels_of, register_sequence

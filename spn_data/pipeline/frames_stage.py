@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area.area import DENSE, EVALUATION, FRAMES, Area
+from spn_data.area.area import EVALUATION, FRAMES, TRACKED, Area
 from spn_data.capture.candidates import Candidates, analyse, frames_of
 from spn_data.capture.extraction import Cost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames
@@ -29,6 +29,7 @@ from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.inputs.flight_telemetry import check_telemetry, telemetry_of, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
@@ -92,7 +93,7 @@ def plan(
                     raise InputError(
                         f"is of the evaluation sequence {evaluated[print_]}, which would be no test of a "
                         "map that holds it; to map it all the same, remove its folders in "
-                        f"{EVALUATION} and {DENSE}",
+                        f"{EVALUATION} and {TRACKED}",
                         path=part,
                     )
             known = [part for part, print_ in prints.items() if print_ in held]
@@ -124,16 +125,6 @@ def _evaluated(area: Area) -> dict[str, str]:
         for file, print_ in area.record(f"{EVALUATION}/{name}").inputs.items()
         if Path(file).suffix.lower() in VIDEO_SUFFIXES | PHOTO_SUFFIXES
     }
-
-
-def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:
-    """Content fingerprint of every file of the sources, by sequence and name, and of their masks."""
-    files = {
-        f"{source.sequence}/{path.name}": content_fingerprint(path)
-        for source in sources
-        for path in (*source.parts, *source.telemetry)
-    }
-    return files | {f"{name}/mask": content_fingerprint(path) for name, path in masks.items()}
 
 
 def masks_of(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:

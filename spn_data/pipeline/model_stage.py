@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +20,14 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.contradiction import focal_changes
 from spn_data.reconstruction.correspondences import FramesToMap
-from spn_data.reconstruction.diagnosis import FrameRegistration, missing_passages
+from spn_data.reconstruction.diagnosis import missing_passages
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
+from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
-from spn_data.storage.files import read_csv, write_csv
 from spn_data.storage.record import StageRecord, read_json
 from spn_data.work.timing import Progress, Stopwatch
 
 DATABASE = "database.db"
-REGISTRATION = "registration.csv"
 
 
 def build_model(
@@ -56,7 +54,7 @@ def build_model(
     result = reconstruct(to_map, work.path, options, progress, stopwatch)
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result.model, chosen, stopwatch)
-    write_registration(work.path / REGISTRATION, result.registrations)
+    write_registration(work.path, result.registrations)
     _name_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen, shutters),
@@ -153,19 +151,6 @@ def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[Shutte
         if not (chosen.video_frame[rows] >= 0).any():
             return ()
         return diagnose_shutter(scene, observations, chosen.sequences[rows], chosen.time_s[rows])
-
-
-def write_registration(path: Path, rows: tuple[FrameRegistration, ...]) -> None:
-    columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(FrameRegistration)}
-    columns["registered"] = ["registered" if row.registered else "missing" for row in rows]
-    columns["error_px"] = ["" if math.isnan(r.error_px) else f"{r.error_px:.4f}" for r in rows]
-    write_csv(path, columns)
-
-
-def read_reasons(folder: Path) -> dict[str, str]:
-    """Why a frame is missing in the model of a folder, by name; empty where it is not."""
-    columns = [f.name for f in fields(FrameRegistration)]
-    return {row["name"]: row["reason"] for _, row in read_csv(folder / REGISTRATION, columns)}
 
 
 def _name_results(work: Path, result: ReconstructResult) -> None:

@@ -70,7 +70,7 @@ def split_area(
 ) -> StageRecord:
     """Divide the area's frames and write what networks train on; audit it at the end.
 
-    video_folder : where the videos of dense frames lie, besides the places that the area remembers.
+    video_folder : where the videos of tracked frames lie, besides the places that the area remembers.
     Raises GeometryError where a group would be empty, StageError for stages missing or stale.
     """
     work = area.begin(SPLIT, asdict(options), {}, overwrite=overwrite)
@@ -95,7 +95,7 @@ def _split(
         labelled = read_labelled_area(area)
         split = make_split(
             labelled.mapping,
-            labelled.dense,
+            labelled.tracked,
             labelled.evaluation,
             options.split,
             metric=labelled.units == "m",
@@ -146,7 +146,7 @@ def _write_files(
     labels = frames.labels
     listed = np.full(len(labels), which is not CambridgeFrames.NONE)
     if which is CambridgeFrames.CHOSEN:
-        listed = ~labels.dense
+        listed = ~labels.tracked
     cambridge = CambridgeFolder(folder / CAMBRIDGE, labelled.cameras)
     roles = {name: _role(name) for name in frames.split.groups()}
     with DatasetWriter(folder / DATASET, info, roles) as writer:

@@ -1,4 +1,4 @@
-"""Stage 4-dense/<sequence>: poses of the video frames between those that have one."""
+"""Stage 4-tracked/<sequence>: poses of the video frames between those that have one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import DENSE, EVALUATION, FRAMES, MODEL, Area
+from spn_data.area.area import EVALUATION, FRAMES, MODEL, TRACKED, Area
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import read_map
 from spn_data.errors import FormatError, InputError, StageError
@@ -36,8 +36,8 @@ from spn_data.registration.frame_covariance import (
     frame_covariances,
 )
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
-from spn_data.tracking.label_video import dense_labels
-from spn_data.tracking.tracked_frames import DenseOptions
+from spn_data.tracking.label_video import track_frames
+from spn_data.tracking.tracked_frames import TrackingOptions
 from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -53,13 +53,13 @@ def sequences_with_video(area: Area) -> list[str]:
     return [str(name) for name in names]
 
 
-def densify(
+def track_sequence(
     area: Area,
     sequence: str,
     progress: Progress,
     *,
     workers: int,
-    options: DenseOptions | None = None,
+    options: TrackingOptions | None = None,
     video: Path | None = None,
     overwrite: bool = False,
 ) -> StageRecord:
@@ -68,18 +68,18 @@ def densify(
     video : where to look for its files besides where they were. Raises StageError where the sequence is
     unknown, is not made of video, or its video is not found.
     """
-    options = options or DenseOptions()
+    options = options or TrackingOptions()
     frames = _frames_of(area, sequence)
-    work = area.begin(f"{DENSE}/{sequence}", asdict(options), {}, overwrite=overwrite)
+    work = area.begin(f"{TRACKED}/{sequence}", asdict(options), {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
     stopwatch = Stopwatch()
     before = map_hash(area.folder(MODEL))
     videos = find_videos(area, sequence, video)
-    labelled = read_labelled_area(area, mapping_covariance=False, dense=False)
+    labelled = read_labelled_area(area, mapping_covariance=False, tracked=False)
     known, seen_by_known = _known(labelled, sequence)
     with stopwatch.step("tracking"):
-        labels, seen = dense_labels(
+        labels, seen = track_frames(
             videos,
             frames,
             known,
@@ -121,7 +121,7 @@ def _frames_of(area: Area, sequence: str) -> Frames:
         frames = read_frames(area.folder(FRAMES) / "frames.csv")
         frames = frames.select(frames.sequences == sequence)
     if not len(frames):
-        left = f"{DENSE}/{sequence}"
+        left = f"{TRACKED}/{sequence}"
         more = f"; {left} is left of one, remove that folder" if area.has(left) else ""
         raise InputError(f"there is no sequence {sequence!r} in {area.root}{more}")
     return frames
@@ -131,7 +131,7 @@ def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, SeenPoints]:
     """Labels of the frames that were chosen, and the points that they see."""
     if sequence in labelled.evaluation:
         labels, seen = labelled.evaluation[sequence], labelled.evaluation_seen[sequence]
-        rows = np.flatnonzero(~labels.dense)
+        rows = np.flatnonzero(~labels.tracked)
     else:
         labels, seen = labelled.mapping, labelled.mapping_seen
         rows = np.flatnonzero(labels.sequences == sequence)

@@ -70,7 +70,10 @@ def attempts(options: ReconstructOptions) -> list[Attempt]:
         why = "intrinsics held until the end"
         ladder.append(replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False))
     why = "more features, wider pairs"
-    return [*ladder, Attempt("dense", why, "database-dense.db", more, pairs.wider(), more)]
+    return [
+        *ladder,
+        Attempt("more features", why, "database-more-features.db", more, pairs.wider(), more),
+    ]
 
 
 _FEW_SHARE = 0.2  # left out, above which it is not for the features of some frames

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
+from spn_data.colmap.job import MappingJob
+from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import Scene, count_registered, read_scene
 from spn_data.errors import StageError

@@ -174,7 +174,7 @@ def labels_of(chosen: Frames, registered: Registered) -> Labels:
     return Labels.of_frames(
         chosen,
         solution.poses,
-        dense=False,
+        tracked=False,
         reason=registered.reason,
         covariance=registered.covariances,
         inliers=registered.inliers,

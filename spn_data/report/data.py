@@ -28,7 +28,7 @@ class FrameTable:
     """N frames with what became of each, in the order of sequence and time. What is not known is NaN.
 
     names, sequences, cameras : (N,) str; evaluation : (N,) bool, of an evaluation sequence, not of the map;
-    dense : (N,) bool, not among the chosen frames; time_s : (N,) since the sequence's first frame.
+    tracked : (N,) bool, not among the chosen frames; time_s : (N,) since the sequence's first frame.
     status : (N,) str, "registered", "failed", "skipped" or "unreadable"; reason : (N,) str.
     poses : of the registered; sigma_m, sigma_deg : (N,) root of the trace of their covariance, 1 sigma.
     inliers : (N,) int, map points that the pose rests on; error_px : (N,) root mean square residual.
@@ -40,7 +40,7 @@ class FrameTable:
     sequences: np.ndarray
     cameras: np.ndarray
     evaluation: np.ndarray
-    dense: np.ndarray
+    tracked: np.ndarray
     time_s: np.ndarray
     status: np.ndarray
     reason: np.ndarray

@@ -69,9 +69,9 @@ def key_figures(data: ReportData) -> str:
         mine = data.frames.evaluation & (data.frames.sequences == name) & data.frames.tried
         more = _lens_and_gnss(data.evaluation_records.get(name))
         tiles.append(_labels_tile(f"Evaluation: {name}", data.frames, mine, unit, more))
-    dense = data.frames.dense & ~data.frames.evaluation & data.frames.tried
-    if dense.any():
-        tiles.append(_labels_tile("Dense frames of mapping", data.frames, dense, unit, []))
+    tracked = data.frames.tracked & ~data.frames.evaluation & data.frames.tried
+    if tracked.any():
+        tiles.append(_labels_tile("Tracked frames of mapping", data.frames, tracked, unit, []))
     if data.split is not None:
         counts = data.split.counts()
         others = [f"{n:,} {group}" for group, n in counts.items() if group != TRAIN]
@@ -110,9 +110,11 @@ def _labels_tile(
         known = values[np.isfinite(values)]
         if len(known):
             lines.append(f"{np.median(known):{form}} {text}")
-    chosen, dense = mask & ~frames.dense, mask & frames.dense
-    if chosen.any() and dense.any():
-        lines.append(f"of these dense: {(dense & frames.registered).sum():,} of {dense.sum():,}")
+    chosen, tracked = mask & ~frames.tracked, mask & frames.tracked
+    if chosen.any() and tracked.any():
+        lines.append(
+            f"of these tracked: {(tracked & frames.registered).sum():,} of {tracked.sum():,}"
+        )
     lines += more
     return _tile(title, f"{registered.sum():,} of {mask.sum():,}", "frames have a pose", lines)
 

@@ -103,7 +103,7 @@ def pack_frames(frames: FrameTable) -> dict[str, Any]:
     }
     flags = {
         "evaluation": frames.evaluation,
-        "dense": frames.dense,
+        "tracked": frames.tracked,
         "outlier": frames.gnss_outlier,
     }
     return {

@@ -10,14 +10,15 @@ from spn_data.report.data import FrameTable
 def thin_frames(frames: FrameTable, limit: int) -> tuple[FrameTable, dict[str, int]]:
     """At most about `limit` frames, and how many of what kind are left out.
 
-    Frames that failed, and chosen ones, all stay; candidates that were not chosen go first, then dense frames
+    Frames that failed, and chosen ones, all stay; candidates that were not chosen go first, then tracked
+    frames
     with a pose, each thinned evenly in time.
     """
     keep = np.ones(len(frames), bool)
     left_out: dict[str, int] = {}
     kinds = {
         "candidates that were not chosen": ~frames.tried,
-        "dense frames with a pose": frames.dense & frames.registered,
+        "tracked frames with a pose": frames.tracked & frames.registered,
     }
     for kind, mask in kinds.items():
         excess = int(keep.sum()) - limit

@@ -176,7 +176,7 @@ def _place(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
 def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
     frames = data.frames
     for name in data.evaluation_sequences:
-        mine = frames.evaluation & (frames.sequences == name) & ~frames.dense & frames.tried
+        mine = frames.evaluation & (frames.sequences == name) & ~frames.tracked & frames.tried
         total, registered = int(mine.sum()), int((mine & frames.registered).sum())
         if not total:
             continue
@@ -186,7 +186,7 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[Finding]:
             yield Finding(
                 Level.STOP,
                 text + ". It is of another place, or the map lacks its views.",
-                "Map those views, or remove the sequence's folders in 4-eval and 4-dense",
+                "Map those views, or remove the sequence's folders in 4-eval and 4-tracked",
             )
         elif share < limits.good_evaluation_share:
             few = "; a test on so few says little" if share < limits.min_evaluation_share else ""

@@ -142,7 +142,7 @@ def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> Fin
 
 
 def check_blocks(labels: Labels, split: Split) -> Finding:
-    """(b) Chosen and dense frames obey the same blocks. labels : of the mapping flights."""
+    """(b) Chosen and tracked frames obey the same blocks. labels : of the mapping flights."""
     group = split.of(labels.names)
     wrong = np.zeros(len(labels), dtype=bool)
     for block in split.blocks:
@@ -151,7 +151,7 @@ def check_blocks(labels: Labels, split: Split) -> Finding:
     for block in split.blocks:
         unblocked &= ~(block.holds(labels) & (group == block.group))
     return finding_of(
-        "chosen and dense frames obey the blocks",
+        "chosen and tracked frames obey the blocks",
         [f"{name} trains and lies in a held-out block" for name in labels.names[wrong]]
         + [f"{name} is held out and lies in no block" for name in labels.names[unblocked]],
         f"{len(split.blocks)} blocks hold {int(np.isin(group, (VALIDATION, TEST)).sum())} frames, "

@@ -48,7 +48,7 @@ def check_labels(parts: Mapping[str, Labels]) -> Finding:
 def check_covered(parts: Mapping[str, Labels], split: Split) -> Finding:
     """The split knows every frame exactly once; those with a pose have a group or a reason, others none.
 
-    parts : all labels, "mapping", "dense", and each evaluation sequence by its name.
+    parts : all labels, "mapping", "tracked", and each evaluation sequence by its name.
     """
     names, times = np.unique(split.names, return_counts=True)
     bad = [
@@ -60,7 +60,7 @@ def check_covered(parts: Mapping[str, Labels], split: Split) -> Finding:
     reason = dict(zip(split.names.tolist(), split.reason.tolist(), strict=True))
     known: set[str] = set()
     for part, labels in parts.items():
-        allowed = {part} if part not in ("mapping", "dense") else {TRAIN, VALIDATION, TEST}
+        allowed = {part} if part not in ("mapping", "tracked") else {TRAIN, VALIDATION, TEST}
         for name, registered in zip(labels.names.tolist(), labels.registered.tolist(), strict=True):
             known.add(name)
             if name not in group:

@@ -38,7 +38,7 @@ class SplitOptions:
     cell_m: float = 4.0  # edge of a cell in plan view (space)
     guard_distance_m: float = 3.0  # in plan view, from validation to training (space)
     guard_height_m: float = 1.0  # in height, from validation to training (height)
-    dense: bool = True  # frames that were not chosen take part
+    tracked: bool = True  # frames that were not chosen take part
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -138,7 +138,7 @@ def next_to(labels: Labels, held: np.ndarray) -> np.ndarray:
     near = np.zeros(len(labels), dtype=bool)
     for sequence in np.unique(labels.sequences[held]):
         mine = labels.sequences == sequence
-        chosen = np.sort(labels.time_s[mine & labels.registered & ~labels.dense])
+        chosen = np.sort(labels.time_s[mine & labels.registered & ~labels.tracked])
         times, own = np.sort(labels.time_s[mine & held]), labels.time_s[mine]
         after = np.searchsorted(times, own)
         before = after - 1

@@ -45,7 +45,7 @@ _MAX_CANDIDATES = 64
 
 def make_split(
     mapping: Labels,
-    dense: Labels,
+    tracked: Labels,
     evaluation: Mapping[str, Labels],
     options: SplitOptions,
     *,
@@ -53,7 +53,7 @@ def make_split(
 ) -> Split:
     """Mapping frames train, but for held-out blocks; each evaluation sequence is a group of its own.
 
-    mapping : chosen frames of the mapping flights; dense : their other frames; evaluation : by sequence.
+    mapping : chosen frames of the mapping flights; tracked : their other frames; evaluation : by sequence.
     metric : whether the poses are in metres with a known up.
     Where no evaluation frame has a pose, one block in time is held out as "test". The same frames, options
     and seed give the same split, whatever their order; a sequence's blocks do not depend on the others'.
@@ -67,7 +67,7 @@ def make_split(
             f"--validation {options.validation} needs metres and a known up; the model is in its own "
             "gauge: use --validation time, or run spn-data georegister first"
         )
-    flights = Labels.concatenate([mapping, dense])
+    flights = Labels.concatenate([mapping, tracked])
     plan = _Plan(flights, options, *_columns(flights, TRAIN, options))
     if not plan.trained.any():
         raise GeometryError("no mapping frame has a pose; nothing can be trained on")
@@ -105,7 +105,7 @@ class _Plan:
     @property
     def trained(self) -> np.ndarray:
         """(N,) bool: chosen frames that train as yet."""
-        return np.asarray((self.group == TRAIN) & ~self.flights.dense)
+        return np.asarray((self.group == TRAIN) & ~self.flights.tracked)
 
     def rng(self, purpose: str) -> np.random.Generator:
         """Of its own for each purpose, so that one draw does not move another."""
@@ -152,9 +152,9 @@ def _columns(labels: Labels, group: str, options: SplitOptions) -> tuple[np.ndar
     failed = [f"failed: {why}" if why else "failed" for why in labels.reason.tolist()]
     reason = np.where(labels.registered, "", np.array(failed, dtype=object))
     groups = np.where(labels.registered, np.array(group, dtype=object), LEFT_OUT)
-    if not options.dense:
-        left_out = labels.dense & labels.registered
-        groups[left_out], reason[left_out] = LEFT_OUT, "dense frames are left out"
+    if not options.tracked:
+        left_out = labels.tracked & labels.registered
+        groups[left_out], reason[left_out] = LEFT_OUT, "tracked frames are left out"
     return groups, reason
 
 
@@ -209,7 +209,7 @@ def _validate_sequence(plan: _Plan, sequence: str) -> _Plan:
 def _rows(plan: _Plan, sequence: str) -> np.ndarray:
     """Chosen frames of a sequence that have a pose, by time."""
     flights = plan.flights
-    rows = np.flatnonzero((flights.sequences == sequence) & flights.registered & ~flights.dense)
+    rows = np.flatnonzero((flights.sequences == sequence) & flights.registered & ~flights.tracked)
     return np.asarray(rows[np.lexsort((flights.names[rows], flights.time_s[rows]))])
 
 
@@ -240,7 +240,9 @@ def _hold_out_one(
     if len(blocks) > _MAX_CANDIDATES:
         picked = np.linspace(0, len(blocks) - 1, _MAX_CANDIDATES).round().astype(int)
         blocks = [blocks[k] for k in picked]
-    chosen = np.flatnonzero(~plan.flights.dense)  # the others, often many more, decide nothing here
+    chosen = np.flatnonzero(
+        ~plan.flights.tracked
+    )  # the others, often many more, decide nothing here
     small = replace(
         plan,
         flights=plan.flights.select(chosen),
@@ -306,8 +308,8 @@ _VALIDATION = {
 def _check_filled(plan: _Plan, groups: Sequence[str]) -> None:
     options = plan.options
     for group in groups:
-        if not ((plan.group == group) & ~plan.flights.dense).any():
-            registered = int((plan.flights.registered & ~plan.flights.dense).sum())
+        if not ((plan.group == group) & ~plan.flights.tracked).any():
+            registered = int((plan.flights.registered & ~plan.flights.tracked).sum())
             raise GeometryError(
                 f"--validation {options.validation} with a gap of {options.gap_s:g} s leaves no frame for "
                 f"{group}, of {registered} mapping frames with a pose; try a smaller "

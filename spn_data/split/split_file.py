@@ -19,7 +19,7 @@ from spn_data.split.groups import (
     Split,
     SplitOptions,
 )
-from spn_data.storage.record import VERSION, read_json, write_json
+from spn_data.storage.record import VERSION, current_options, read_json, write_json
 
 _NOT_FREE = (
     "Validation frames were bundle-adjusted jointly with the training frames: poses and points of both "
@@ -69,7 +69,7 @@ def read_split(path: Path) -> Split:
     """The frames by group, those left out last. Raises FormatError where it is not of `write_split`."""
     table = read_json(path)
     try:
-        options = dict(table["options"])
+        options = current_options(table["options"])
         options["validation"] = Policy(options["validation"])
         names, group, reason = [], [], []
         for own, members in table["groups"].items():

@@ -15,6 +15,9 @@ from spn_data.errors import FormatError
 from spn_data.storage.files import write_whole
 
 VERSION = 1  # of the area's layout and of stage.json
+# Names that version 0.1 used in stage.json and split.json, and what they are called now.
+_RENAMED_GROUPS = {"4-dense": "4-tracked"}
+_RENAMED_OPTIONS = {"dense": "tracked"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +43,35 @@ class StageRecord:
     @property
     def made_of(self) -> dict[str, Any]:
         """What decides whether a stage would come out the same."""
-        made_of = {"options": self.options, "inputs": self.inputs, "upstream": self.upstream}
+        upstream = {current_stage(name): value for name, value in self.upstream.items()}
+        made_of = {
+            "options": current_options(self.options),
+            "inputs": self.inputs,
+            "upstream": upstream,
+        }
         return dict(json.loads(json.dumps(made_of)))
 
     def fingerprint(self) -> str:
         """Changes whenever the stage is made anew from something else."""
-        content = json.dumps({"of": self.made_of, "counts": self.counts}, sort_keys=True)
+        made_of = {"options": self.options, "inputs": self.inputs, "upstream": self.upstream}
+        content = json.dumps({"of": made_of, "counts": self.counts}, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def current_stage(name: str) -> str:
+    """Return the name that a stage has in this version, given the one that its record has."""
+    group, slash, rest = name.partition("/")
+    return _RENAMED_GROUPS.get(group, group) + slash + rest
+
+
+def current_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return recorded options under the names that they have in this version, nested groups too."""
+    return {
+        _RENAMED_OPTIONS.get(name, name): current_options(value)
+        if isinstance(value, Mapping)
+        else value
+        for name, value in options.items()
+    }
 
 
 def content_fingerprint(path: Path) -> str:
@@ -104,7 +129,9 @@ def check_version(path: Path, found: int) -> None:
 
 def difference(found: StageRecord, wanted: StageRecord) -> str:
     """In words, what two records are made of that differs."""
-    for name, before, now in _changed_options(found.options, wanted.options):
+    for name, before, now in _changed_options(
+        current_options(found.options), current_options(wanted.options)
+    ):
         return f"was made with {name} = {before!r}, now {now!r}"
     new = sorted(set(wanted.inputs) - set(found.inputs))
     gone = sorted(set(found.inputs) - set(wanted.inputs))

@@ -15,21 +15,21 @@ from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.labels.map_points import MapPoints
 from spn_data.tracking.point_tracking import between, track_segment
 from spn_data.tracking.segments import SequenceToLabel, read_segments
-from spn_data.tracking.tracked_frames import DenseOptions, TrackedFrame, failed
+from spn_data.tracking.tracked_frames import TrackedFrame, TrackingOptions, failed
 from spn_data.work.parallel import run_batches
 from spn_data.work.timing import Progress
 
 _STEP = "label the frames between"
 
 
-def dense_labels(
+def track_frames(
     videos: Sequence[Path],
     frames: Frames,
     labelled: Labels,
     seen: SeenPoints,
     cameras: dict[str, Camera],
     points: MapPoints,
-    options: DenseOptions,
+    options: TrackingOptions,
     *,
     workers: int = 1,
     progress: Progress | None = None,
@@ -69,7 +69,7 @@ def dense_labels(
 
 
 def drop_jumps(
-    sequence: SequenceToLabel, found: dict[int, TrackedFrame], options: DenseOptions
+    sequence: SequenceToLabel, found: dict[int, TrackedFrame], options: TrackingOptions
 ) -> None:
     """Fails, in place, frames that lie off the motion of those before and after; the worst one first."""
     times = sequence.frames.time_s
@@ -112,7 +112,7 @@ def _labels(sequence: SequenceToLabel, found: dict[int, TrackedFrame]) -> tuple[
     labels = Labels.of_frames(
         frames,
         Poses.concatenate(r.poses for r in results),
-        dense=True,
+        tracked=True,
         reason=[r.reason for r in results],
         covariance=np.full((n, 6, 6), np.nan),
         inliers=np.array([len(r.point_ids) for r in results], dtype=np.int64),

@@ -15,10 +15,10 @@ from spn_data.geometry.grouping import number_within
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
 from spn_data.labels.map_points import covered_share
-from spn_data.tracking.tracked_frames import Anchor, DenseOptions, Segment, TrackedFrame, failed
+from spn_data.tracking.tracked_frames import Anchor, Segment, TrackedFrame, TrackingOptions, failed
 
 
-def track_segment(segment: Segment, options: DenseOptions) -> list[TrackedFrame]:
+def track_segment(segment: Segment, options: TrackingOptions) -> list[TrackedFrame]:
     """The frames of a segment in its order; a pure function.
 
     Those nearest to a labelled frame come first, so that each begins where its neighbours point to.
@@ -85,7 +85,7 @@ class _Prepared:
 
     @classmethod
     def of(
-        cls, anchor: Anchor, camera: Camera, shrunk: np.ndarray, options: DenseOptions
+        cls, anchor: Anchor, camera: Camera, shrunk: np.ndarray, options: TrackingOptions
     ) -> _Prepared:
         pixels = anchor.pixels * shrunk
         rows = spread(pixels, camera.width, camera.height, options.max_points)
@@ -96,7 +96,7 @@ class _Prepared:
         return cls(anchor.time_s, anchor.gray, small, start, ids, xyz, pixels)
 
 
-def _small(gray: np.ndarray, options: DenseOptions) -> np.ndarray:
+def _small(gray: np.ndarray, options: TrackingOptions) -> np.ndarray:
     """The image of the first search. (cv2.pyrDown would shift it by half a pixel.)"""
     size = (gray.shape[1] >> options.start_halvings, gray.shape[0] >> options.start_halvings)
     return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
@@ -120,7 +120,7 @@ def follow(
     pixels: np.ndarray,
     expected: np.ndarray,
     levels: int,
-    options: DenseOptions,
+    options: TrackingOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (K, 2) of patches in another image, begun at the expected ones, and which (K,) were found.
 
@@ -157,7 +157,7 @@ def _track_frame(
     camera: Camera,
     anchors: list[_Prepared],
     guesses: list[Poses],
-    options: DenseOptions,
+    options: TrackingOptions,
 ) -> TrackedFrame:
     """From each labelled frame a rough pose by few points, then all its points; then the checks.
 
@@ -190,7 +190,7 @@ def _rough_pose(
     camera: Camera,
     anchor: _Prepared,
     guesses: list[Poses],
-    options: DenseOptions,
+    options: TrackingOptions,
 ) -> Poses | None:
     """From the first guess with which the anchor's points agree with each other."""
     height, width = small.shape
@@ -223,7 +223,7 @@ class _Tracks:
 
 
 def _tracks(
-    anchor: _Prepared, gray: np.ndarray, rough: Poses, camera: Camera, options: DenseOptions
+    anchor: _Prepared, gray: np.ndarray, rough: Poses, camera: Camera, options: TrackingOptions
 ) -> _Tracks:
     expected = _project(camera, rough, anchor.xyz)
     there, found = follow(anchor.gray, gray, anchor.pixels, expected, options.levels, options)
@@ -245,7 +245,7 @@ def _fit(tracks: _Tracks, start: Poses, camera: Camera) -> PoseFit | None:
 
 
 def _checked(
-    tracks: _Tracks, fit: PoseFit, answers: list[PoseFit], camera: Camera, options: DenseOptions
+    tracks: _Tracks, fit: PoseFit, answers: list[PoseFit], camera: Camera, options: TrackingOptions
 ) -> TrackedFrame:
     """The frame with its figures; without its label where they speak against it."""
     good = fit.inliers(options.max_error_px)
@@ -280,7 +280,7 @@ def _checked(
     return failed(objection) if objection else frame
 
 
-def _objection(frame: TrackedFrame, options: DenseOptions) -> str:
+def _objection(frame: TrackedFrame, options: TrackingOptions) -> str:
     """Why a pose is not to be trusted; empty where it is."""
     if frame.inlier_ratio < options.min_inlier_ratio:
         return f"only {frame.inlier_ratio:.0%} of its points agree with its pose"

@@ -13,7 +13,7 @@ from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
 from spn_data.labels.labels import Labels, SeenPoints
 from spn_data.labels.map_points import MapPoints
-from spn_data.tracking.tracked_frames import Anchor, DenseOptions, Segment
+from spn_data.tracking.tracked_frames import Anchor, Segment, TrackingOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class _Open:
 def read_segments(
     sequence: SequenceToLabel,
     videos: Sequence[Path],
-    options: DenseOptions,
+    options: TrackingOptions,
     reasons: dict[int, str],
 ) -> Iterator[Segment]:
     """Segments in the order of time. Fills `reasons` for the rows that come in none.
@@ -83,7 +83,7 @@ def read_segments(
 
 
 def _images(
-    frames: Frames, videos: Sequence[Path], options: DenseOptions
+    frames: Frames, videos: Sequence[Path], options: TrackingOptions
 ) -> Iterator[tuple[int, np.ndarray]]:
     """(row, grey image) of the frames in the order of time."""
     row_of = {

@@ -11,7 +11,7 @@ from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, kw_only=True)
-class DenseOptions:
+class TrackingOptions:
     """How frames are followed, and when a pose becomes a label.
 
     Pixels are those of the image in which points are followed. Lengths are shares of the median distance

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,10 @@ from spn_model.evaluation.evaluate import check_world
 from spn_model.evaluation.validation import spread_rows
 from spn_model.export.bundle_checks import (
     ExportOptions,
-    GroupErrors,
-    Parity,
     compare_with_pytorch,
     measure_errors,
 )
+from spn_model.export.exported import Exported
 from spn_model.export.graphs import Deployment, deployment, write_graph
 from spn_model.export.model_card import model_card
 from spn_model.export.quantization import quantize
@@ -45,18 +44,6 @@ from spn_model.onboard.bundle import (
     sha256_of,
     verified,
 )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Exported:
-    """What was written, and what was found. bytes : by precision; errors : float32, then int8, of a group."""
-
-    folder: Path
-    units: str
-    bytes: Mapping[str, int]
-    parity: Parity
-    errors: tuple[GroupErrors, ...]
-    notes: tuple[str, ...] = field(default=())
 
 
 def export(

@@ -13,7 +13,7 @@ from spn_model.pretrained.weights import of_name
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_checks import GroupErrors
-    from spn_model.export.bundle_export import Exported
+    from spn_model.export.exported import Exported
 
 
 def model_card(

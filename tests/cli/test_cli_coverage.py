@@ -46,7 +46,7 @@ def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
         cameras=np.full(n, name),
         sources=np.full(n, f"{name}.mp4"),
         video_frame=np.arange(n),
-        dense=np.zeros(n, bool),
+        tracked=np.zeros(n, bool),
         time_s=np.arange(n) / 2,
         status=np.array(status),
         reason=np.where(failed, "ambiguous", ""),

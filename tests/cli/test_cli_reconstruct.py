@@ -259,7 +259,7 @@ def test_a_model_that_is_contradicted_is_made_again(
     notes = Area(tmp_path / "area").record(MODEL).notes
     assert notes.count(words) == (3 if stays else 1)
     assert any(note.startswith("steady attempt") for note in notes)
-    assert any(note.startswith("dense attempt") for note in notes) == stays
+    assert any(note.startswith("more features attempt") for note in notes) == stays
 
 
 _MISPLACED = "flight1/000008.jpg"

@@ -378,10 +378,10 @@ def test_defaults_of_the_command_are_those_of_the_option_classes() -> None:
     """Help, docs and library agree on what happens without options."""
     given = {p.name: p.default for p in main.commands["split"].params}
     for field in fields(SplitOptions):
-        if field.name != "dense":
+        if field.name != "tracked":
             assert given[field.name] == field.default, field.name
     assert given["cambridge"] == SplitStageOptions().cambridge
-    assert given["no_dense"] is not SplitOptions().dense
+    assert given["no_tracked"] is not SplitOptions().tracked
 
 
 def test_checks_and_fields_are_documented(split_area: Path) -> None:

@@ -1,4 +1,4 @@
-"""`spn-data split` and `audit` on an area with an evaluation sequence and dense frames."""
+"""`spn-data split` and `audit` on an area with an evaluation sequence and tracked frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(*arguments: object) -> Result:
 def registered_area(
     finished_area: Path, flight2: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """The area with the second flight registered at one frame a second, the others dense."""
+    """The area with the second flight registered at one frame a second, the others tracked."""
     area = tmp_path_factory.mktemp("evaluated") / "area"
     shutil.copytree(finished_area, area)
     options = ("--name", "medium", "--rate", 1, "--all-frames", "--any-telemetry", "--threads", 1)
@@ -64,7 +64,7 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path) -> None:
-    """Chosen and dense frames, points not for training, none of it in the map's groups; not optimistic."""
+    """Chosen and tracked frames, points not for training, none of it in the map's groups; not optimistic."""
     split = read_split(split_area / SPLIT / "split.json")
     assert split.groups() == ("train", "validation", "medium")
     assert not split.optimistic
@@ -74,7 +74,7 @@ def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path)
         (medium,) = (g for g in dataset.groups.values() if g.role is Role.TEST)
         assert medium.name == "medium"
         assert not medium.points_for_training
-        assert 0 < medium.dense.sum() < len(medium)
+        assert 0 < medium.tracked.sum() < len(medium)
         assert len(medium) == labelled.evaluation["medium"].registered.sum()
         assert set(medium.strata.tolist()) <= {"high", "medium", "low"}
         assert len(medium.points(0).ids) > 50
@@ -85,11 +85,11 @@ def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path)
 
 
 def test_dense_images_are_those_of_the_video(split_area: Path, flight2: Path) -> None:
-    """The stored image of a dense frame resembles its neighbours in time more than distant ones."""
+    """The stored image of a tracked frame resembles its neighbours in time more than distant ones."""
     with Dataset(split_area / SPLIT / "dataset.h5") as dataset:
         medium = dataset.groups["medium"]
         order = np.argsort(medium.time_s)
-        rows = [k for k in range(1, len(order) - 1) if medium.dense[order[k]]]
+        rows = [k for k in range(1, len(order) - 1) if medium.tracked[order[k]]]
         for k in rows:
             image, near, far = (
                 medium.image(int(row)).astype(float)[::4, ::4].ravel()
@@ -101,7 +101,7 @@ def test_dense_images_are_those_of_the_video(split_area: Path, flight2: Path) ->
 def test_the_test_list_holds_the_sequence_and_the_model_no_measurement_of_it(
     split_area: Path,
 ) -> None:
-    """dataset_test.txt lists chosen frames only; with --cambridge all, the dense ones too."""
+    """dataset_test.txt lists chosen frames only; with --cambridge all, the tracked ones too."""
     folder = split_area / SPLIT / "cambridge"
     listed = read_cambridge(folder / "dataset_test.txt")
     labels = read_labels(split_area / EVALUATION / "medium" / "poses.csv")
@@ -117,10 +117,10 @@ def test_dense_frames_may_stand_in_all_lists_or_nowhere(area: Path) -> None:
     assert every.exit_code == 0, every.output
     listed = read_cambridge(area / SPLIT / "cambridge" / "dataset_test.txt")
     assert len(listed) == read_split(area / SPLIT / "split.json").counts()["medium"]
-    none = run("split", "--area", area, "--no-dense", "--overwrite")
+    none = run("split", "--area", area, "--no-tracked", "--overwrite")
     assert none.exit_code == 0, none.output
     with Dataset(area / SPLIT / "dataset.h5") as dataset:
-        assert not any(group.dense.any() for group in dataset.groups.values())
+        assert not any(group.tracked.any() for group in dataset.groups.values())
 
 
 def test_a_copy_of_the_mapping_flight_is_noticed(split_area: Path) -> None:
@@ -177,7 +177,7 @@ def test_what_was_planted_fails_the_audit(
     area: Path, plant: Callable[[Path], None], check: str
 ) -> None:
     plant(area)
-    for stage in ("4-dense/medium", SPLIT):  # what a forger would mend too
+    for stage in ("4-tracked/medium", SPLIT):  # what a forger would mend too
         now = {s: Area(area).record(s).fingerprint() for s in Area(area).record(stage).upstream}
         rewrite(area / stage / "stage.json", lambda value, now=now: value.update(upstream=now))
     result = run("audit", "--area", area)

@@ -41,7 +41,7 @@ def flight(
         sequences=np.full(count, name),
         cameras=np.full(count, name),
         evaluation=np.full(count, is_evaluation),
-        dense=np.zeros(count, bool),
+        tracked=np.zeros(count, bool),
         time_s=np.arange(count) * 0.5,
         status=np.where(has, "registered", "failed"),
         reason=np.where(has, "", "failed: ambiguous"),

@@ -3,7 +3,7 @@
 function makeTable(onPick) {
   const box = document.getElementById("table");
   const ROW = 26;
-  const kind = i => (frames.evaluation[i] ? "evaluation" : "mapping") + (frames.dense[i] ? ", dense" : "");
+  const kind = i => (frames.evaluation[i] ? "evaluation" : "mapping") + (frames.tracked[i] ? ", tracked" : "");
   const horizontal = i => Math.hypot(frames.gnss_m[3 * i], frames.gnss_m[3 * i + 1]);
   const number = (label, title, width, value, digits) => ({label, title, width, value, digits, number: true});
   const text = (label, title, width, value) => ({label, title, width, value});
@@ -11,7 +11,7 @@ function makeTable(onPick) {
   const columns = [
     text("frame", "name of the image", 175, frames.name),
     text("sequence", "", 90, frames.sequence),
-    text("kind", "of the map, or of an evaluation sequence; dense: not among the chosen frames", 130, kind),
+    text("kind", "of the map, or of an evaluation sequence; tracked: not among the chosen frames", 130, kind),
     number("time, s", "since the sequence's first frame", 85, i => frames.time_s[i], 2),
     text("status", "", 85, frames.status),
     ...axes.map((axis, k) => number(`${axis}, ${unit}`, "of the camera centre", 90, i => frames.center[3 * i + k], 3)),

@@ -1,10 +1,10 @@
-// One strip a sequence: a tick for every frame, by time. Chosen frames fill the height, dense ones the
+// One strip a sequence: a tick for every frame, by time. Chosen frames fill the height, tracked ones the
 // middle, candidates that were not chosen the lower edge.
 
 function makeTimeline(onPick) {
   const box = document.getElementById("timeline");
   if (!box) return {draw() {}, pick() {}};
-  const colors = {registered: "--mapping", chosen: "--dense", failed: "--failed", skipped: "--skipped", unreadable: "--unreadable"};
+  const colors = {registered: "--mapping", chosen: "--tracked", failed: "--failed", skipped: "--skipped", unreadable: "--unreadable"};
   const key = element("div", {class: "key"});
   for (const status of Object.keys(colors)) {
     const n = rows.filter(i => frames.status(i) === status).length;
@@ -30,7 +30,7 @@ function makeTimeline(onPick) {
     const find = px => {
       let best = -1, least = 12;
       for (const i of mine) {
-        const far = Math.abs(x(i) - px) + (tried(i) ? 0 : 2) + (frames.dense[i] ? 1 : 0);
+        const far = Math.abs(x(i) - px) + (tried(i) ? 0 : 2) + (frames.tracked[i] ? 1 : 0);
         if (far < least) { least = far; best = i; }
       }
       return best;
@@ -59,7 +59,7 @@ function makeTimeline(onPick) {
         const status = frames.status(i);
         const color = status === "registered" && frames.evaluation[i] ? "--evaluation" : colors[status];
         const failed = status === "failed";
-        const [top, height] = !tried(i) && status !== "chosen" ? [0.72, 0.28] : frames.dense[i] ? [0.36, 0.3] : [0, failed ? 1 : 0.66];
+        const [top, height] = !tried(i) && status !== "chosen" ? [0.72, 0.28] : frames.tracked[i] ? [0.36, 0.3] : [0, failed ? 1 : 0.66];
         context.fillStyle = css(color);
         context.fillRect(4 * scale + frames.time_s[i] / last * w - scale / 2, top * h, Math.max(1, (failed ? 2.5 : 1.2) * scale), height * h);
       }

@@ -23,7 +23,7 @@ function path(out, wanted) {
 
 const rows = Array.from({length: frames.count}, (_, i) => i);
 const posed = rows.filter(hasPose);
-const stills = posed.filter(i => !frames.dense[i]);
+const stills = posed.filter(i => !frames.tracked[i]);
 
 // Size of a camera's pyramid: somewhat less than the usual step between neighbours.
 function usualSize() {
@@ -60,12 +60,12 @@ function makeLayers(size) {
     i => frames.evaluation[i] && frames.sequence(i) === name));
   const track = (label, color, evaluation) => {
     const xyz = [];
-    path(xyz, i => (frames.dense[i] || hasPose(i)) && !!frames.evaluation[i] === evaluation && tried(i));
-    if (rows.some(i => frames.dense[i] && hasPose(i) && !!frames.evaluation[i] === evaluation))
+    path(xyz, i => (frames.tracked[i] || hasPose(i)) && !!frames.evaluation[i] === evaluation && tried(i));
+    if (rows.some(i => frames.tracked[i] && hasPose(i) && !!frames.evaluation[i] === evaluation))
       add(label, color, {lines: true, xyz: new Float32Array(xyz), rgb: color});
   };
-  track("dense, mapping", "--dense", false);
-  track("dense, evaluation", "--evaluation", true);
+  track("tracked, mapping", "--tracked", false);
+  track("tracked, evaluation", "--evaluation", true);
   const fixes = [], arm = 0.25 * size;
   for (const i of posed) {
     const g = frames.gnss_m.subarray(3 * i, 3 * i + 3);
@@ -232,7 +232,7 @@ function makeView(onPick) {
     for (const i of posed) {
       const [px, py, w] = onScreen(m, ...centerOf(i));
       if (w <= 0) continue;
-      const far = Math.hypot(px - x, py - y) + (frames.dense[i] ? 4 : 0);
+      const far = Math.hypot(px - x, py - y) + (frames.tracked[i] ? 4 : 0);
       if (far < least) { least = far; best = i; }
     }
     return best;

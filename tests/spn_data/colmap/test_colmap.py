@@ -9,7 +9,8 @@ import pytest
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.colmap.mapping import MappingJob, latest_snapshot, refine, run_mapping, triangulate
+from spn_data.colmap.job import MappingJob
+from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.model import (
     count_registered,
     read_observations,

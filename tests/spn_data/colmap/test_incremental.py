@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from spn_data.colmap import incremental, pycolmap
-from spn_data.colmap.mapping import MappingJob, latest_snapshot
+from spn_data.colmap.job import MappingJob
+from spn_data.colmap.mapping import latest_snapshot
 from spn_data.colmap.model import scene_of
 from spn_data.geometry.pose import Similarity
 from spn_data.work import child

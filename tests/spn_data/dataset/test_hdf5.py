@@ -50,7 +50,7 @@ def frame(group: str, k: int) -> DatasetFrame:
         quat_wxyz=canonical_quats(rng.normal(size=4)),
         covariance=rng.normal(size=(6, 6)),
         intrinsics=CAMERA.matrix,
-        dense=bool(k % 2),
+        tracked=bool(k % 2),
         stratum=("high", "medium", "low", "")[k % 4],
         image=rng.integers(0, 256, (27, 48, 3)).astype(np.uint8),
         valid=PART if group == "low" and k % 3 == 0 else None,
@@ -95,7 +95,7 @@ def test_what_is_written_comes_back(written):
                 assert group.sequences[k] == wanted.sequence
                 assert group.strata[k] == wanted.stratum
                 assert group.time_s[k] == wanted.time_s
-                assert group.dense[k] == wanted.dense
+                assert group.tracked[k] == wanted.tracked
                 assert (group.poses.centers[k] == wanted.center).all()
                 assert (group.poses.quats_wxyz[k] == wanted.quat_wxyz).all()
                 assert (group.covariance[k] == wanted.covariance).all()

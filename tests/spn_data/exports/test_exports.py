@@ -81,7 +81,7 @@ def add_evaluation(root: Path) -> None:
             "names": np.array([f"again/{k:06d}.jpg" for k in range(6)]),
             "sequences": np.full(6, "again"),
             "cameras": np.full(6, "again"),
-            "dense": np.arange(6) == 4,
+            "tracked": np.arange(6) == 4,
             "time_s": np.arange(6) / 2,
             "status": np.where(failed, "failed", "registered"),
             "reason": np.where(failed, "failed: too few", ""),
@@ -174,7 +174,7 @@ def test_tum_is_read_by_evo(
     assert [path.stem for path in read_files] == ["again", "flight1"]
     for path in read_files:
         labels = labelled.evaluation.get(path.stem, labelled.mapping)
-        labels = labels.select(labels.registered & ~labels.dense)
+        labels = labels.select(labels.registered & ~labels.tracked)
         found = read(str(path))
         assert found.check()[0], found.check()
         assert np.allclose(found.timestamps, labels.time_s, rtol=0, atol=1e-6)
@@ -219,7 +219,7 @@ def test_colmap_models_are_read_by_pycolmap(
     for image_id, image in source.images.items():
         assert found.images[image_id].num_points3D == image.num_points3D
     labels, seen = labelled.evaluation["again"], labelled.evaluation_seen["again"]
-    for row in np.flatnonzero(labels.registered & ~labels.dense):
+    for row in np.flatnonzero(labels.registered & ~labels.tracked):
         ids, pixels = seen.of_frame(row)
         points = images[labels.names[row]].get_observation_points2D()
         assert [p.point3D_id for p in points] == ids.tolist()
@@ -529,7 +529,7 @@ def one_frame(reference: HeightReference, center: np.ndarray) -> ExportedFrames:
         cameras=np.array(["a"]),
         sources=np.array(["a.mp4"]),
         video_frame=np.zeros(1, np.int64),
-        dense=np.zeros(1, bool),
+        tracked=np.zeros(1, bool),
         time_s=np.zeros(1),
         status=np.array(["registered"]),
         reason=np.array([""]),

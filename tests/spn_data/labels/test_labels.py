@@ -39,7 +39,7 @@ def labels(count: int = 4, name: str = "low") -> Labels:
         cameras=np.full(count, name),
         sources=np.full(count, f"{name}.mp4"),
         video_frame=np.arange(count) * 5,
-        dense=np.arange(count) % 2 == 1,
+        tracked=np.arange(count) % 2 == 1,
         time_s=np.arange(count) / 3,
         status=np.where(has, "registered", "failed"),
         reason=np.where(has, "", 'ambiguous: "two", or more'),

@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner, Result
 from spn_cli.data import main
 
-from spn_data.area.area import DENSE, EVALUATION, GEO, MODEL, Area
+from spn_data.area.area import EVALUATION, GEO, MODEL, TRACKED, Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
@@ -118,7 +118,7 @@ def test_an_evaluation_flight_gets_true_poses_with_covariances(
     """All frames, by a lens that was not given; the frames between too; no label is wrong."""
     labelled = read_labelled_area(Area(registered))
     labels = labelled.evaluation["medium"]
-    chosen = labels.select(~labels.dense)
+    chosen = labels.select(~labels.tracked)
     assert len(chosen) == 7
     assert chosen.registered.all()
     error_m, error_deg = errors(labelled, labels, flight1)
@@ -143,7 +143,7 @@ def test_the_map_is_not_touched(registered: Path, finished_area: Path) -> None:
             assert path.is_dir() or path.read_bytes() == same.read_bytes(), path
         names = {p.name for p in (registered / stage).iterdir()}
         assert names == {p.name for p in (finished_area / stage).iterdir()}
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         told = read_json(registered / group / "medium" / "registration.json")
         assert told["map_before"] == told["map_after"] == map_hash(finished_area / MODEL)
     told = read_json(registered / EVALUATION / "medium" / "registration.json")
@@ -169,7 +169,7 @@ def test_the_same_again_is_left_alone(area: Path, flight2: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in (area / EVALUATION).rglob("*")}
     again = register(area, flight2 / "flight2.mp4", "--name", "medium", *FAST, "--all-frames")
     assert f"{EVALUATION}/medium: unchanged since" in again.stdout
-    assert f"{DENSE}/medium: unchanged since" in again.stdout
+    assert f"{TRACKED}/medium: unchanged since" in again.stdout
     assert {p: p.stat().st_mtime_ns for p in (area / EVALUATION).rglob("*")} == before
 
 
@@ -181,7 +181,7 @@ def test_another_place_fails_entirely_and_says_so(bare: Path, other_place: Path)
     assert not labels.registered.any()
     assert all(labels.reason.tolist())
     assert np.isnan(labels.poses.centers).all()
-    between = read_labels(poses_file(bare, "elsewhere", DENSE))
+    between = read_labels(poses_file(bare, "elsewhere", TRACKED))
     assert len(between) == 4
     assert not between.registered.any()
     labelled = read_labelled_area(Area(bare), mapping_covariance=False)
@@ -299,7 +299,7 @@ def test_frames_between_those_of_the_map_get_labels(flight1: Path, tmp_path: Pat
     assert made.exit_code == 0, made.output
     register(area, "--all-frames", "--threads", "1")
     labelled = read_labelled_area(Area(area))
-    between = labelled.dense
+    between = labelled.tracked
     total = len(read_truth(flight1.parent / "truth", "flight1").poses)
     assert len(between) == total - len(labelled.mapping) > 4
     assert between.registered.sum() > 2
@@ -315,7 +315,7 @@ def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
     area: Path, flight2: Path, tmp_path: Path
 ) -> None:
     """The area remembers where it was; gone from there, --video says where it lies now."""
-    shutil.rmtree(area / DENSE)
+    shutil.rmtree(area / TRACKED)
     facts = area / "area.toml"
     facts.write_text(facts.read_text().replace(str(flight2), str(tmp_path / "gone")))
     lost = run("register", "--all-frames", "--name", "medium", "--threads", "1", "--area", area)
@@ -324,7 +324,7 @@ def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
     assert "--video" in lost.stderr
     options = ("--all-frames", "--name", "medium", "--threads", "1", "--video", flight2)
     register(area, *options)
-    assert read_labels(poses_file(area, group=DENSE)).registered.sum() > 3
+    assert read_labels(poses_file(area, group=TRACKED)).registered.sum() > 3
 
 
 def test_a_relative_video_is_found_from_any_folder_and_with_the_area_moved_along(
@@ -364,7 +364,7 @@ def test_frames_between_follow_a_lens_that_was_kept(
     options = ("--name", "medium", *FAST, "--all-frames", "--camera", lens, "--fixed-lens")
     register(bare, flight2 / "flight2.mp4", *options)
     assert read_json(bare / EVALUATION / "medium" / "camera.json")["estimated"] == []
-    between = read_labels(poses_file(bare, group=DENSE))
+    between = read_labels(poses_file(bare, group=TRACKED))
     assert between.registered.sum() > 2
     assert np.isfinite(between.covariance[between.registered]).all()
 
@@ -398,10 +398,10 @@ def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
     """Split sends to `register --all-frames`, which says what to remove; then it runs."""
     shutil.rmtree(area / EVALUATION / "medium")
     refused = run("split", "--area", area)
-    assert "4-dense/medium is stale" in refused.stderr
+    assert "4-tracked/medium is stale" in refused.stderr
     told = run("register", "--all-frames", "--name", "medium", "--area", area)
     assert told.exit_code == 1
-    assert "4-dense/medium is left of one, remove that folder" in told.stderr
+    assert "4-tracked/medium is left of one, remove that folder" in told.stderr
 
 
 def test_frames_between_need_a_map(tmp_path: Path) -> None:
@@ -432,7 +432,7 @@ def test_labels_move_with_their_map(area: Path) -> None:
     error_deg = pose_errors(found.poses[has], expected.poses[has])[1]
     assert error_deg.max() < 1e-6
     assert np.allclose(found.covariance[has], expected.covariance[has], rtol=1e-6)
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         folder = area / group / "medium"
         stored = similarity_from_json(read_json(folder / "registration.json")["world_from_model"])
         assert np.array_equal(stored.translation, new.translation)
@@ -447,12 +447,12 @@ def test_labels_move_with_their_map(area: Path) -> None:
 def test_labels_that_a_kill_kept_from_moving_are_right_all_the_same(area: Path) -> None:
     """The map has moved and poses.csv has not: readers move them; the next `georegister` does on disk."""
     left = area.parent / "left"
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         shutil.copytree(area / group, left / group)
     options = ("--gnss-sigma", "0.5", "3", "--overwrite")
     assert run("georegister", "--area", area, *options).exit_code == 0
     moved = read_labelled_area(Area(area), mapping_covariance=False).evaluation["medium"]
-    for group in (EVALUATION, DENSE):
+    for group in (EVALUATION, TRACKED):
         shutil.rmtree(area / group)
         shutil.copytree(left / group, area / group)
     assert poses_file(area).read_bytes() == poses_file(left).read_bytes()

@@ -366,16 +366,16 @@ def test_frames_are_thinned_but_for_those_that_matter():
     """Of too many frames, candidates go first; failed and chosen ones all stay."""
     base = flight("flight1", 400, radius_m=30, height_m=10, failed=50)
     status = np.where(np.arange(400) < 200, "skipped", base.status)
-    frames = replace(base, status=status, dense=np.arange(400) >= 300)
+    frames = replace(base, status=status, tracked=np.arange(400) >= 300)
     kept, left_out = thin_frames(frames, 250)
     assert left_out == {"candidates that were not chosen": 150}
     kept, left_out = thin_frames(frames, 170)
     assert left_out == {
         "candidates that were not chosen": 200,
-        "dense frames with a pose": 30,
+        "tracked frames with a pose": 30,
     }
     assert (kept.status == "failed").sum() == 50
-    assert (~kept.dense).sum() == 100
+    assert (~kept.tracked).sum() == 100
     assert thin_frames(frames, 400)[1] == {}
 
 

@@ -29,7 +29,7 @@ def frames(
         cameras=np.full(count, sequence),
         sources=np.full(count, f"{sequence}.mp4"),
         video_frame=np.arange(count),
-        dense=np.full(count, kind == "d"),
+        tracked=np.full(count, kind == "d"),
         time_s=every_s * np.arange(count),
         status=np.full(count, "registered", dtype="<U10"),
         reason=np.full(count, "", dtype="<U40"),
@@ -43,11 +43,11 @@ def frames(
 
 @pytest.fixture
 def mapping() -> Labels:
-    """100 chosen frames of a flight of 50 s, and 200 dense ones between them."""
-    dense = replace(
+    """100 chosen frames of a flight of 50 s, and 200 tracked ones between them."""
+    tracked = replace(
         frames("one", 200, every_s=0.25, kind="d"), time_s=0.125 + 0.25 * np.arange(200)
     )
-    return Labels.concatenate([frames("one", 100), dense])
+    return Labels.concatenate([frames("one", 100), tracked])
 
 
 @pytest.fixture
@@ -57,14 +57,14 @@ def evaluation() -> dict[str, Labels]:
 
 @pytest.fixture
 def split(mapping: Labels, evaluation: dict[str, Labels]) -> Split:
-    chosen, dense = mapping.select(~mapping.dense), mapping.select(mapping.dense)
-    return make_split(chosen, dense, evaluation, SplitOptions())
+    chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
+    return make_split(chosen, tracked, evaluation, SplitOptions())
 
 
 @pytest.fixture
 def parts(mapping: Labels, evaluation: dict[str, Labels]) -> dict[str, Labels]:
-    chosen, dense = mapping.select(~mapping.dense), mapping.select(mapping.dense)
-    return {"mapping": chosen, "dense": dense, **evaluation}
+    chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
+    return {"mapping": chosen, "tracked": tracked, **evaluation}
 
 
 def regrouped(split: Split, name: str, group: str) -> Split:
@@ -83,7 +83,7 @@ EVALUATION_SOURCES = {"medium": {"medium/medium.mp4": "bbbb"}}
 
 
 def test_evaluation_frames_apart_from_the_map_pass(mapping, evaluation):
-    names = mapping.names[~mapping.dense].tolist()
+    names = mapping.names[~mapping.tracked].tolist()
     found = audit.check_not_in_map(names, SOURCES, evaluation, EVALUATION_SOURCES)
     assert found.verdict is Verdict.PASS
     assert "30 evaluation frames" in found.text
@@ -136,10 +136,10 @@ def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
         assert check(mapping, split).verdict is Verdict.PASS
 
 
-@pytest.mark.parametrize("dense", [False, True])
-def test_a_training_frame_within_a_block_is_found(mapping, split, dense):
-    """Chosen or dense: it lies in a held-out block, and nearer than the gap to its frames."""
-    held = mapping.names[(split.of(mapping.names) == VALIDATION) & (mapping.dense == dense)]
+@pytest.mark.parametrize("tracked", [False, True])
+def test_a_training_frame_within_a_block_is_found(mapping, split, tracked):
+    """Chosen or tracked: it lies in a held-out block, and nearer than the gap to its frames."""
+    held = mapping.names[(split.of(mapping.names) == VALIDATION) & (mapping.tracked == tracked)]
     planted = regrouped(split, held[len(held) // 2], TRAIN)
     assert_fails(audit.check_blocks(mapping, planted), held[len(held) // 2])
     assert_fails(audit.check_gap(mapping, planted), held[len(held) // 2])
@@ -151,8 +151,8 @@ def test_a_held_out_frame_outside_all_blocks_is_found(mapping, split):
 
 
 def test_a_dense_training_frame_in_the_guard_gap_is_found(mapping, split):
-    """One dense frame of the guard that trains is named, with its distance in seconds."""
-    guard = mapping.names[(split.of(mapping.names) == LEFT_OUT) & mapping.dense][0]
+    """One tracked frame of the guard that trains is named, with its distance in seconds."""
+    guard = mapping.names[(split.of(mapping.names) == LEFT_OUT) & mapping.tracked][0]
     assert_fails(audit.check_gap(mapping, regrouped(split, guard, TRAIN)), guard, "s from")
 
 
@@ -164,7 +164,7 @@ def test_a_gap_smaller_than_the_stated_one_is_found(mapping, split):
 
 def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping, split):
     """0.5 m and 5 degrees off, a minute later; one that looks elsewhere is not."""
-    row = np.flatnonzero((split.of(mapping.names) == VALIDATION) & ~mapping.dense)[0]
+    row = np.flatnonzero((split.of(mapping.names) == VALIDATION) & ~mapping.tracked)[0]
     center = mapping.poses.centers[row] + [0.0, 0.5, 0.0]
     for heading_deg, listed in ((5.0, True), (40.0, False)):
         there = rotations_from_angles(np.array([[heading_deg, -20.0, 0.0]]))
@@ -193,7 +193,7 @@ def seen_points(mapping: Labels, views: dict[int, list[str]]) -> SeenPoints:
 
 def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
     """Point 1 has two training frames, point 2 one and two validation frames, point 3 none."""
-    chosen = mapping.select(~mapping.dense)
+    chosen = mapping.select(~mapping.tracked)
     group = split.of(chosen.names)
     train, held = chosen.names[group == TRAIN], chosen.names[group == VALIDATION]
     views = {
@@ -211,7 +211,7 @@ def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
 
 def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
     """Two pixels of one training frame are no second view."""
-    chosen = mapping.select(~mapping.dense)
+    chosen = mapping.select(~mapping.tracked)
     row = np.flatnonzero(split.of(chosen.names) == TRAIN)[0]
     seen = SeenPoints(np.array([row, row]), np.array([7, 7]), np.zeros((2, 2)))
     assert len(audit.training_points(chosen, seen, split)) == 0
@@ -351,8 +351,8 @@ def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split)
 
 def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
     assert audit.check_test_is_apart(split).verdict is Verdict.PASS
-    chosen, dense = mapping.select(~mapping.dense), mapping.select(mapping.dense)
-    alone = make_split(chosen, dense, {}, SplitOptions())
+    chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
+    alone = make_split(chosen, tracked, {}, SplitOptions())
     found = audit.check_test_is_apart(alone)
     assert found.verdict is Verdict.NOTICE
     assert found.text == "same flight as training: optimistic"

@@ -22,13 +22,13 @@ def flight(
     centers: np.ndarray,
     *,
     every_s: float = 0.5,
-    dense: bool = False,
+    tracked: bool = False,
     start_s: float = 0.0,
     heading_deg: float = 0.0,
 ) -> Labels:
     """Registered frames along centres (N, 3), all looking the same way."""
     n = len(centers)
-    kind = "d" if dense else "f"
+    kind = "d" if tracked else "f"
     angles = np.tile([heading_deg, -20.0, 0.0], (n, 1))
     return Labels(
         names=np.array([f"{sequence}/{kind}{k:05d}.jpg" for k in range(n)]),
@@ -36,7 +36,7 @@ def flight(
         cameras=np.full(n, sequence),
         sources=np.full(n, f"{sequence}.mp4"),
         video_frame=np.arange(n),
-        dense=np.full(n, dense),
+        tracked=np.full(n, tracked),
         time_s=start_s + every_s * np.arange(n),
         status=np.full(n, "registered"),
         reason=np.full(n, "", dtype="<U40"),
@@ -69,17 +69,19 @@ def nothing() -> Labels:
 
 @pytest.fixture
 def area() -> tuple[Labels, Labels]:
-    """Two flights of 100 s and 60 s with 2 chosen frames a second, and 10 dense ones between."""
+    """Two flights of 100 s and 60 s with 2 chosen frames a second, and 10 tracked ones between."""
     mapping = Labels.concatenate(
         [flight("one", line(200)), flight("two", line(120, north_m=20.0, up_m=12.0))]
     )
-    dense = Labels.concatenate(
+    tracked = Labels.concatenate(
         [
-            flight("one", line(1000, step_m=0.2), every_s=0.1, start_s=0.05, dense=True),
-            flight("two", line(600, step_m=0.2, up_m=12.0), every_s=0.1, start_s=0.05, dense=True),
+            flight("one", line(1000, step_m=0.2), every_s=0.1, start_s=0.05, tracked=True),
+            flight(
+                "two", line(600, step_m=0.2, up_m=12.0), every_s=0.1, start_s=0.05, tracked=True
+            ),
         ]
     )
-    return mapping, dense
+    return mapping, tracked
 
 
 @pytest.fixture
@@ -127,17 +129,17 @@ def test_blocks_in_time_have_about_the_length_wanted(area, evaluation):
 
 
 def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
-    """A dense frame within a block validates; none that trains is nearer than 2 s to a block."""
-    mapping, dense = area
-    split = make_split(mapping, dense, evaluation, SplitOptions())
-    everything = Labels.concatenate([mapping, dense])
+    """A tracked frame within a block validates; none that trains is nearer than 2 s to a block."""
+    mapping, tracked = area
+    split = make_split(mapping, tracked, evaluation, SplitOptions())
+    everything = Labels.concatenate([mapping, tracked])
     held = np.zeros(len(everything), bool)
     for block in split.blocks:
         held |= block.holds(everything)
     group = split.of(everything.names)
     assert (group[held] == VALIDATION).all()
     assert (group[~held] != VALIDATION).all()
-    assert (everything.dense & (group == VALIDATION)).sum() > 50
+    assert (everything.tracked & (group == VALIDATION)).sum() > 50
     assert nearest_s(everything, split) == pytest.approx(2.0, abs=0.11)
     assert nearest_s(everything, split) >= 2.0 - 1e-6
     left_out = group == LEFT_OUT
@@ -147,10 +149,10 @@ def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
 @pytest.mark.parametrize("seed", range(20))
 def test_the_gap_holds_for_every_seed(area, seed):
     """Wherever the blocks fall, no training frame is nearer than the gap to test or validation."""
-    mapping, dense = area
+    mapping, tracked = area
     options = SplitOptions(seed=seed, gap_s=3.0)
-    split = make_split(mapping, dense, {}, options)
-    assert nearest_s(Labels.concatenate([mapping, dense]), split) >= 3.0 - 1e-6
+    split = make_split(mapping, tracked, {}, options)
+    assert nearest_s(Labels.concatenate([mapping, tracked]), split) >= 3.0 - 1e-6
     assert set(split.groups()) == {TRAIN, VALIDATION, TEST}
 
 
@@ -188,16 +190,16 @@ def test_a_frame_without_a_pose_is_in_no_group(area, evaluation):
 
 def test_the_same_input_gives_the_same_split_in_any_order(area, evaluation):
     """The order of frames and the presence of another flight move no block; another seed does."""
-    mapping, dense = area
+    mapping, tracked = area
     options = SplitOptions(seed=5)
-    split = make_split(mapping, dense, evaluation, options)
+    split = make_split(mapping, tracked, evaluation, options)
     shuffled = mapping.select(np.random.default_rng(0).permutation(len(mapping)))
-    again = make_split(shuffled, dense, evaluation, options)
+    again = make_split(shuffled, tracked, evaluation, options)
     assert (again.of(split.names) == split.group).all()
     alone = mapping.select(mapping.sequences == "one")
     of_one = make_split(alone, nothing(), evaluation, options)
     assert (of_one.of(alone.names) == split.of(alone.names)).all()
-    others = [make_split(mapping, dense, evaluation, replace(options, seed=s)) for s in range(4)]
+    others = [make_split(mapping, tracked, evaluation, replace(options, seed=s)) for s in range(4)]
     assert len({other.blocks for other in others}) > 2
 
 
@@ -218,13 +220,13 @@ def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
 
 
 def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
-    """Dense frames of a hover of 20 s are in no group where a block ends as it begins: nothing moved."""
+    """Tracked frames of a hover of 20 s are in no group where a block ends as it begins: nothing moved."""
     moving = flight("one", line(30))
     after = flight("one", line(30) + np.array([30.0, 0.0, 0.0]), start_s=35.0)
     names = np.char.replace(after.names, "/f", "/g")
     chosen = Labels.concatenate([moving, replace(after, names=names)])
     hover = flight(
-        "one", np.tile([29.0, 0.0, 8.0], (180, 1)), every_s=0.1, start_s=15.0, dense=True
+        "one", np.tile([29.0, 0.0, 8.0], (180, 1)), every_s=0.1, start_s=15.0, tracked=True
     )
     for seed in range(60):
         split = make_split(chosen, hover, evaluation, SplitOptions(seed=seed))
@@ -263,12 +265,12 @@ def test_nothing_registered_is_an_error(evaluation):
 
 
 def test_left_out_dense_frames_are_in_no_group(area, evaluation):
-    """Without dense frames, those of evaluation sequences are left out too."""
-    mapping, dense = area
-    more = flight("medium", line(100), every_s=0.1, dense=True)
+    """Without tracked frames, those of evaluation sequences are left out too."""
+    mapping, tracked = area
+    more = flight("medium", line(100), every_s=0.1, tracked=True)
     both = {"medium": Labels.concatenate([evaluation["medium"], more])}
-    split = make_split(mapping, dense, both, SplitOptions(dense=False))
-    for names in (dense.names, more.names):
+    split = make_split(mapping, tracked, both, SplitOptions(tracked=False))
+    for names in (tracked.names, more.names):
         assert (split.of(names) == LEFT_OUT).all()
     assert split.counts()["medium"] == 50
 

@@ -21,7 +21,8 @@ from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
 from spn_data.storage.record import write_json
 from spn_model.export.bundle_checks import ExportOptions
-from spn_model.export.bundle_export import Exported, export
+from spn_model.export.bundle_export import export
+from spn_model.export.exported import Exported
 from spn_model.export.graphs import _CellMeans, deployment, reference, write_graph
 from spn_model.models import checkpoint
 from spn_model.models.registry import make

@@ -120,7 +120,7 @@ def labels_of(frames: Frames, rows: tuple[int, ...], poses: Poses) -> Labels:
         cameras=chosen.cameras,
         sources=chosen.sources,
         video_frame=chosen.video_frame,
-        dense=np.zeros(n, bool),
+        tracked=np.zeros(n, bool),
         time_s=chosen.time_s,
         status=np.array([LabelStatus.REGISTERED.value] * n),
         reason=np.array([""] * n),

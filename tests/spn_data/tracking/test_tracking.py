@@ -11,18 +11,18 @@ import pytest
 from spn_data.capture.frames import FrameStatus
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.geometry.pose_fit import fit_pose
-from spn_data.tracking.label_video import dense_labels, drop_jumps
+from spn_data.tracking.label_video import drop_jumps, track_frames
 from spn_data.tracking.point_tracking import follow, spread, track_segment
 from spn_data.tracking.segments import read_segments
-from spn_data.tracking.tracked_frames import DenseOptions, TrackedFrame
-from tests.worlds.dense_world import CAMERA, LABELLED, TEXTURE, N, World, visible
+from spn_data.tracking.tracked_frames import TrackedFrame, TrackingOptions
+from tests.worlds.tracking_world import CAMERA, LABELLED, TEXTURE, N, World, visible
 
-OPTIONS = DenseOptions()
+OPTIONS = TrackingOptions()
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
-    return World(tmp_path_factory.mktemp("dense"))
+    return World(tmp_path_factory.mktemp("tracked"))
 
 
 def poses_of(tracked: list[TrackedFrame]) -> Poses:
@@ -35,7 +35,7 @@ def poses_of(tracked: list[TrackedFrame]) -> Poses:
 def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
     """Through H.264, a distorted lens, uneven motion; before the first and after the last label as well."""
     heard: list[tuple[int, int]] = []
-    labels, seen = dense_labels(
+    labels, seen = track_frames(
         world.videos,
         world.frames,
         world.labelled,
@@ -50,7 +50,7 @@ def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
     assert labels.names.tolist() == [f"f/{k:06d}.jpg" for k in others]
     assert labels.video_frame.tolist() == [k % 12 for k in others]
     assert labels.sources.tolist() == ["a.mp4" if k < 12 else "b.mp4" for k in others]
-    assert labels.dense.all()
+    assert labels.tracked.all()
     assert labels.registered.all()
     error_m, error_deg = pose_errors(labels.poses, world.poses[np.array(others)])
     assert 1e-5 < np.median(error_m) < 0.004
@@ -71,7 +71,7 @@ def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
 def test_frames_off_a_steady_motion_are_dropped_from_the_labels(world: World) -> None:
     """Nothing may turn faster or slower here, which the flight does; two workers give the same poses."""
     options = replace(OPTIONS, max_jump_deg=0.02, max_turn_deg_s2=1e-6)
-    labels, seen = dense_labels(
+    labels, seen = track_frames(
         world.videos,
         world.frames,
         world.labelled,
@@ -172,7 +172,7 @@ def test_a_frame_of_something_else_fails_and_those_around_it_do_not(world: World
         (replace(OPTIONS, max_split=1e-9), "ambiguous"),
     ],
 )
-def test_each_check_names_its_reason(world: World, options: DenseOptions, reason: str) -> None:
+def test_each_check_names_its_reason(world: World, options: TrackingOptions, reason: str) -> None:
     segment = world.segment(15, 20)
     for frame in track_segment(segment, options):
         assert reason in frame.reason

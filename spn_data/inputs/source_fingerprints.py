@@ -1,0 +1,19 @@
+"""Fingerprints of the files that a stage is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from spn_data.capture.sources import Source
+from spn_data.storage.record import content_fingerprint
+
+
+def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:
+    """Content fingerprint of every file of the sources, by sequence and name, and of their masks."""
+    files = {
+        f"{source.sequence}/{path.name}": content_fingerprint(path)
+        for source in sources
+        for path in (*source.parts, *source.telemetry)
+    }
+    return files | {f"{name}/mask": content_fingerprint(path) for name, path in masks.items()}
