@@ -26,7 +26,7 @@ from spn_data.area.area import Area
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
-from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
+from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.frame_images import frame_images
 
@@ -58,7 +58,9 @@ def write(area_folder: Path, target: Path, frames: int) -> Cost:
     labels = labelled.mapping.select(np.flatnonzero(labelled.mapping.registered))
     seen = labelled.mapping_seen.select(np.flatnonzero(labelled.mapping.registered))
     target_camera = canonical_camera(list(labelled.cameras.values()), RenderingOptions())
-    renderers = {key: Renderer(camera, target_camera) for key, camera in labelled.cameras.items()}
+    renderers = {
+        key: PinholeRenderer(camera, target_camera) for key, camera in labelled.cameras.items()
+    }
     rng = np.random.default_rng(0)
     noise: np.ndarray | None = None
     done = points = 0

@@ -42,11 +42,11 @@ from torch import nn
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.member import Batch, Member
+from spn_model.models.pose_model import Batch, PoseModel
 from spn_model.models.registry import make
 from spn_model.networks.imagenet import MEAN, STD
-from spn_model.onboard.view import View
 from spn_model.training.batches import rows_of_step
 from spn_model.training.gradients import Gradients, gradients
 from spn_model.training.machine import PRECISIONS, Machine, Ranks, choose, prepared
@@ -80,7 +80,7 @@ class Contest:
 
     def __init__(
         self,
-        member: Member,
+        model: PoseModel,
         stage: Stage,
         images: TrainingSet,
         machine: Machine,
@@ -88,7 +88,7 @@ class Contest:
         jpegs: list[Path],
         steps: int,
     ):
-        self.member, self.images, self.machine, self.jpegs = member, images, machine, jpegs
+        self.model, self.images, self.machine, self.jpegs = model, images, machine, jpegs
         self.stage = replace(stage, images=steps * stage.batch, minutes=0.0)
         self.optimizer, self.steps = optimizer, steps
         self.parameters = [p for group in optimizer.param_groups for p in group["params"]]
@@ -101,7 +101,7 @@ class Contest:
         return [self.part(number) for number in range(first, first + self.stage.parts)]
 
     def part(self, number: int) -> Batch:
-        made = made_part(self.member, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
+        made = made_part(self.model, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
         return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
 
     def step(self, gradient: Gradients, parts: list[Batch]) -> None:
@@ -111,11 +111,11 @@ class Contest:
         self.optimizer.step()
 
     def computing(self) -> AbstractContextManager[Gradients]:
-        return gradients(self.member, self.parameters, self.stage.parts, self.machine)
+        return gradients(self.model, self.parameters, self.stage.parts, self.machine)
 
     def loop(self, record: Record) -> None:
         run_stage(
-            *(self.stage, 0, self.images, self.member, self.optimizer, record.position),
+            *(self.stage, 0, self.images, self.model, self.optimizer, record.position),
             *(self.machine, Ranks(), record, Silent(), 0, 1),
         )
 
@@ -154,11 +154,11 @@ def measure(
     """Images a second of each loop, round by round."""
     recipe = read_recipe(recipe_name)
     stage = recipe.stages[-1]
-    member = make(recipe.kind, recipe.options)
-    member.bfloat16 = machine.bfloat16
+    model = make(recipe.kind, recipe.options)
+    model.bfloat16 = machine.bfloat16
     if recipe.weights != "none":
-        member.load_pretrained(
-            member.weights_name if recipe.weights == "published" else recipe.weights
+        model.load_pretrained(
+            model.weights_name if recipe.weights == "published" else recipe.weights
         )
     with (
         Dataset(area / "5-split" / "dataset.h5") as dataset,
@@ -169,19 +169,19 @@ def measure(
         jpegs = [area / "1-frames" / name for name in group.names]
         jpegs = [path for path in jpegs if path.is_file()] or [Path("none")]
         jpegs = [jpegs[k % len(jpegs)] for k in range(len(group))]
-        member.fit(images)
-        member.network.to(machine.device)
-        member.network.to(memory_format=torch.channels_last)
-        member.begin_stage(stage.options, images)
-        member.network.train()
+        model.fit(images)
+        model.network.to(machine.device)
+        model.network.to(memory_format=torch.channels_last)
+        model.begin_stage(stage.options, images)
+        model.network.train()
         contest = Contest(
-            member, stage, images, machine, optimizer_of(recipe, stage, member), jpegs, steps
+            model, stage, images, machine, optimizer_of(recipe, stage, model), jpegs, steps
         )
         paths = [Path(folder) / name for name in ("best", "last", "state", "log")]
 
         def loop() -> float:
             at = Position()
-            record = Record(Files(*paths), Silent(), member, View.of(dataset), [], at, {})
+            record = Record(Files(*paths), Silent(), model, view_of(dataset), [], at, {})
             with closing(record):
                 contest.loop(record)
             return at.train_s

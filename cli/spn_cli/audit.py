@@ -10,7 +10,7 @@ import click
 from spn_cli import console, options
 
 if TYPE_CHECKING:
-    from spn_data.split.audit import Finding
+    from spn_data.split.audit import AuditFinding
 
 _SHOWN = 5  # lines of evidence a finding
 
@@ -35,9 +35,9 @@ def audit(area_folder: Path, everything: bool) -> None:
     show_findings(findings, shown=None if everything else _SHOWN)
 
 
-def show_findings(findings: tuple[Finding, ...], *, shown: int | None = _SHOWN) -> None:
+def show_findings(findings: tuple[AuditFinding, ...], *, shown: int | None = _SHOWN) -> None:
     """One line a check, its evidence below. Ends the program with 1 where a check failed."""
-    from spn_data.split.audit import Verdict, has_failed
+    from spn_data.split.audit import AuditVerdict, has_failed
 
     rows = []
     for finding in findings:
@@ -47,7 +47,7 @@ def show_findings(findings: tuple[Finding, ...], *, shown: int | None = _SHOWN) 
             more = len(finding.evidence) - shown
             rows.append(("", "", f"- and {more} more (spn-data audit --all)"))
     console.table("Audit", rows, ("check", "", "found"))
-    failed = [f.check for f in findings if f.verdict is Verdict.FAIL]
+    failed = [f.check for f in findings if f.verdict is AuditVerdict.FAIL]
     if has_failed(findings):
         raise click.ClickException(f"the audit failed: {', '.join(failed)}")
     console.out.print("Audit passed.")

@@ -12,7 +12,7 @@ import click
 from spn_cli import console, options
 
 if TYPE_CHECKING:
-    from spn_model.export.bundle_benchmark import Cost
+    from spn_model.export.bundle_benchmark import BundleCost
 
 _STEPS = ("preprocessing", "graph", "decoding", "total")
 
@@ -92,7 +92,7 @@ def run(
     _show(found)
 
 
-def _show(found: tuple[Cost, ...]) -> None:
+def _show(found: tuple[BundleCost, ...]) -> None:
     first = found[0].found
     width, height = first["frame"]
     rows = []

@@ -53,7 +53,9 @@ def export(
     from spn_data.pipeline import area_export as stage
 
     area = options.open_area(area_folder)
-    chosen = stage.ExportOptions(sequences=sequences, all_frames=all_frames, images=not no_images)
+    chosen = stage.LabelExportOptions(
+        sequences=sequences, all_frames=all_frames, images=not no_images
+    )
     with area.locked():
         done = stage.export(area, stage.Format(format_name), target, chosen, overwrite=overwrite)
     rows = [(name, str(count)) for name, count in done.frames.items()]

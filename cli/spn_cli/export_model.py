@@ -12,7 +12,7 @@ import click
 from spn_cli import console, options
 
 if TYPE_CHECKING:
-    from spn_model.export.exported import Exported
+    from spn_model.export.exported import ExportedBundle
 
 
 @click.command("export")
@@ -60,7 +60,7 @@ def run(
     from spn_data.area import area as names_of
     from spn_data.errors import StageError
     from spn_data.storage.record import content_fingerprint
-    from spn_model.export.bundle_checks import ExportOptions
+    from spn_model.export.bundle_checks import BundleOptions
     from spn_model.export.bundle_export import export as work
     from spn_model.export.bundle_export import is_made_of
     from spn_model.models.checkpoint import load
@@ -75,7 +75,7 @@ def run(
     source = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
     fingerprint = content_fingerprint(file)
     metrics = _evaluation(area.run(name) / names_of.METRICS, name, fingerprint)
-    wanted = ExportOptions(int8=int8, calibration_images=calibration_images)
+    wanted = BundleOptions(int8=int8, calibration_images=calibration_images)
     facts = {"run": name, "checkpoint": fingerprint, "evaluated": metrics is not None}
     if not overwrite and is_made_of(folder, facts, wanted):
         console.out.print(f"{folder}: stands already, made of the same.")
@@ -115,7 +115,7 @@ def _evaluation(path: Path, name: str, fingerprint: str) -> dict[str, Any] | Non
         return None
 
 
-def _show(made: Exported) -> None:
+def _show(made: ExportedBundle) -> None:
     from spn_model.export.model_card import loss_percent
 
     unit = "m" if made.units == "m" else "units"

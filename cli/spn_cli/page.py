@@ -10,7 +10,7 @@ from spn_data.area.area import FRAMES, Area
 from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:
-    from spn_data.report.verdict import Verdict
+    from spn_data.report.verdict import AreaVerdict
 
 
 def refresh(area: Area) -> None:
@@ -38,7 +38,7 @@ def refresh_if_free(area: Area) -> None:
         )
 
 
-def tell(path: Path, verdict: Verdict) -> None:
+def tell(path: Path, verdict: AreaVerdict) -> None:
     """The verdict, and what to do next."""
     console.out.print(f"{verdict.headline}: see {path}.")
     if step := verdict.next_step:

@@ -76,11 +76,11 @@ def predict(
     Example:
         spn-model predict flight.mp4 --run first --camera cam.json --to poses/
     """
-    from spn_model.prediction.predict import Stopped
+    from spn_model.prediction.predict import PredictionStopped
 
     try:
         run(inputs, area_folder, **chosen)
-    except Stopped as stopped:
+    except PredictionStopped as stopped:
         _tell(stopped.predicted)
         click.echo("Stopped: the frames so far are written, the rest is not done.", err=True)
         context.exit(130)
@@ -108,7 +108,7 @@ def run(
     from spn_data.geometry.camera_file import camera_to_json, read_camera
     from spn_data.storage.record import content_fingerprint
     from spn_model.models.checkpoint import load
-    from spn_model.prediction.flown import Choice, find_flights
+    from spn_model.prediction.flown import FrameFilter, find_flights
     from spn_model.prediction.predict import PredictOptions, check_target
     from spn_model.prediction.predict import predict as work
     from spn_model.training import machine
@@ -125,7 +125,7 @@ def run(
     chosen = machine.choose(device, threads or 0, "float32")
     with machine.prepared(chosen):
         network = load(file, chosen.device)
-        if network.view.camera is None and not network.member.any_camera:
+        if network.view.camera is None and not network.model.any_camera:
             notes.append(
                 "the network was trained on images of several cameras, each as it was: poses of another "
                 "camera's images are only as right as that is like them."
@@ -139,14 +139,14 @@ def run(
                 folder,
                 progress,
                 PredictOptions(
-                    choice=Choice(every=every, fps=fps),
+                    choice=FrameFilter(every=every, fps=fps),
                     formats=tuple(dict.fromkeys(("csv", *formats))),
                     batch=batch,
                 ),
                 facts={
                     "run": name,
                     "checkpoint": content_fingerprint(file),
-                    "kind": network.member.kind,
+                    "kind": network.model.kind,
                     "camera": None if given is None else camera_to_json(given),
                 },
                 overwrite=overwrite,

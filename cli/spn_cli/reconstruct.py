@@ -11,7 +11,7 @@ from spn_data.capture.selection import SelectionOptions
 from spn_data.matching.features import FeatureOptions
 from spn_data.pipeline.frames_stage import FramesOptions
 from spn_data.pipeline.geo_stage import GeoStageOptions
-from spn_data.pipeline.map_stages import Options, reconstruct
+from spn_data.pipeline.map_stages import MapOptions, reconstruct
 from spn_data.pipeline.map_stages import add as extend
 from spn_data.reconstruction.attempts import ReconstructOptions
 
@@ -38,7 +38,7 @@ def run(
 ) -> None:
     """Make or extend the area, telling each stage as it is done."""
     given = options.geo_options(**geo)
-    wanted = Options(
+    wanted = MapOptions(
         frames=FramesOptions(
             selection=SelectionOptions(target_count=target_count, motion_share=motion_share),
             fov_deg=dict(fov_deg),

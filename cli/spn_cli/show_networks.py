@@ -7,7 +7,7 @@ import math
 from spn_cli import console
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
-from spn_model.evaluation.evaluate import Comparison, Judged
+from spn_model.evaluation.evaluate import EvaluatedGroup, NetworkComparison
 from spn_model.evaluation.metrics import Evaluation, Summary
 
 # Where many columns leave little room for names; the table of errors has them in full.
@@ -19,7 +19,7 @@ _WHAT = {
 }
 
 
-def comparison(found: Comparison) -> None:
+def comparison(found: NetworkComparison) -> None:
     """Tables of each group, then what the networks cost, and notes."""
     unit = "m" if found.units == "m" else "units"
     for group in found.groups:
@@ -46,7 +46,7 @@ def comparison(found: Comparison) -> None:
         console.note(note)
 
 
-def _errors(group: Judged, unit: str) -> None:
+def _errors(group: EvaluatedGroup, unit: str) -> None:
     rows: list[tuple[str, ...]] = [
         (
             one.method + (" (the better)" if one.method == group.retrieval else ""),
@@ -80,7 +80,7 @@ def _errors(group: Judged, unit: str) -> None:
         )
 
 
-def _shares(group: Judged, unit: str) -> None:
+def _shares(group: EvaluatedGroup, unit: str) -> None:
     """Shares within limits, signed errors by axis, and the fit of covariances."""
     within = group.evaluations[0].summary.within
     rows = [
@@ -106,7 +106,7 @@ def _shares(group: Judged, unit: str) -> None:
     )
 
 
-def _strata(group: Judged, unit: str) -> None:
+def _strata(group: EvaluatedGroup, unit: str) -> None:
     first = group.evaluations[0]
     if len(first.strata) < 2:
         return

@@ -103,7 +103,7 @@ def run(
     from spn_data.errors import InputError
     from spn_data.storage.record import StageRecord, content_fingerprint, versions
     from spn_model.training.recipe import read_recipe
-    from spn_model.training.train import Data, Stopped, TrainOptions
+    from spn_model.training.train import Data, TrainingStopped, TrainOptions
     from spn_model.training.train import train as train_network
     from spn_model.training.training_record import Files
 
@@ -174,7 +174,7 @@ def run(
                 if files.state.exists():
                     follow.say("Going on from where it was stopped.")
                 facts = train_network(wanted, files, Data(path, pretrain), how, follow)
-        except Stopped:
+        except TrainingStopped:
             raise KeyboardInterrupt from None
         if not leads:
             return

@@ -13,7 +13,7 @@ from spn_data.capture import video
 from spn_data.capture.frames import Frames
 from spn_data.capture.measurement import MEASURE_WIDTH, GrayImage, Measurements, measure
 from spn_data.capture.photos import PhotoHeaders, decode_photo_gray, read_headers
-from spn_data.capture.selection import Choice
+from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, safe_name
 from spn_data.errors import InputError
 from spn_data.storage.files import writing_whole
@@ -68,7 +68,9 @@ def analyse(
     return candidates
 
 
-def frames_of(candidates: Candidates, choice: Choice, *, focal: np.ndarray | None = None) -> Frames:
+def frames_of(
+    candidates: Candidates, choice: FrameChoice, *, focal: np.ndarray | None = None
+) -> Frames:
     """The rows of frames.csv for one source, telemetry still unknown.
 
     focal : (N,) focal length in any unit where the telemetry tells it, NaN where not. A change of it by

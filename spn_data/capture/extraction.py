@@ -28,7 +28,7 @@ CHOSEN_PER_S = 1.3  # of video, where no target is given
 
 
 @dataclass(frozen=True)
-class Cost:
+class ExtractionCost:
     """What making the frames is expected to take."""
 
     candidates: int
@@ -82,7 +82,7 @@ def estimate_cost(
     target_count: int | None = None,
     chosen_per_s: float = CHOSEN_PER_S,
     probe: Callable[[Path], video.VideoInfo] = video.probe,
-) -> Cost:
+) -> ExtractionCost:
     """Time and disk for measuring, choosing and writing the frames of sources, from headers alone.
 
     The number of frames that motion will choose is not known before; without a target (of all videos) it is
@@ -113,7 +113,7 @@ def estimate_cost(
         chosen = target_count
     seconds += chosen_megapixels * ENCODE_S_PER_MEGAPIXEL
     disk_bytes = photo_bytes + int(chosen_megapixels * 1e6 * BYTES_PER_PIXEL)
-    return Cost(
+    return ExtractionCost(
         candidates + photos,
         round(chosen) + photos,
         chosen_megapixels + photo_megapixels,

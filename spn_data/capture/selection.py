@@ -43,7 +43,7 @@ class SelectionOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class FrameChoice:
     """What became of N measured frames.
 
     status : (N,) str, a FrameStatus; reason : (N,) str; motion_px : (N,) motion of the image since the frame
@@ -90,7 +90,7 @@ def check_usable(measured: Measurements, options: SelectionOptions, name: str) -
 
 def choose(
     measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
-) -> Choice:
+) -> FrameChoice:
     """Which frames of a video are used, and why.
 
     position_m : (N, 3) by the telemetry: east, north and height above take-off; NaN where unknown. An
@@ -125,12 +125,12 @@ def choose(
             reason[rows[pick]] = why
             motion_px[rows[pick]] = passage.pixels(pick, ahead)
         last, done = pick, end + 1
-    return Choice(status, reason.astype(np.str_), motion_px)
+    return FrameChoice(status, reason.astype(np.str_), motion_px)
 
 
 def choose_all(
     sources: list[tuple[Measurements, np.ndarray | None]], options: SelectionOptions
-) -> list[Choice]:
+) -> list[FrameChoice]:
     """`choose` for several videos (measurements, positions), near `target_count` frames in all where given.
 
     Without a target, a video that gives fewer than `min_count` frames is chosen from more densely: a short
@@ -149,13 +149,13 @@ def choose_all(
 
 def _choose_near(
     sources: list[tuple[Measurements, np.ndarray | None]], options: SelectionOptions, target: int
-) -> list[Choice]:
+) -> list[FrameChoice]:
     """Near `target` frames in all: motion and the longest spacing are scaled together.
 
     The shortest spacing holds, so that a target may stay out of reach.
     """
 
-    def scaled(factor: float) -> list[Choice]:
+    def scaled(factor: float) -> list[FrameChoice]:
         these = replace(
             options,
             motion_share=options.motion_share * factor,
@@ -166,7 +166,7 @@ def _choose_near(
         return [choose(m, these, position_m=p) for m, p in sources]
 
     low, high = 1 / 64, 64.0
-    best: tuple[int, list[Choice]] | None = None
+    best: tuple[int, list[FrameChoice]] | None = None
     for _ in range(16):
         middle = float(np.sqrt(low * high))
         choices = scaled(middle)
@@ -183,7 +183,7 @@ def _choose_near(
 
 def choose_photos(
     measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
-) -> Choice:
+) -> FrameChoice:
     """All readable photos but those that repeat the one chosen before: same place, image unmoved.
 
     position_m : (N, 3) as for `choose`.
@@ -210,7 +210,7 @@ def choose_photos(
                 reason[row] = f"skipped: the photo before, {motion_px[row]:.1f} px apart"
                 continue
         last, total = row, np.eye(3)
-    return Choice(status, reason.astype(np.str_), motion_px)
+    return FrameChoice(status, reason.astype(np.str_), motion_px)
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Sources:
+class FoundSources:
     """What was found, in the order of names; ignored : (path, reason) of everything else."""
 
     sources: tuple[Source, ...]
@@ -73,7 +73,7 @@ def discover(
     *,
     probe: Callable[[Path], VideoInfo] | None = None,
     min_split_bytes: int = MIN_SPLIT_BYTES,
-) -> Sources:
+) -> FoundSources:
     """The sequences of a folder and those below it, or of a single video or photo.
 
     Several video files are one sequence where a camera split one recording:
@@ -118,7 +118,7 @@ def discover(
     if not sources:
         raise InputError(_nothing_found(folder, ignored), path=folder)
     ignored.sort()
-    return Sources(tuple(sources), tuple((p.relative_to(root), why) for p, why in ignored))
+    return FoundSources(tuple(sources), tuple((p.relative_to(root), why) for p, why in ignored))
 
 
 def safe_name(text: str, fallback: str = "sequence") -> str:

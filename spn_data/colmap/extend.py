@@ -11,14 +11,14 @@ from spn_data.colmap.model import load_native, write_native
 from spn_data.colmap.verify import native_camera
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 
 
 def write_extended(
     source: Path,
     target: Path,
     labels: Labels,
-    seen: SeenPoints,
+    seen: LabelObservations,
     cameras: dict[str, Camera],
     *,
     text: bool = False,

@@ -35,7 +35,7 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class MapObservations:
     """Every measurement of a point in an image, M in all.
 
     image_idx : (M,) position in Scene.names; point_idx : (M,) position in Scene.points;
@@ -112,21 +112,21 @@ def scene_of(native: pycolmap.Reconstruction) -> Scene:
     )
 
 
-def read_observations(folder: Path) -> tuple[Scene, Observations]:
+def read_observations(folder: Path) -> tuple[Scene, MapObservations]:
     """The scene with all its measurements."""
     native = load_native(folder)
     scene = scene_of(native)
     return scene, observations_of(native, scene)
 
 
-def read_map(folder: Path) -> tuple[Scene, Observations, MapPoints]:
+def read_map(folder: Path) -> tuple[Scene, MapObservations, MapPoints]:
     """The scene, its measurements, and its points with ids and colours, in the order of Scene.points."""
     return _map_of(load_native(folder))
 
 
 def read_map_with_features(
     folder: Path,
-) -> tuple[Scene, Observations, MapPoints, dict[str, np.ndarray]]:
+) -> tuple[Scene, MapObservations, MapPoints, dict[str, np.ndarray]]:
     """As `read_map`, and the point id of every feature (K,) by image name, -1 where it is no point.
 
     Features are in the order of the database.
@@ -141,7 +141,7 @@ def read_map_with_features(
     return *_map_of(native), of_features
 
 
-def _map_of(native: pycolmap.Reconstruction) -> tuple[Scene, Observations, MapPoints]:
+def _map_of(native: pycolmap.Reconstruction) -> tuple[Scene, MapObservations, MapPoints]:
     scene = scene_of(native)
     ids = sorted(native.points3D)
     colors = np.array([native.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
@@ -149,7 +149,7 @@ def _map_of(native: pycolmap.Reconstruction) -> tuple[Scene, Observations, MapPo
     return scene, observations_of(native, scene), points
 
 
-def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observations:
+def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> MapObservations:
     point_position = {point_id: k for k, point_id in enumerate(sorted(native.points3D))}
     image_idx, point_idx, pixels, residuals = [], [], [], []
     by_name = {image.name: image for image in registered_images(native)}
@@ -167,7 +167,7 @@ def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> Observatio
         point_idx.append(index)
         pixels.append(measured)
         residuals.append(projected - measured)
-    return Observations(
+    return MapObservations(
         np.concatenate(image_idx),
         np.concatenate(point_idx),
         np.concatenate(pixels),

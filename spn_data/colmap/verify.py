@@ -11,7 +11,7 @@ from spn_data.colmap import pycolmap
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
 from spn_data.matching.guided import match_along_lines
-from spn_data.matching.putative import Comparison, MatchOptions
+from spn_data.matching.putative import DescriptorComparison, MatchOptions
 
 _ITERATIONS = 1000  # of its estimation, at most
 
@@ -94,7 +94,7 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
     The strongest features tell first, for a sixteenth of the cost, then twice as many, and so on: most pairs
     end here. Of those that surely overlap the other features are compared along epipolar lines alone.
     """
-    comparison = Comparison(a.descriptors, b.descriptors)
+    comparison = DescriptorComparison(a.descriptors, b.descriptors)
     fundamental, n = None, options.strongest
     while n < min(len(a), len(b)):
         comparison.extend(n)

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from spn_data.coverage.view_share import ViewOptions
+from spn_data.coverage.view_share import ViewShareOptions
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
 
@@ -35,7 +35,7 @@ class CoverageOptions:
     medium_m: float = 5.0
     medium_deg: float = 40.0
     deg_per_m: float = 10.0  # this many degrees count as much as a metre
-    view: ViewOptions = field(default_factory=ViewOptions)
+    view: ViewShareOptions = field(default_factory=ViewShareOptions)
 
     def __post_init__(self) -> None:
         if not (0 < self.high_m <= self.medium_m and 0 < self.high_deg <= self.medium_deg):

@@ -19,7 +19,7 @@ _FIRST = 4  # points of a cell that are looked at before the others
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions:
+class ViewShareOptions:
     """What counts as a view that the map has points for."""
 
     columns: int = 16  # of the grid over the image
@@ -86,7 +86,7 @@ def view_shares(
     poses: Poses,
     cameras: Sequence[Camera],
     seen: SeenMap,
-    options: ViewOptions | None = None,
+    options: ViewShareOptions | None = None,
     progress: Progress | None = None,
 ) -> np.ndarray:
     """Share (N,) of the cells of a grid over each image that hold a point which is visible and known.
@@ -95,7 +95,7 @@ def view_shares(
     a mapping frame saw it from a direction within `max_turn_deg`, and from a distance within
     `max_range_factor`, of those from which the pose sees it.
     """
-    options = options or ViewOptions()
+    options = options or ViewShareOptions()
     rotations = poses.rotations
     borders = {id(camera): _border(camera) for camera in cameras}
     shares = np.zeros(len(poses))
@@ -114,7 +114,7 @@ def _share(
     camera: Camera,
     border: tuple[np.ndarray, np.ndarray],
     seen: SeenMap,
-    options: ViewOptions,
+    options: ViewShareOptions,
 ) -> float:
     points, x, y, ranges = _in_view(center, rotation, camera, border, seen)
     count = options.columns * options.rows
@@ -178,7 +178,9 @@ def _inside(
     return np.flatnonzero(np.logical_and.reduce(inside))
 
 
-def _hidden(cells: np.ndarray, ranges: np.ndarray, count: int, options: ViewOptions) -> np.ndarray:
+def _hidden(
+    cells: np.ndarray, ranges: np.ndarray, count: int, options: ViewShareOptions
+) -> np.ndarray:
     """(K,) bool: `occluders` points of the same cell are nearer than `occluder_ratio` of its distance."""
     if len(ranges) == 0:
         return np.zeros(0, dtype=bool)
@@ -197,7 +199,7 @@ def _known(
     points: np.ndarray,
     ranges: np.ndarray,
     seen: SeenMap,
-    options: ViewOptions,
+    options: ViewShareOptions,
 ) -> np.ndarray:
     """(K,) bool: some sighting of the point is alike in direction and distance."""
     first, counts = seen.starts[points], np.diff(seen.starts)[points]

@@ -41,7 +41,7 @@ _UNKNOWN = {"", "nan", "n/a", "na", "null", "none", "-"}
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class WaypointFrame:
     """Where an area lies, as far as waypoints need it.
 
     origin : of its East-North-Up frame. takeoff_up_m : up coordinate of the point from which heights above
@@ -77,7 +77,7 @@ class Waypoints:
         return len(self.lines)
 
 
-def read_waypoints(path: Path | str, place: Place) -> Waypoints:
+def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
     """From a CSV with a header row; columns as in docs/coverage.md, those of other names are passed over.
 
     Raises InputError, with the line, for a value that is missing, is no number or out of bounds; for
@@ -121,7 +121,7 @@ def read_waypoints(path: Path | str, place: Place) -> Waypoints:
 
 
 def waypoint_columns(
-    centers: np.ndarray, angles_deg: np.ndarray, place: Place
+    centers: np.ndarray, angles_deg: np.ndarray, place: WaypointFrame
 ) -> dict[str, list[str]]:
     """Cells by column of positions (N, 3) and heading, pitch, roll (N, 3), as `read_waypoints` reads them.
 
@@ -168,7 +168,7 @@ def _columns(header: list[str], line: int, path: Path | str) -> dict[str, int]:
 
 
 def _usable_heights(
-    columns: dict[str, int], place: Place, line: int, path: Path | str
+    columns: dict[str, int], place: WaypointFrame, line: int, path: Path | str
 ) -> list[str]:
     """Columns of heights that the area knows the zero of."""
     if not columns.keys() >= {"lat_deg", "lon_deg"}:
@@ -210,7 +210,7 @@ def _key(cell: str) -> str:
 def _centers(
     table: dict[str, np.ndarray],
     heights: list[str],
-    place: Place,
+    place: WaypointFrame,
     lines: list[int],
     path: Path | str,
 ) -> np.ndarray:

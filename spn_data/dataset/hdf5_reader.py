@@ -19,9 +19,9 @@ from spn_data.dataset.hdf5_schema import (
     POINTS,
     UNIT_TOLERANCE,
     VERSION,
-    Column,
     DatasetInfo,
     Role,
+    SchemaColumn,
     flag,
 )
 from spn_data.errors import FormatError, InputError
@@ -291,7 +291,7 @@ def _stored(group: h5py.Group, name: str) -> h5py.Dataset:
     return dataset
 
 
-def _table(group: h5py.Group, name: str, column: Column, rows: int) -> h5py.Dataset:
+def _table(group: h5py.Group, name: str, column: SchemaColumn, rows: int) -> h5py.Dataset:
     dataset = _stored(group, name)
     if dataset.dtype != np.dtype(column.dtype) or dataset.shape != (rows, *column.tail):
         raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")

@@ -38,7 +38,7 @@ class Role(StrEnum):
 
 
 @dataclass(frozen=True)
-class Column:
+class SchemaColumn:
     """A dataset of a group: one row a frame, or a point; tail : shape of a row; says : for its attribute.
 
     dtype : of NumPy; S256 is UTF-8 of at most 256 bytes.
@@ -49,26 +49,30 @@ class Column:
     says: str
 
 
-COLUMNS: dict[str, Column] = {
-    "names": Column("S256", (), "<sequence>/<frame>, unique in the file"),
-    "sequences": Column("S128", (), "flight that the frame is from"),
-    "strata": Column("S8", (), "coverage by the mapping frames: high, medium, low; empty: unknown"),
-    "time_s": Column("<f8", (), "seconds since the sequence's first frame"),
-    "dense": Column("u1", (), "1: a video frame that was not chosen for the map"),
-    "centers": Column("<f8", (3,), "camera centre in the world"),
-    "quats_wxyz": Column("<f8", (4,), "unit quaternion, world to camera, scalar first"),
-    "covariance": Column("<f8", (6, 6), "of the pose: centre, then rotation vector in radians"),
-    "intrinsics": Column("<f8", (3, 3), "K in pixels of the image; there is no distortion"),
-    "mask_idx": Column(
+COLUMNS: dict[str, SchemaColumn] = {
+    "names": SchemaColumn("S256", (), "<sequence>/<frame>, unique in the file"),
+    "sequences": SchemaColumn("S128", (), "flight that the frame is from"),
+    "strata": SchemaColumn(
+        "S8", (), "coverage by the mapping frames: high, medium, low; empty: unknown"
+    ),
+    "time_s": SchemaColumn("<f8", (), "seconds since the sequence's first frame"),
+    "dense": SchemaColumn("u1", (), "1: a video frame that was not chosen for the map"),
+    "centers": SchemaColumn("<f8", (3,), "camera centre in the world"),
+    "quats_wxyz": SchemaColumn("<f8", (4,), "unit quaternion, world to camera, scalar first"),
+    "covariance": SchemaColumn(
+        "<f8", (6, 6), "of the pose: centre, then rotation vector in radians"
+    ),
+    "intrinsics": SchemaColumn("<f8", (3, 3), "K in pixels of the image; there is no distortion"),
+    "mask_idx": SchemaColumn(
         "<i4", (), "row of masks that holds the frame's valid pixels; -1: all are valid"
     ),
 }
-POINTS: dict[str, Column] = {
-    "ids": Column("<i8", (), "id of the point in the map's COLMAP model"),
-    "pixels": Column("<f4", (2,), "where it was measured, moved into this image"),
-    "xyz": Column("<f8", (3,), "its position in the world"),
+POINTS: dict[str, SchemaColumn] = {
+    "ids": SchemaColumn("<i8", (), "id of the point in the map's COLMAP model"),
+    "pixels": SchemaColumn("<f4", (2,), "where it was measured, moved into this image"),
+    "xyz": SchemaColumn("<f8", (3,), "its position in the world"),
 }
-OFFSETS = Column("<i8", (), "points of frame k are rows offsets[k] to offsets[k + 1]")
+OFFSETS = SchemaColumn("<i8", (), "points of frame k are rows offsets[k] to offsets[k + 1]")
 IMAGES = "height x width x RGB"
 MASKS = "1: the pixel shows the scene; 0: outside the camera's view, or masked out"
 

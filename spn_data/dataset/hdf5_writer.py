@@ -20,10 +20,10 @@ from spn_data.dataset.hdf5_schema import (
     OFFSETS,
     POINTS,
     UNIT_TOLERANCE,
-    Column,
     DatasetFrame,
     DatasetInfo,
     Role,
+    SchemaColumn,
 )
 from spn_data.errors import InputError, StageError
 
@@ -236,7 +236,7 @@ def _check(frame: DatasetFrame, *, has_image: bool) -> None:
         raise ValueError(f"{frame.name}: a point outside the image")
 
 
-def _create(group: h5py.Group, name: str, column: Column, rows_a_chunk: int) -> h5py.Dataset:
+def _create(group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: int) -> h5py.Dataset:
     dataset = group.create_dataset(
         name,
         shape=(0, *column.tail),

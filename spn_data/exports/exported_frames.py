@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 
 
@@ -27,7 +27,7 @@ class ExportedFrames:
     origin: GeoOrigin | None
     labels: Labels
     is_evaluation: np.ndarray
-    seen: SeenPoints
+    seen: LabelObservations
     points: MapPoints
     cameras: dict[str, Camera]
 

@@ -103,7 +103,7 @@ def _fold_radius(camera: Camera) -> float:
     return float(np.sqrt(positive.min())) if len(positive) else np.inf
 
 
-class Renderer:
+class PinholeRenderer:
     """Renders images of one lens into one pinhole, and tells where points come to lie.
 
     Each output pixel is the mean of k x k samples of the source, k so large that no source pixel is

@@ -6,8 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.georegistration.noise import Levels, Solution, improve_levels, robust_weights, solve
-from spn_data.georegistration.problem import SHARED, Problem, State
+from spn_data.georegistration.noise import (
+    Levels,
+    LinearSolution,
+    improve_levels,
+    robust_weights,
+    solve,
+)
+from spn_data.georegistration.problem import SHARED, FitState, Problem
 
 _ROUNDS = 40
 _SAME_PLACE_SIGMAS = 3.0
@@ -23,7 +29,7 @@ class Estimate:
     parameters; offset_sigma_m : (F,) what was assumed of each flight's vertical offset.
     """
 
-    state: State
+    state: FitState
     levels: Levels
     weights: np.ndarray
     distance: np.ndarray
@@ -41,7 +47,7 @@ def covariance_of(information: np.ndarray) -> np.ndarray:
     return (vectors / values) @ vectors.T * size[:, None] * size
 
 
-def _bias_weights(state: State, bias_deg: float, freedom: float = 4.0) -> np.ndarray:
+def _bias_weights(state: FitState, bias_deg: float, freedom: float = 4.0) -> np.ndarray:
     """(F,) weights of a Student t distribution on the flights' gimbal biases."""
     square = (state.gimbal_deg**2).sum(axis=1) / bias_deg**2
     return np.minimum((freedom + 3) / (freedom + square), 1.0)
@@ -49,7 +55,7 @@ def _bias_weights(state: State, bias_deg: float, freedom: float = 4.0) -> np.nda
 
 def iterate(
     problem: Problem,
-    state: State,
+    state: FitState,
     inlier: np.ndarray,
     offset_sigma_m: np.ndarray,
     levels: Levels,
@@ -65,7 +71,7 @@ def iterate(
     weights = np.where(position & ~inlier[problem.frame], 1e-4, 1.0)
     bias_weight = np.ones(len(state.offsets_m))
     distance = np.zeros(len(weights))
-    solution: Solution | None = None
+    solution: LinearSolution | None = None
     for k in range(rounds):
         linear = problem.linearise(state, offset_sigma_m, bias_weight)
         if k >= 2:
@@ -86,7 +92,7 @@ def iterate(
     )
 
 
-def estimate(problem: Problem, state: State, inlier: np.ndarray) -> Estimate:
+def estimate(problem: Problem, state: FitState, inlier: np.ndarray) -> Estimate:
     """The fit of all frames, with the flights' vertical offsets free or tied as the data say.
 
     A flight whose take-off differs in height from the first flight's by less than its errors explain is taken
@@ -120,13 +126,13 @@ def _first_flight_with_heights(problem: Problem) -> int:
     return int(problem.fixes.flight[known].min()) if known.any() else 0
 
 
-def _without_offsets(state: State) -> State:
+def _without_offsets(state: FitState) -> FitState:
     """The same state with the offsets at zero and their mean in the centre's height."""
     return _from_first(state, 0, drop=True)
 
 
-def _from_first(state: State, first: int, *, drop: bool = False) -> State:
+def _from_first(state: FitState, first: int, *, drop: bool = False) -> FitState:
     """Offsets counted from one flight's, the centre's height moved along."""
     offsets = np.zeros_like(state.offsets_m) if drop else state.offsets_m - state.offsets_m[first]
     center = state.center - np.array([0.0, 0.0, state.offsets_m[first]])
-    return State(state.rotation, state.scale, center, offsets, state.gimbal_deg, state.level_deg)
+    return FitState(state.rotation, state.scale, center, offsets, state.gimbal_deg, state.level_deg)

@@ -155,7 +155,7 @@ class Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class LinearSolution:
     """Of the linear problem: step (P,), information (P, P), residuals' white part (M,) after the step."""
 
     step: np.ndarray
@@ -186,14 +186,14 @@ def _step(information: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, fl
     return step, float(np.linalg.slogdet(scaled)[1] - 2 * np.log(size).sum())
 
 
-def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> Solution:
+def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> LinearSolution:
     """Generalised least squares under the chains' covariance."""
     columns = np.column_stack([linear.jacobian, linear.residual])
     inverse, _ = inverse_times(chains, levels, weights, columns)
     information, gradient, _ = _normal(columns.T @ inverse, linear)
     step, _ = _step(information, gradient)
     white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
-    return Solution(step, information, white_var * (inverse[:, -1] - inverse[:, :-1] @ step))
+    return LinearSolution(step, information, white_var * (inverse[:, -1] - inverse[:, :-1] @ step))
 
 
 def robust_weights(

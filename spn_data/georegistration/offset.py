@@ -18,7 +18,7 @@ from spn_data.georegistration.noise import (
     solve,
 )
 from spn_data.georegistration.observe import Fixes, observe
-from spn_data.georegistration.problem import Kind, Problem, State
+from spn_data.georegistration.problem import FitState, Kind, Problem
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FRAMES = 12
@@ -225,7 +225,7 @@ class _Flight:
         careful = solve(problem.chains, problem.conservative(levels), weights, linear)
         return _Found(offset_s, float(np.sqrt(covariance_of(careful.information)[-1, -1])), cost)
 
-    def _linear(self, problem: Problem, state: State) -> Linear:
+    def _linear(self, problem: Problem, state: FitState) -> Linear:
         """The fit's linear problem with the offset as its last parameter."""
         linear = problem.linearise(state, np.full(1, _NO_OFFSET_M), np.ones(1))
         return Linear(
@@ -235,7 +235,7 @@ class _Flight:
             np.append(linear.value, 0.0),
         )
 
-    def _rate(self, problem: Problem, state: State) -> np.ndarray:
+    def _rate(self, problem: Problem, state: FitState) -> np.ndarray:
         """(M,) change of each residual by a second of offset, by the model's motion between its neighbours.
 
         Not by the telemetry's own: its noise would pass for motion.

@@ -48,7 +48,7 @@ _HEADING_TIME_S = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class FitState:
     """Current values: ``x_world = scale * rotation @ x_model + center`` on centred model coordinates.
 
     offsets_m : (F,) height of each flight's zero above the first's; gimbal_deg : (F, 3) constant error
@@ -62,10 +62,10 @@ class State:
     gimbal_deg: np.ndarray
     level_deg: np.ndarray
 
-    def moved(self, step: np.ndarray) -> State:
+    def moved(self, step: np.ndarray) -> FitState:
         """After a step (P,) of all parameters."""
         f = len(self.offsets_m)
-        return State(
+        return FitState(
             rotations_from_vectors(step[3:6]) @ self.rotation,
             self.scale * float(np.exp(step[6])),
             self.center + step[:3],
@@ -138,7 +138,7 @@ class Problem:
         floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.2, 0.0, 0.2])
         return levels.at_least(floor_bias, floor_white)
 
-    def start(self, world_from_model: Similarity, inlier: np.ndarray) -> State:
+    def start(self, world_from_model: Similarity, inlier: np.ndarray) -> FitState:
         """State of a first similarity; vertical offsets from its inliers' (N,) median heights."""
         f = len(self.fixes.flights)
         offsets = np.zeros(f)
@@ -147,7 +147,7 @@ class Problem:
             for k in range(f):
                 mine = inlier & (self.fixes.flight == k) & np.isfinite(up)
                 offsets[k] = np.median(up[mine]) if mine.any() else 0.0
-        return State(
+        return FitState(
             world_from_model.rotation,
             world_from_model.scale,
             world_from_model.translation,
@@ -157,7 +157,7 @@ class Problem:
         )
 
     def linearise(
-        self, state: State, offset_sigma_m: np.ndarray, bias_weight: np.ndarray
+        self, state: FitState, offset_sigma_m: np.ndarray, bias_weight: np.ndarray
     ) -> Linear:
         """Residuals and Jacobian at a state.
 
@@ -181,7 +181,7 @@ class Problem:
         rows = self.kind, self.frame
         return Linear(residual[rows], jacobian[rows], precision, value)
 
-    def _all_rows(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+    def _all_rows(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (7, N) and their Jacobian (7, N, P), NaN where nothing was observed."""
         n, f = len(self.model), len(self.fixes.flights)
         flight, every = self.fixes.flight, np.arange(n)
@@ -226,7 +226,7 @@ class Problem:
             jacobian[Kind.HEADING, :, 5] = np.rad2deg(1.0)
         return residual, jacobian
 
-    def residuals(self, state: State) -> np.ndarray:
+    def residuals(self, state: FitState) -> np.ndarray:
         """(7, N) residuals of all kinds; NaN where nothing was observed."""
         residual = self._all_rows(state)[0]
         residual[Kind.LEVEL] = np.where(self.use_level, residual[Kind.LEVEL], np.nan)

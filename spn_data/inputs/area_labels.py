@@ -10,14 +10,14 @@ import numpy as np
 
 from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, TRACKED, Area
 from spn_data.capture.frames import Frames, read_frames
-from spn_data.colmap.model import Observations, Scene, read_map
+from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.errors import FormatError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
-from spn_data.labels.labels import Labels, SeenPoints, read_labels, read_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, read_labels, read_seen_points
 from spn_data.labels.map_points import MapPoints, covered_share
 from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.storage.record import read_json
@@ -46,13 +46,13 @@ class LabelledArea:
     points: MapPoints
     cameras: dict[str, Camera]
     mapping: Labels
-    mapping_seen: SeenPoints
+    mapping_seen: LabelObservations
     tracked: Labels
-    tracked_seen: SeenPoints
+    tracked_seen: LabelObservations
     evaluation: dict[str, Labels]
-    evaluation_seen: dict[str, SeenPoints]
+    evaluation_seen: dict[str, LabelObservations]
 
-    def parts(self) -> list[tuple[Labels, SeenPoints]]:
+    def parts(self) -> list[tuple[Labels, LabelObservations]]:
         """Mapping, its tracked frames, and each evaluation sequence."""
         return [
             (self.mapping, self.mapping_seen),
@@ -162,8 +162,8 @@ def _camera_samples(chosen: Frames, scene: Scene) -> dict[str, str]:
 
 
 def _mapping_labels(
-    area: Area, scene: Scene, observations: Observations, points: MapPoints, chosen: Frames
-) -> tuple[Labels, SeenPoints]:
+    area: Area, scene: Scene, observations: MapObservations, points: MapPoints, chosen: Frames
+) -> tuple[Labels, LabelObservations]:
     """The model's own frames; those that mapping left out have no pose."""
     n = len(chosen)
     row_of = {name: k for k, name in enumerate(chosen.names.tolist())}
@@ -189,7 +189,7 @@ def _mapping_labels(
         error_px=error_px,
     )
     order = np.argsort(rows[observations.image_idx], kind="stable")
-    seen = SeenPoints(
+    seen = LabelObservations(
         rows[observations.image_idx][order],
         points.ids[observations.point_idx[order]],
         observations.pixels[order],
@@ -197,7 +197,7 @@ def _mapping_labels(
     return labels, seen
 
 
-def _with_covariance(labels: Labels, scene: Scene, observations: Observations) -> Labels:
+def _with_covariance(labels: Labels, scene: Scene, observations: MapObservations) -> Labels:
     covariance = labels.covariance.copy()
     row_of = {name: k for k, name in enumerate(labels.names.tolist())}
     rows = [row_of[name] for name in scene.names]
@@ -205,7 +205,9 @@ def _with_covariance(labels: Labels, scene: Scene, observations: Observations) -
     return replace(labels, covariance=covariance)
 
 
-def _read_stage(area: Area, stage: str, world_from_model: Similarity) -> tuple[Labels, SeenPoints]:
+def _read_stage(
+    area: Area, stage: str, world_from_model: Similarity
+) -> tuple[Labels, LabelObservations]:
     """Labels of one stage, moved to where the map is now: it may have been georegistered anew since."""
     folder = area.folder(stage)
     labels = read_labels(folder / POSES)
@@ -216,11 +218,11 @@ def _read_stage(area: Area, stage: str, world_from_model: Similarity) -> tuple[L
     return labels, read_seen_points(folder / SEEN)
 
 
-def together(parts: list[tuple[Labels, SeenPoints]]) -> tuple[Labels, SeenPoints]:
+def together(parts: list[tuple[Labels, LabelObservations]]) -> tuple[Labels, LabelObservations]:
     """One after the other, sorted by sequence and time."""
     labels = Labels.concatenate([part for part, _ in parts])
     first = np.cumsum([0, *(len(part) for part, _ in parts)])
-    seen = SeenPoints(
+    seen = LabelObservations(
         np.concatenate([s.frame_idx + first[k] for k, (_, s) in enumerate(parts)]),
         np.concatenate([s.point_ids for _, s in parts]),
         np.concatenate([s.pixels for _, s in parts]),

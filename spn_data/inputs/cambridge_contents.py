@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.dataset.cambridge import NVM, TEST_LIST, TRAIN_LIST, VALIDATION_LIST, write_cambridge
 from spn_data.dataset.nvm import nvm_model, write_nvm
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.rendering import Renderer, undistorted_camera
+from spn_data.geometry.rendering import PinholeRenderer, undistorted_camera
 from spn_data.inputs.dataset_contents import GivenFrames
 from spn_data.labels.map_points import MapPoints
 from spn_data.split.audit import MIN_TRAINING_VIEWS
@@ -40,7 +40,7 @@ class CambridgeFolder:
     def __init__(self, folder: Path, cameras: dict[str, Camera]):
         self._folder = folder
         self._cameras = cameras
-        self._renderers: dict[str, Renderer] = {}
+        self._renderers: dict[str, PinholeRenderer] = {}
 
     def add_image(self, frame: str, key: str, image: np.ndarray) -> None:
         """Write a frame's image (H, W, 3) BGR, unless an interrupted run has written it already."""
@@ -100,8 +100,8 @@ class CambridgeFolder:
         )
         write_nvm(self._folder / NVM, model)
 
-    def _renderer(self, key: str) -> Renderer:
+    def _renderer(self, key: str) -> PinholeRenderer:
         if key not in self._renderers:
             camera = self._cameras[key]
-            self._renderers[key] = Renderer(camera, undistorted_camera(camera))
+            self._renderers[key] = PinholeRenderer(camera, undistorted_camera(camera))
         return self._renderers[key]

@@ -13,13 +13,13 @@ from spn_data.coverage.nearest_frame import strata_of
 from spn_data.dataset.hdf5_schema import DatasetFrame
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import (
-    Renderer,
+    PinholeRenderer,
     RenderingOptions,
     canonical_camera,
     undistorted_camera,
 )
 from spn_data.inputs.area_labels import LabelledArea
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.split.audit import training_points
 from spn_data.split.groups import LEFT_OUT, TRAIN, Split
 
@@ -39,7 +39,7 @@ class GivenFrames:
     strata: np.ndarray
     for_training: np.ndarray
     split: Split
-    seen: tuple[SeenPoints, ...]
+    seen: tuple[LabelObservations, ...]
     part: np.ndarray
     row: np.ndarray
 
@@ -114,7 +114,7 @@ class RenderedFrames:
         self._frames = frames
         self._targets = targets
         self._masks = masks
-        self._renderers: dict[str, Renderer] = {}
+        self._renderers: dict[str, PinholeRenderer] = {}
         self._valid: dict[tuple[str, str], np.ndarray | None] = {}
 
     def frame(self, row: int, image: np.ndarray) -> DatasetFrame:
@@ -140,9 +140,9 @@ class RenderedFrames:
             point_xyz=self._points.xyz[self._points.rows_of(ids[is_seen])],
         )
 
-    def _renderer(self, key: str) -> Renderer:
+    def _renderer(self, key: str) -> PinholeRenderer:
         if key not in self._renderers:
-            self._renderers[key] = Renderer(self._cameras[key], self._targets[key])
+            self._renderers[key] = PinholeRenderer(self._cameras[key], self._targets[key])
         return self._renderers[key]
 
     def _valid_pixels(self, sequence: str, key: str) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from spn_data.area.area import FRAMES, Area
 from spn_data.capture.candidates import analyse, frames_of
 from spn_data.capture.extraction import estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, FrameStatus, write_frames
-from spn_data.capture.selection import Choice
+from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
@@ -100,7 +100,7 @@ def take_frames(
     status[~measured.readable] = FrameStatus.UNREADABLE.value
     reason = np.where(taken, "chosen: at the rate asked for", "skipped: between two that are taken")
     reason = np.where(measured.readable, reason, measured.problem)
-    choice = Choice(status, reason, np.full(len(status), np.nan))
+    choice = FrameChoice(status, reason, np.full(len(status), np.nan))
     track = telemetry_of(source, candidates, any_telemetry=any_telemetry)
     zoom = None if track is None else track.at(measured.time_s).zoom
     frames = frames_of(candidates, choice, focal=zoom)

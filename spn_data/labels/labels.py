@@ -146,7 +146,7 @@ def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPoints:
+class LabelObservations:
     """Map points that N frames see, M observations in all, sorted by frame.
 
     frame_idx : (M,) row of the frame in its Labels; point_ids : (M,) COLMAP's ids in the map;
@@ -168,7 +168,7 @@ class SeenPoints:
         first, last = np.searchsorted(self.frame_idx, [row, row + 1])
         return self.point_ids[first:last], self.pixels[first:last]
 
-    def select(self, rows: np.ndarray) -> SeenPoints:
+    def select(self, rows: np.ndarray) -> LabelObservations:
         """Those of the frames at `rows`, numbered anew in that order."""
         starts = np.searchsorted(self.frame_idx, rows)
         ends = np.searchsorted(self.frame_idx, rows, side="right")
@@ -176,7 +176,7 @@ class SeenPoints:
             [np.arange(a, b) for a, b in zip(starts, ends, strict=True)] or [np.zeros(0, np.int64)]
         ).astype(np.int64)
         frame_idx = np.repeat(np.arange(len(rows)), ends - starts)
-        return SeenPoints(frame_idx, self.point_ids[index], self.pixels[index])
+        return LabelObservations(frame_idx, self.point_ids[index], self.pixels[index])
 
 
 _POSE_COLUMNS = ["x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -287,7 +287,7 @@ def _number(cell: str) -> float:
     return value
 
 
-def write_seen_points(path: Path, seen: SeenPoints) -> None:
+def write_seen_points(path: Path, seen: LabelObservations) -> None:
     """As observations.npz, plain arrays; the file appears whole."""
     with writing_whole(path) as file:
         np.savez_compressed(
@@ -298,11 +298,11 @@ def write_seen_points(path: Path, seen: SeenPoints) -> None:
         )
 
 
-def read_seen_points(path: Path) -> SeenPoints:
+def read_seen_points(path: Path) -> LabelObservations:
     """Raises InputError where it is not what `write_seen_points` writes. No pickle is opened."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            seen = SeenPoints(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
+            seen = LabelObservations(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
     except _DAMAGED as error:
         raise InputError(f"is no file of observations ({error})", path=path) from error
     if seen.pixels.shape != (len(seen.frame_idx), 2):

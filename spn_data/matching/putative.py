@@ -32,12 +32,12 @@ def match_descriptors(
     descriptors_a: np.ndarray, descriptors_b: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
     """Matches (M, 2) uint32 of row indices into two (N, 128) uint8 RootSIFT arrays."""
-    comparison = Comparison(descriptors_a, descriptors_b)
+    comparison = DescriptorComparison(descriptors_a, descriptors_b)
     comparison.extend(max(len(descriptors_a), len(descriptors_b)))
     return comparison.matches(options)
 
 
-class Comparison:
+class DescriptorComparison:
     """All with all of the first n descriptors of two images, where n can grow: nothing is compared twice."""
 
     def __init__(self, descriptors_a: np.ndarray, descriptors_b: np.ndarray) -> None:

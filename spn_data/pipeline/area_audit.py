@@ -18,9 +18,9 @@ from spn_data.inputs.cambridge_contents import image_name, list_of
 from spn_data.labels.labels import Labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.split.audit import (
-    Finding,
+    AuditFinding,
+    AuditVerdict,
     MapHashes,
-    Verdict,
     check_blocks,
     check_copies,
     check_fresh,
@@ -47,7 +47,7 @@ from spn_data.storage.record import VERSION, read_json, write_json
 SPLIT_FILE, DATASET, AUDIT, CAMBRIDGE = "split.json", "dataset.h5", "audit.json", "cambridge"
 
 
-def audit(area: Area) -> tuple[Finding, ...]:
+def audit(area: Area) -> tuple[AuditFinding, ...]:
     """Check the area's split as it lies on the disk. Raises StageError where there is none."""
     area.record(SPLIT)
     return (
@@ -56,7 +56,7 @@ def audit(area: Area) -> tuple[Finding, ...]:
     )
 
 
-def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Finding, ...]:
+def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[AuditFinding, ...]:
     """Check a split in a folder against the area's labels."""
     split = read_split(folder / SPLIT_FILE)
     parts = {"mapping": labelled.mapping, "tracked": labelled.tracked, **labelled.evaluation}
@@ -69,7 +69,9 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Find
         covered,
         check_test_is_apart(split),
     ]
-    if covered.verdict is Verdict.FAIL:  # groups of frames that it does not know cannot be judged
+    if (
+        covered.verdict is AuditVerdict.FAIL
+    ):  # groups of frames that it does not know cannot be judged
         return tuple(findings)
     flights = Labels.concatenate([labelled.mapping, labelled.tracked])
     flights = flights.select(flights.registered)
@@ -82,7 +84,7 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Find
     return tuple(findings)
 
 
-def _check_not_in_map(area: Area, labelled: LabelledArea) -> Finding:
+def _check_not_in_map(area: Area, labelled: LabelledArea) -> AuditFinding:
     names = read_scene(area.folder(MODEL)).names
     return check_not_in_map(
         names,
@@ -92,7 +94,7 @@ def _check_not_in_map(area: Area, labelled: LabelledArea) -> Finding:
     )
 
 
-def _check_copies(labelled: LabelledArea) -> list[Finding]:
+def _check_copies(labelled: LabelledArea) -> list[AuditFinding]:
     """Only where lengths are metres and there is something to compare."""
     if labelled.units != "m" or not labelled.evaluation:
         return []
@@ -108,7 +110,7 @@ def _sources(area: Area, stage: str) -> dict[str, str]:
 
 def _check_files(
     folder: Path, labelled: LabelledArea, split: Split, parts: dict[str, Labels]
-) -> list[Finding]:
+) -> list[AuditFinding]:
     check = "files readable"
     try:
         with Dataset(folder / DATASET) as dataset:
@@ -127,7 +129,11 @@ def _check_files(
         if (folder / CAMBRIDGE).is_dir():
             findings += _check_cambridge(folder / CAMBRIDGE, lists, tracked, split)
     except SpnError as error:
-        return [Finding(check, Verdict.FAIL, "a file of the split cannot be read", (str(error),))]
+        return [
+            AuditFinding(
+                check, AuditVerdict.FAIL, "a file of the split cannot be read", (str(error),)
+            )
+        ]
     return findings
 
 
@@ -142,7 +148,7 @@ def _point_ids(dataset: Dataset) -> np.ndarray:
 
 def _check_cambridge(
     folder: Path, stored: dict[str, PoseList], tracked: dict[str, np.ndarray], split: Split
-) -> list[Finding]:
+) -> list[AuditFinding]:
     """Lists hold every chosen frame of the data set; tracked ones are in all lists or in none."""
     files = sorted(path.name for path in folder.glob("dataset_*.txt"))
     lists = {file: read_cambridge(folder / file) for file in files}
@@ -163,7 +169,7 @@ def _check_cambridge(
     return [check_cambridge(found, wanted), check_measured(measured, split)]
 
 
-def _check_map_unchanged(area: Area) -> Finding:
+def _check_map_unchanged(area: Area) -> AuditFinding:
     """Each sequence's stage noted the map's hash before and after it was registered."""
     at: dict[str, MapHashes] = {}
     for group in (EVALUATION, TRACKED):
@@ -177,20 +183,20 @@ def _check_map_unchanged(area: Area) -> Finding:
     return check_map_unchanged(map_hash(area.folder(MODEL)), at)
 
 
-def write_audit(path: Path, findings: tuple[Finding, ...]) -> None:
+def write_audit(path: Path, findings: tuple[AuditFinding, ...]) -> None:
     """audit.json: findings in the order in which they were checked."""
     table = [{**asdict(f), "verdict": f.verdict.value} for f in findings]
     write_json(path, {"version": VERSION, "findings": table})
 
 
-def read_audit(path: Path) -> tuple[Finding, ...]:
+def read_audit(path: Path) -> tuple[AuditFinding, ...]:
     """Raises FormatError where it is not what `write_audit` writes."""
     table = read_json(path)
     try:
         return tuple(
-            Finding(
+            AuditFinding(
                 str(f["check"]),
-                Verdict(f["verdict"]),
+                AuditVerdict(f["verdict"]),
                 str(f["text"]),
                 tuple(str(line) for line in f["evidence"]),
             )

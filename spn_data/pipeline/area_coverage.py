@@ -23,7 +23,7 @@ from spn_data.coverage.sequence_table import (
     write_coverage,
 )
 from spn_data.coverage.view_share import SeenMap
-from spn_data.coverage.waypoints import Place, Waypoints, read_waypoints, waypoint_columns
+from spn_data.coverage.waypoints import WaypointFrame, Waypoints, read_waypoints, waypoint_columns
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import HeightReference
@@ -146,7 +146,7 @@ def stale_because(area: Area, coverage: Mapping[str, Any]) -> str | None:
 def _measured(
     labelled: LabelledArea,
     queries: Mapping[str, Queries],
-    place: Place | None,
+    place: WaypointFrame | None,
     options: CoverageStageOptions,
     folder: Path,
     progress: Progress,
@@ -227,18 +227,18 @@ def _usual_camera(labelled: LabelledArea) -> Camera:
     return labelled.cameras[str(keys[counts.argmax()])]
 
 
-def _place(area: Area, labelled: LabelledArea) -> Place | None:
+def _place(area: Area, labelled: LabelledArea) -> WaypointFrame | None:
     """What is known of the area's place and heights."""
     origin = labelled.origin
     if origin is None:
         return None
     if origin.height_reference is HeightReference.TAKEOFF:
-        return Place(origin, 0.0)
+        return WaypointFrame(origin, 0.0)
     fit = recorded_options(area.record(GEO)).fit
     is_same = fit.height_reference is origin.height_reference
     if fit.takeoff_alt_m is not None and is_same:
-        return Place(origin, fit.takeoff_alt_m - origin.alt_m)
-    return Place(origin)
+        return WaypointFrame(origin, fit.takeoff_alt_m - origin.alt_m)
+    return WaypointFrame(origin)
 
 
 def _together(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:

@@ -60,7 +60,7 @@ _WITH_TRACKED = (Format.TUM, Format.GEOJSON, Format.KML)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
+class LabelExportOptions:
     """What is exported.
 
     sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames).
@@ -74,7 +74,7 @@ class ExportOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exported:
+class ExportedLabels:
     """What an export holds: frames by sequence, formats written, and formats left out, with the reason."""
 
     units: str
@@ -87,10 +87,10 @@ def export(
     area: Area,
     format_name: Format,
     target: Path,
-    options: ExportOptions,
+    options: LabelExportOptions,
     *,
     overwrite: bool = False,
-) -> Exported:
+) -> ExportedLabels:
     """Write the registered frames to the folder `target`, which appears whole.
 
     Raises StageError where the target holds something, where no frame has a pose, where a sequence is
@@ -126,7 +126,7 @@ def export(
         exchange(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Exported(
+    return ExportedLabels(
         units=labelled.units,
         frames=counts,
         formats=tuple(f.value for f in wanted),

@@ -24,7 +24,7 @@ from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import AUDIT, SPLIT_FILE, read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
-from spn_data.report.verdict import Verdict, verdict
+from spn_data.report.verdict import AreaVerdict, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_whole
 from spn_data.storage.record import read_json, versions
@@ -40,7 +40,7 @@ class ReportOptions:
     max_frames: int = 30_000
 
 
-def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, Verdict]:
+def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, AreaVerdict]:
     """Write report.html at the area's root, in place of an earlier one; its path, and the verdict on it.
 
     Stale stages are named and otherwise left out. Raises StageError where the area holds no frames yet,

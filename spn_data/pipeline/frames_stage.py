@@ -13,11 +13,11 @@ import numpy as np
 
 from spn_data.area.area import EVALUATION, FRAMES, TRACKED, Area
 from spn_data.capture.candidates import Candidates, analyse, frames_of
-from spn_data.capture.extraction import Cost, check_space, estimate_cost, extract_chosen
+from spn_data.capture.extraction import ExtractionCost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames
 from spn_data.capture.photos import load_mask
 from spn_data.capture.selection import (
-    Choice,
+    FrameChoice,
     SelectionOptions,
     check_usable,
     choose_all,
@@ -57,7 +57,7 @@ class Plan:
 
     sources: tuple[Source, ...]
     ignored: tuple[tuple[Path, str], ...]
-    cost: Cost
+    cost: ExtractionCost
 
 
 def plan(
@@ -254,7 +254,7 @@ def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict
     return [frames], dict(read_json(folder / "cameras.json")["cameras"])
 
 
-def _analyse(source: Source, folder: Path, cost: Cost, progress: Progress) -> Candidates:
+def _analyse(source: Source, folder: Path, cost: ExtractionCost, progress: Progress) -> Candidates:
     """Measurements of a source; those of videos are kept, so that an interrupted run has them."""
     step = f"analysis {source.sequence}"
     total = cost.candidates if source.kind is SourceKind.VIDEO else len(source.parts)
@@ -267,7 +267,7 @@ def _analyse(source: Source, folder: Path, cost: Cost, progress: Progress) -> Ca
 
 def _choose(
     candidates: list[Candidates], tracks: list[Telemetry | None], options: SelectionOptions
-) -> list[Choice]:
+) -> list[FrameChoice]:
     positions = []
     for one, track in zip(candidates, tracks, strict=True):
         positions.append(None if track is None else _positions(track.at(one.measured.time_s)))

@@ -28,7 +28,7 @@ from spn_data.dataset.nvm_frames import NvmFrames
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
-from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
+from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.storage.record import content_fingerprint
 from spn_data.work.timing import Progress
 
@@ -268,9 +268,9 @@ class _Key:
 
 
 @lru_cache(maxsize=4)
-def _renderer(key: _Key, width_px: int) -> Renderer:
+def _renderer(key: _Key, width_px: int) -> PinholeRenderer:
     camera = key.camera
-    return Renderer(camera, canonical_camera([camera], RenderingOptions(width_px=width_px)))
+    return PinholeRenderer(camera, canonical_camera([camera], RenderingOptions(width_px=width_px)))
 
 
 def _some(names: Sequence[str]) -> str:

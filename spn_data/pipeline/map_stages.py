@@ -24,7 +24,7 @@ from spn_data.telemetry.track import TelemetrySummary
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class MapOptions:
     """Of all stages."""
 
     frames: FramesOptions = field(default_factory=FramesOptions)
@@ -49,7 +49,12 @@ class Watcher(Protocol):
 
 
 def reconstruct(
-    area: Area, inputs: list[Path], options: Options, watcher: Watcher, *, overwrite: bool = False
+    area: Area,
+    inputs: list[Path],
+    options: MapOptions,
+    watcher: Watcher,
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Frames, model and georegistration of the inputs. A stage made of the same is left as it is.
 
@@ -61,7 +66,12 @@ def reconstruct(
 
 
 def add(
-    area: Area, inputs: list[Path], options: Options, watcher: Watcher, *, overwrite: bool = False
+    area: Area,
+    inputs: list[Path],
+    options: MapOptions,
+    watcher: Watcher,
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Extend the area by the inputs; it stays as it is until its next version is complete.
 
@@ -89,7 +99,7 @@ def _stages(
     area: Area,
     found: Plan,
     inputs: list[Path],
-    options: Options,
+    options: MapOptions,
     watcher: Watcher,
     *,
     overwrite: bool,
@@ -128,7 +138,7 @@ def _stages(
     tell(geo, before.get(GEO))
 
 
-def _geo_options(area: Area, options: Options) -> GeoStageOptions:
+def _geo_options(area: Area, options: MapOptions) -> GeoStageOptions:
     if options.geo is not None:
         return options.geo
     return recorded_options(area.record(GEO)) if area.has(GEO) else GeoStageOptions()

@@ -32,7 +32,7 @@ from spn_data.pipeline.area_audit import (
     audit_folder,
     write_audit,
 )
-from spn_data.split.audit import Finding, Verdict
+from spn_data.split.audit import AuditFinding, AuditVerdict
 from spn_data.split.groups import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.split.holdout import make_split
 from spn_data.split.split_file import write_split
@@ -124,7 +124,7 @@ def _split(
             "optimistic": split.optimistic,
             "training_points": len(frames.for_training),
             "image_px": _sizes(targets),
-            "audit": {v.value: sum(f.verdict is v for f in findings) for v in Verdict},
+            "audit": {v.value: sum(f.verdict is v for f in findings) for v in AuditVerdict},
         },
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
@@ -185,5 +185,5 @@ def _sizes(targets: dict[str, Camera]) -> list[Any]:
     return sorted({(camera.width, camera.height) for camera in targets.values()})
 
 
-def _failures(findings: tuple[Finding, ...]) -> list[str]:
-    return [f"audit: {f.check}: {f.text}" for f in findings if f.verdict is Verdict.FAIL]
+def _failures(findings: tuple[AuditFinding, ...]) -> list[str]:
+    return [f"audit: {f.check}: {f.text}" for f in findings if f.verdict is AuditVerdict.FAIL]

@@ -26,13 +26,13 @@ from spn_data.inputs.area_labels import (
 )
 from spn_data.inputs.evaluation_source import FRAMES_FILE
 from spn_data.inputs.source_videos import find_videos
-from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, write_labels, write_seen_points
 from spn_data.labels.map_hash import map_hash
 from spn_data.labels.map_points import MapPoints
 from spn_data.registration.adjustment import lens_parameters
 from spn_data.registration.frame_covariance import (
-    FramePoints,
     LensUncertainty,
+    PointObservations,
     frame_covariances,
 )
 from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
@@ -127,7 +127,7 @@ def _frames_of(area: Area, sequence: str) -> Frames:
     return frames
 
 
-def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, SeenPoints]:
+def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, LabelObservations]:
     """Labels of the frames that were chosen, and the points that they see."""
     if sequence in labelled.evaluation:
         labels, seen = labelled.evaluation[sequence], labelled.evaluation_seen[sequence]
@@ -139,7 +139,7 @@ def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, SeenPoints]:
 
 
 def _with_covariances(
-    area: Area, labelled: LabelledArea, labels: Labels, seen: SeenPoints, sequence: str
+    area: Area, labelled: LabelledArea, labels: Labels, seen: LabelObservations, sequence: str
 ) -> Labels:
     """The labels with what their points, the map's errors and the lens leave uncertain."""
     scene, observations, points = read_map(map_folder(area))
@@ -161,10 +161,10 @@ def _with_covariances(
     return replace(labels, covariance=covariance)
 
 
-def _points_of(seen: SeenPoints, row: int, points: MapPoints) -> FramePoints:
+def _points_of(seen: LabelObservations, row: int, points: MapPoints) -> PointObservations:
     point_ids, pixels = seen.of_frame(row)
     rows = points.rows_of(point_ids)
-    return FramePoints(pixels, rows, points.xyz[rows])
+    return PointObservations(pixels, rows, points.xyz[rows])
 
 
 def _camera_id(

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from spn_data.geometry.least_squares import POSE
-from spn_data.reconstruction.residual_fit import FRAME_EFFECTS, Block, Partialled, solve_spd
+from spn_data.reconstruction.residual_fit import (
+    FRAME_EFFECTS,
+    LensObservations,
+    Partialled,
+    solve_spd,
+)
 
 _LENS_SIGMA = 0.02  # zoom, shear or stretch that all frames may have alike
 _MISFIT = 2.5  # times the noise: what lens model and matches leave in real models' frames, measured
@@ -15,7 +20,7 @@ _WELL_KNOWN = (
 
 
 def frame_jitter(
-    blocks: list[tuple[Block, Partialled]], readout_s: float
+    blocks: list[tuple[LensObservations, Partialled]], readout_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scatter (3,) between frames of their own zoom, shear and stretch, and how many sigmas it is worth (3,).
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from spn_data.colmap.model import Observations, Scene
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import (
     LENS,
@@ -29,7 +29,7 @@ _RIDGE = 1e-9  # of each unknown's own information: the gauge is free, and solvi
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class LensObservations:
     """M observations of F frames of one lens, linearised at the model.
 
     frames : (F,) positions in the scene; frame : (M,) 0..F-1; weights : (M,), robust.
@@ -91,13 +91,13 @@ def frame_effects(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 def linearize(
     scene: Scene,
-    seen: Observations,
+    seen: MapObservations,
     frames: np.ndarray,
     twists: np.ndarray,
     trend: np.ndarray,
     *,
     max_observations: int,
-) -> Block | None:
+) -> LensObservations | None:
     """A block of some frames (F,) of one lens, with the effects rolling shutter (per second) and zoom trend.
 
     twists : (F, 6) velocity of a still world in the camera frame, per second: moves, then rotation vector.
@@ -141,7 +141,7 @@ def linearize(
     whitened = by_place @ np.swapaxes(inverse_root, 1, 2)[point]
     shared = np.concatenate([lens, effects, residuals[:, :, None]], axis=2)
     normal = _normal(per_frame, shared, frame, len(frames), whitened, point, weights)
-    return Block(
+    return LensObservations(
         frames, frame, weights, effects, residuals, per_frame, lens, whitened, point, normal
     )
 
@@ -185,7 +185,7 @@ def _normal(
     return normal
 
 
-def partial_out(block: Block) -> Partialled:
+def partial_out(block: LensObservations) -> Partialled:
     """Take from effects and residuals what points, poses and lens explain of them."""
     frames = len(block.frames)
     first_shared = _PER_FRAME * frames

@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from spn_data.colmap.model import Observations, Scene
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.least_squares import POSE
 from spn_data.geometry.pose import Poses
 from spn_data.reconstruction.frame_jitter import frame_jitter
 from spn_data.reconstruction.residual_fit import (
-    Block,
+    LensObservations,
     Partialled,
     linearize,
     partial_out,
@@ -136,7 +136,7 @@ def _plain(value: float, digits: int = 2) -> str:
 
 def diagnose_shutter(
     scene: Scene,
-    observations: Observations,
+    observations: MapObservations,
     sequences: np.ndarray,
     time_s: np.ndarray,
     options: ShutterOptions | None = None,
@@ -185,7 +185,7 @@ def world_twists(poses: Poses, time_s: np.ndarray, *, max_gap_s: float) -> np.nd
 
 def _diagnose(
     scene: Scene,
-    seen: Observations,
+    seen: MapObservations,
     rows: np.ndarray,
     time_s: np.ndarray,
     sequence: str,
@@ -266,7 +266,7 @@ def _diagnose(
 
 
 def _fit_effects(
-    blocks: list[tuple[Block, Partialled]],
+    blocks: list[tuple[LensObservations, Partialled]],
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Effects (E,), their sigmas (E,), and the share of squared residuals that the first explains.
 
@@ -303,7 +303,7 @@ def _fit_effects(
 
 
 def _pose_shift(
-    scene: Scene, blocks: list[tuple[Block, Partialled]], readout_s: float
+    scene: Scene, blocks: list[tuple[LensObservations, Partialled]], readout_s: float
 ) -> tuple[float, float]:
     """RMS of centres (units) and rotations (degrees) that the readout moved, but for a common similarity."""
     shifts, turns = [], []

@@ -8,7 +8,7 @@ from spn_data.colmap.resection import Resection, resect
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.registration.solution import Sequence, reprojection_errors
+from spn_data.registration.solution import UnsolvedSequence, reprojection_errors
 from spn_data.registration.tracks import triangulate
 
 _WEAK = 200  # map points below which a frame's other features are worth triangulating
@@ -17,7 +17,10 @@ _ROUNDS = 10  # of carrying poses to neighbours
 
 
 def carry(
-    sequence: Sequence, found: dict[int, Resection], camera: Camera, options: RegisterOptions
+    sequence: UnsolvedSequence,
+    found: dict[int, Resection],
+    camera: Camera,
+    options: RegisterOptions,
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Let neighbours carry poses to frames that see too little of the map; `found` grows.
 
@@ -57,7 +60,7 @@ def _total(found: dict[int, Resection]) -> int:
 
 
 def _carried_matches(
-    sequence: Sequence,
+    sequence: UnsolvedSequence,
     found: dict[int, Resection],
     putative: list[np.ndarray],
     camera: Camera,
@@ -100,7 +103,7 @@ def _carried_matches(
 
 
 def _own_points(
-    sequence: Sequence,
+    sequence: UnsolvedSequence,
     found: dict[int, Resection],
     putative: list[np.ndarray],
     camera: Camera,

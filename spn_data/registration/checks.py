@@ -19,7 +19,7 @@ from spn_data.geometry.pose import Poses, rotation_errors_deg
 from spn_data.labels.labels import sigmas
 from spn_data.labels.map_points import covered_share
 from spn_data.registration.register_options import CheckOptions, RegisterOptions
-from spn_data.registration.solution import Sequence, Solution, reprojection_errors
+from spn_data.registration.solution import SequenceSolution, UnsolvedSequence, reprojection_errors
 
 _MIN_SHARED = 10  # map points that two frames both show, to compare their poses by
 
@@ -50,8 +50,8 @@ class Evidence:
 
 
 def gather_evidence(
-    sequence: Sequence,
-    solution: Solution,
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
     covariances: np.ndarray,
     pairs: dict[tuple[int, int], np.ndarray],
     options: RegisterOptions,
@@ -97,7 +97,11 @@ def gather_evidence(
 
 
 def _rival(
-    sequence: Sequence, solution: Solution, row: int, depth: float, options: RegisterOptions
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
+    row: int,
+    depth: float,
+    options: RegisterOptions,
 ) -> int:
     """Inliers of the best pose among the matches that the pose leaves unexplained, if it lies elsewhere."""
     matches = sequence.putative[row]
@@ -126,7 +130,9 @@ def same_pose(a: Poses, b: Poses, depth: float, options: CheckOptions) -> bool:
     return apart <= options.same_place * depth and turned_deg <= options.same_rotation_deg
 
 
-def _points_of_features(sequence: Sequence, solution: Solution, row: int) -> np.ndarray:
+def _points_of_features(
+    sequence: UnsolvedSequence, solution: SequenceSolution, row: int
+) -> np.ndarray:
     """(K,) row of the map point that the pose agrees with, of each feature of a frame; -1 for none."""
     shown = np.full(len(sequence.pixels[row]), -1)
     feature, point = solution.inliers(row)
@@ -135,8 +141,8 @@ def _points_of_features(sequence: Sequence, solution: Solution, row: int) -> np.
 
 
 def _agreement(
-    sequence: Sequence,
-    solution: Solution,
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
     shown: list[np.ndarray],
     matches: np.ndarray,
     i: int,
@@ -168,8 +174,8 @@ def _agreement(
 
 
 def _epipolar_share(
-    sequence: Sequence,
-    solution: Solution,
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
     matches: np.ndarray,
     i: int,
     j: int,
@@ -183,14 +189,14 @@ def _epipolar_share(
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class PoseVerdict:
     """accepted : (N,) bool; reason : N sentences, empty where accepted."""
 
     accepted: np.ndarray
     reason: tuple[str, ...]
 
 
-def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> Verdict:
+def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> PoseVerdict:
     """Accept or refuse each of N poses."""
     n = len(posed)
     reason = ["" if posed[k] else _unposed_reason(evidence, k) for k in range(n)]
@@ -218,7 +224,7 @@ def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> Verdi
         accepted[supported] = True
     for k in np.flatnonzero(possible & ~accepted).tolist():
         reason[k] = _needs_support(evidence, k, options) + ", and no neighbour confirms its pose"
-    return Verdict(accepted, tuple("" if accepted[k] else reason[k] for k in range(n)))
+    return PoseVerdict(accepted, tuple("" if accepted[k] else reason[k] for k in range(n)))
 
 
 def _unposed_reason(evidence: Evidence, k: int) -> str:

@@ -36,7 +36,7 @@ class LensUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class FramePoints:
+class PointObservations:
     """What one frame sees. pixels : (K, 2); point_rows : (K,) of the map's points; xyz : (K, 3)."""
 
     pixels: np.ndarray
@@ -47,7 +47,7 @@ class FramePoints:
 def frame_covariances(
     poses: Poses,
     camera: Camera,
-    frames: Sequence[FramePoints],
+    frames: Sequence[PointObservations],
     lens: LensUncertainty,
     map_covariance: MapCovariance,
 ) -> np.ndarray:
@@ -69,7 +69,7 @@ def frame_covariances(
 
 
 def _one(
-    pose: Poses, camera: Camera, frame: FramePoints, lens: LensUncertainty
+    pose: Poses, camera: Camera, frame: PointObservations, lens: LensUncertainty
 ) -> tuple[np.ndarray, Functional, float]:
     """Covariance by noise and a lens of its own; what the map does to the pose; deviation of a residual."""
     m = len(frame.pixels)

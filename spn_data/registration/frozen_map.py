@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from spn_data.colmap.map_features import MapFeatures
-from spn_data.colmap.model import Observations, Scene, read_map_with_features
+from spn_data.colmap.model import MapObservations, Scene, read_map_with_features
 from spn_data.errors import FormatError
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
@@ -33,7 +33,7 @@ class FrozenMap:
 
     def __init__(self, folder: Path, features: MapFeatures):
         self.scene: Scene
-        self.observations: Observations
+        self.observations: MapObservations
         self.points: MapPoints
         self.scene, self.observations, self.points, self._feature_points = read_map_with_features(
             folder

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
 from spn_data.reconstruction.correspondences import FramesToMap, extract_missing, match_missing
@@ -18,7 +18,13 @@ from spn_data.registration.covariance import SequenceCovariance, sequence_covari
 from spn_data.registration.frozen_map import FrozenMap
 from spn_data.registration.lookup import look_up_missing
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.registration.solution import Sequence, Solution, free_lens, settle, without
+from spn_data.registration.solution import (
+    SequenceSolution,
+    UnsolvedSequence,
+    free_lens,
+    settle,
+    without,
+)
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
 from spn_data.uncertainty.map_covariance import MapCovariance
@@ -36,13 +42,13 @@ class Registered:
     where none was accepted; seen : map points of each frame; map_sigma_px : residuals of the map itself.
     """
 
-    solution: Solution
+    solution: SequenceSolution
     reason: tuple[str, ...]
     inliers: np.ndarray
     coverage: np.ndarray
     covariance: SequenceCovariance | None
     covariances: np.ndarray
-    seen: SeenPoints
+    seen: LabelObservations
     map_sigma_px: float
 
 
@@ -86,7 +92,7 @@ def register_sequence(
     progress("poses", 0, len(names))
     with stopwatch.step("poses"):
         tracks = find_tracks(pairs, [len(p) for p in pixels])
-        sequence = Sequence(pixels, [putative[name] for name in names], tracks, points.xyz)
+        sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
         (start,) = to_match.start_cameras.values()
         solution = solve(sequence, *start, options)
         found = accept(
@@ -97,8 +103,8 @@ def register_sequence(
 
 
 def accept(
-    sequence: Sequence,
-    solution: Solution,
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
     pairs: dict[tuple[int, int], np.ndarray],
     map_covariance: MapCovariance,
     points: MapPoints,
@@ -121,7 +127,7 @@ def accept(
             break
         solution = settle(sequence, without(solution, failing), options)
     of_map = np.flatnonzero(solution.point_row >= 0)
-    seen = SeenPoints(
+    seen = LabelObservations(
         solution.frame[of_map],
         points.ids[solution.point_row[of_map]],
         sequence.pixels_of(solution.frame[of_map], solution.feature[of_map]),
@@ -139,8 +145,8 @@ def accept(
 
 
 def _covariances(
-    sequence: Sequence,
-    solution: Solution,
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
     map_covariance: MapCovariance,
     options: RegisterOptions,
 ) -> tuple[SequenceCovariance | None, np.ndarray]:

@@ -25,7 +25,7 @@ _FOR_A_POSE = 4  # measurements; with fewer it is not determined
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class UnsolvedSequence:
     """What is known of N frames before they have poses.
 
     pixels : N arrays (K, 2) of features; putative : N arrays (M, 2) of feature and map point row;
@@ -44,7 +44,7 @@ class Sequence:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class SequenceSolution:
     """N frames in the map.
 
     posed : (N,) bool; poses : (N), NaN where there is none; camera : of all of them.
@@ -67,7 +67,7 @@ class Solution:
         mine = first + np.flatnonzero(self.point_row[first:last] >= 0)
         return self.feature[mine], self.point_row[mine]
 
-    def with_measurements(self, stay: np.ndarray) -> Solution:
+    def with_measurements(self, stay: np.ndarray) -> SequenceSolution:
         """Only some of the measurements (M,) bool, and own points numbered anew: those that are left."""
         own = self.own[stay]
         used = np.unique(own[own >= 0])
@@ -80,7 +80,9 @@ class Solution:
             own_points=self.own_points[used],
         )
 
-    def least_squares(self, sequence: Sequence) -> tuple[SequenceState, SequenceObservations]:
+    def least_squares(
+        self, sequence: UnsolvedSequence
+    ) -> tuple[SequenceState, SequenceObservations]:
         """The posed frames, numbered 0, 1, ..., and their measurements."""
         rows = np.flatnonzero(self.posed)
         position = np.full(len(self.posed), -1)
@@ -94,14 +96,14 @@ class Solution:
 
 
 def refine(
-    sequence: Sequence,
+    sequence: UnsolvedSequence,
     found: dict[int, Resection],
     camera: Camera,
     putative: list[np.ndarray],
     own: np.ndarray,
     own_points: np.ndarray,
     options: RegisterOptions,
-) -> Solution:
+) -> SequenceSolution:
     """All frames, their lens and their own points together; measurements that do not agree are left out."""
     n = len(sequence.pixels)
     posed = np.zeros(n, bool)
@@ -118,11 +120,13 @@ def refine(
     table = table[posed[table[:, 0]]]
     table = table[np.lexsort(table.T[::-1])]
     frame, feature, point_row, own_row = table.T
-    start = Solution(posed, poses, camera, frame, feature, point_row, own_row, own_points)
+    start = SequenceSolution(posed, poses, camera, frame, feature, point_row, own_row, own_points)
     return settle(sequence, start, options)
 
 
-def settle(sequence: Sequence, solution: Solution, options: RegisterOptions) -> Solution:
+def settle(
+    sequence: UnsolvedSequence, solution: SequenceSolution, options: RegisterOptions
+) -> SequenceSolution:
     """The least squares of a solution's frames, and which of its measurements agree with it.
 
     A frame of which hardly any agree has no pose any more.
@@ -155,7 +159,7 @@ def free_lens(camera: Camera, frames: int, options: RegisterOptions) -> tuple[st
     return lens_parameters(camera) if tells else ()
 
 
-def without(solution: Solution, refused: np.ndarray) -> Solution:
+def without(solution: SequenceSolution, refused: np.ndarray) -> SequenceSolution:
     """The solution without some frames (N,) bool, nor points that only one frame sees then."""
     stay = ~refused[solution.frame]
     seen = np.bincount(solution.own[stay & (solution.own >= 0)], minlength=len(solution.own_points))

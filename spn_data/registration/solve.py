@@ -18,8 +18,8 @@ from spn_data.registration.carry import carry
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import (
     SCALE_PX,
-    Sequence,
-    Solution,
+    SequenceSolution,
+    UnsolvedSequence,
     free_lens,
     refine,
 )
@@ -29,8 +29,8 @@ _FOCAL_FRAMES = 12  # that a focal length is guessed from
 
 
 def solve(
-    sequence: Sequence, start: Camera, focal_is_known: bool, options: RegisterOptions
-) -> Solution:
+    sequence: UnsolvedSequence, start: Camera, focal_is_known: bool, options: RegisterOptions
+) -> SequenceSolution:
     """Poses where there is any agreement with the map; whether they are good enough, `checks` says.
 
     start : intrinsics to begin with, of which only the principal point is kept (all with `hold_lens`).
@@ -64,13 +64,13 @@ def _with_focal(camera: Camera, focal_px: float) -> Camera:
     return replace(camera, params=params)
 
 
-def _strongest(sequence: Sequence, count: int) -> list[int]:
+def _strongest(sequence: UnsolvedSequence, count: int) -> list[int]:
     """Frames with most putative matches, spread by nothing else."""
     sizes = np.array([len(m) for m in sequence.putative])
     return [int(row) for row in np.argsort(-sizes, kind="stable")[:count]]
 
 
-def _guess_focal(sequence: Sequence, camera: Camera, options: RegisterOptions) -> Camera:
+def _guess_focal(sequence: UnsolvedSequence, camera: Camera, options: RegisterOptions) -> Camera:
     focals, weights = [], []
     for row in _strongest(sequence, _FOCAL_FRAMES):
         found = _resect(
@@ -86,7 +86,7 @@ def _guess_focal(sequence: Sequence, camera: Camera, options: RegisterOptions) -
     return _with_focal(camera, float(np.array(focals)[order][half]))
 
 
-def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> Camera:
+def _find_lens(sequence: UnsolvedSequence, camera: Camera, options: RegisterOptions) -> Camera:
     """Focal length and distortion from the frames that agree best with the map, by growing strictness."""
     rows = _strongest(sequence, _LENS_FRAMES)
     for max_error_px in (options.start_error_px, options.start_error_px / 2, options.max_error_px):
@@ -116,7 +116,7 @@ def _find_lens(sequence: Sequence, camera: Camera, options: RegisterOptions) -> 
 
 
 def _resect(
-    sequence: Sequence,
+    sequence: UnsolvedSequence,
     row: int,
     camera: Camera,
     options: RegisterOptions,

@@ -249,7 +249,7 @@ class ReportData:
     coverage: CoverageFacts | None = None
     plan: CoverageFacts | None = None
     split: Split | None = None
-    audit: tuple[audit.Finding, ...] | None = None
+    audit: tuple[audit.AuditFinding, ...] | None = None
     evaluation_records: dict[str, StageRecord] = field(default_factory=dict)
     runs: tuple[RunFacts, ...] = ()
     broken_runs: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ import numpy as np
 from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
 from spn_data.report.figures import figure
 from spn_data.report.residual_map import residual_map
-from spn_data.report.verdict import Finding, Level, Verdict
+from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
 from spn_data.split import audit
 from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import statements
@@ -38,7 +38,7 @@ def heading(data: ReportData) -> str:
     )
 
 
-def verdict_box(verdict: Verdict) -> str:
+def verdict_box(verdict: AreaVerdict) -> str:
     """The answer, what to do next, and the reasons."""
     mark = _MARKS[verdict.level][0]
     step = verdict.next_step
@@ -50,7 +50,7 @@ def verdict_box(verdict: Verdict) -> str:
     )
 
 
-def _finding(finding: Finding, *, is_next: bool) -> str:
+def _finding(finding: VerdictReason, *, is_next: bool) -> str:
     mark, word = _MARKS[finding.level]
     do = "" if is_next else _what_to_do(finding)
     return (
@@ -59,7 +59,7 @@ def _finding(finding: Finding, *, is_next: bool) -> str:
     )
 
 
-def _what_to_do(finding: Finding) -> str:
+def _what_to_do(finding: VerdictReason) -> str:
     code = f"<code>{escape(finding.command)}</code>" if finding.command else ""
     return f"{escape(finding.do)}{': ' if finding.do and code else '.' if finding.do else ''}{code}"
 
@@ -208,12 +208,12 @@ def split(data: ReportData) -> str:
     return "".join(parts) + "".join(_check(check) for check in data.audit or ()) + "</section>"
 
 
-def _check(check: audit.Finding) -> str:
+def _check(check: audit.AuditFinding) -> str:
     """One line of the audit; its evidence folds out."""
     level = {
-        audit.Verdict.PASS: Level.GOOD,
-        audit.Verdict.NOTICE: Level.CAUTION,
-        audit.Verdict.FAIL: Level.STOP,
+        audit.AuditVerdict.PASS: Level.GOOD,
+        audit.AuditVerdict.NOTICE: Level.CAUTION,
+        audit.AuditVerdict.FAIL: Level.STOP,
     }[check.verdict]
     mark, word = _MARKS[level]
     text = f"<b>{escape(check.check)}</b>: {escape(check.text)}"

@@ -26,8 +26,8 @@ from spn_data.simulate.flight import (
     simulate_telemetry,
 )
 from spn_data.simulate.presets import SimulateOptions
-from spn_data.simulate.render import BAND_PX, Renderer
-from spn_data.simulate.scene import Place, build_place, paint
+from spn_data.simulate.render import BAND_PX, SceneRenderer
+from spn_data.simulate.scene import SceneFaces, build_place, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
@@ -114,20 +114,22 @@ class _Studio:
         cv2.setNumThreads(1)
         self.options = options
         self.texture_folder = texture_folder
-        self.place: Place = build_place(options.scene)
+        self.place: SceneFaces = build_place(options.scene)
         self.paths = simulate_paths(options)
         self.noise = noise_field(options.width, options.height, options.noise_sigma, options.seed)
         self._textures: dict[str, Texture] = {}
-        self._renderers: dict[str, Renderer] = {}
+        self._renderers: dict[str, SceneRenderer] = {}
 
-    def renderer(self, path: FlightPath) -> Renderer:
+    def renderer(self, path: FlightPath) -> SceneRenderer:
         """The renderer of a flight's camera."""
         if not self._textures:
             self._textures = {
                 name: _open_texture(self.texture_folder, name) for name in self.place.canvases
             }
         if path.role not in self._renderers:
-            self._renderers[path.role] = Renderer(self.place.faces, self._textures, path.camera)
+            self._renderers[path.role] = SceneRenderer(
+                self.place.faces, self._textures, path.camera
+            )
         return self._renderers[path.role]
 
 
@@ -162,7 +164,7 @@ def _render(studio: _Studio, flight: str, frame: int) -> np.ndarray:
 
 
 def render_frame(
-    renderer: Renderer, path: FlightPath, frame: int, readout_s: float = 0.0
+    renderer: SceneRenderer, path: FlightPath, frame: int, readout_s: float = 0.0
 ) -> np.ndarray:
     """One frame (H, W, 3) uint8 RGB of a flight, before exposure and noise."""
     blurred = bool(path.blurred[frame])

@@ -27,7 +27,7 @@ HAZE_RGB = (208, 214, 220)  # where a ray meets no face
 _EDGE_TOLERANCE = 1e-7  # lets neighbouring faces meet without a crack from rounding
 
 
-class Renderer:
+class SceneRenderer:
     """Holds the faces, the textures and one camera's rays; each image is a function of poses alone."""
 
     def __init__(self, faces: Sequence[Face], textures: Mapping[str, Texture], camera: Camera):

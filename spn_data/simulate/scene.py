@@ -32,7 +32,7 @@ class SceneOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class SceneFaces:
     """Faces of the scene, and how their textures are painted.
 
     canvases : painter's name and canvas of each texture; obstacles : (N, 6) boxes x0, y0, z0, x1, y1, z1 in
@@ -49,7 +49,7 @@ class Place:
 BUILDING_DEPTH_M = 10.0
 
 
-def build_place(options: SceneOptions) -> Place:
+def build_place(options: SceneOptions) -> SceneFaces:
     """The courtyard for a seed; textures are painted apart (`paint`)."""
     builder = _Courtyard(options)
     builder.shell()
@@ -57,7 +57,7 @@ def build_place(options: SceneOptions) -> Place:
     builder.roof_things()
     builder.courtyard_things()
     builder.houses()
-    return Place(
+    return SceneFaces(
         tuple(builder.faces),
         builder.canvases,
         np.array(builder.obstacles),
@@ -65,13 +65,13 @@ def build_place(options: SceneOptions) -> Place:
     )
 
 
-def paint(place: Place, name: str) -> np.ndarray:
+def paint(place: SceneFaces, name: str) -> np.ndarray:
     """Picture (H, W, 3 or 4) uint8 RGB of one texture."""
     painter, canvas = place.canvases[name]
     return PAINTERS[painter](canvas)
 
 
-def paint_all(place: Place) -> dict[str, Texture]:
+def paint_all(place: SceneFaces) -> dict[str, Texture]:
     """All textures, in memory."""
     return {name: Texture.from_image(paint(place, name)) for name in place.canvases}
 

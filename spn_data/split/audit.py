@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spn_data.geometry.pose import rotation_errors_deg
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.split.groups import (
     OPTIMISTIC,
     SLACK,
@@ -30,7 +30,7 @@ _NOT_IN_MAP = "no evaluation frame in the map"
 MIN_TRAINING_VIEWS = 2
 
 
-class Verdict(StrEnum):
+class AuditVerdict(StrEnum):
     """What a check found. A notice is no fault; the user should know it."""
 
     PASS = "pass"
@@ -39,11 +39,11 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class AuditFinding:
     """One check: its name, what it found in a sentence, and the evidence (one line each)."""
 
     check: str
-    verdict: Verdict
+    verdict: AuditVerdict
     text: str
     evidence: tuple[str, ...] = ()
 
@@ -56,11 +56,11 @@ class MapHashes:
     after: str
 
 
-def finding_of(check: str, bad: Sequence[str], good_text: str, bad_text: str) -> Finding:
+def finding_of(check: str, bad: Sequence[str], good_text: str, bad_text: str) -> AuditFinding:
     """Failed where there is anything bad, with that as evidence."""
     if bad:
-        return Finding(check, Verdict.FAIL, bad_text, tuple(bad))
-    return Finding(check, Verdict.PASS, good_text)
+        return AuditFinding(check, AuditVerdict.FAIL, bad_text, tuple(bad))
+    return AuditFinding(check, AuditVerdict.PASS, good_text)
 
 
 def check_not_in_map(
@@ -68,7 +68,7 @@ def check_not_in_map(
     mapping_sources: Mapping[str, str],
     evaluation: Mapping[str, Labels],
     evaluation_sources: Mapping[str, Mapping[str, str]],
-) -> Finding:
+) -> AuditFinding:
     """(a) No evaluation frame is in the map, and no file of an evaluation sequence was mapped.
 
     map_names : images of the model; mapping_sources, evaluation_sources[sequence] : content fingerprint by
@@ -88,7 +88,7 @@ def check_not_in_map(
             bad.append(f"{sequence}: its source is not recorded")
     frames = sum(len(labels) for labels in evaluation.values())
     if not evaluation:
-        return Finding(_NOT_IN_MAP, Verdict.PASS, "there is no evaluation sequence")
+        return AuditFinding(_NOT_IN_MAP, AuditVerdict.PASS, "there is no evaluation sequence")
     return finding_of(
         _NOT_IN_MAP,
         bad,
@@ -97,7 +97,7 @@ def check_not_in_map(
     )
 
 
-def check_copies(mapping: Labels, evaluation: Mapping[str, Labels]) -> Finding:
+def check_copies(mapping: Labels, evaluation: Mapping[str, Labels]) -> AuditFinding:
     """(a) No evaluation sequence looks like a mapping flight itself, encoded anew: that no fingerprint tells.
 
     Two flights do not meet within centimetres and fractions of a degree, again and again.
@@ -114,16 +114,16 @@ def check_copies(mapping: Labels, evaluation: Mapping[str, Labels]) -> Finding:
             suspects.append(f"{sequence}: {same} of {len(poses)} frames")
     meet = f"within {COPY_M * 100:g} cm and {COPY_DEG:g} deg of a mapping frame"
     if not suspects:
-        return Finding(_COPIES, Verdict.PASS, f"no sequence lies again and again {meet}")
-    return Finding(
+        return AuditFinding(_COPIES, AuditVerdict.PASS, f"no sequence lies again and again {meet}")
+    return AuditFinding(
         _COPIES,
-        Verdict.NOTICE,
+        AuditVerdict.NOTICE,
         f"frames lie {meet}: is it a mapping flight under another name, cut or encoded anew?",
         tuple(suspects),
     )
 
 
-def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> Finding:
+def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> AuditFinding:
     """The map is, bit for bit, the one that every sequence was registered in."""
     bad = []
     for sequence, at in registrations.items():
@@ -141,7 +141,7 @@ def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> Fin
     )
 
 
-def check_blocks(labels: Labels, split: Split) -> Finding:
+def check_blocks(labels: Labels, split: Split) -> AuditFinding:
     """(b) Chosen and tracked frames obey the same blocks. labels : of the mapping flights."""
     group = split.of(labels.names)
     wrong = np.zeros(len(labels), dtype=bool)
@@ -160,7 +160,7 @@ def check_blocks(labels: Labels, split: Split) -> Finding:
     )
 
 
-def check_gap(labels: Labels, split: Split) -> Finding:
+def check_gap(labels: Labels, split: Split) -> AuditFinding:
     """(b) No training frame is nearer to a held-out frame of its sequence than the gap."""
     group, gap_s = split.of(labels.names), split.options.gap_s
     held = np.isin(group, (VALIDATION, TEST))
@@ -179,14 +179,14 @@ def check_gap(labels: Labels, split: Split) -> Finding:
     )
 
 
-def check_revisits(labels: Labels, split: Split) -> Finding:
+def check_revisits(labels: Labels, split: Split) -> AuditFinding:
     """(b) Lists training frames within 1 m and 10 degrees of a held-out frame, the nearest of each."""
     check = "revisits"
     group = split.of(labels.names)
     held = np.flatnonzero(np.isin(group, (VALIDATION, TEST)))
     trained = np.flatnonzero(group == TRAIN)
     if not len(held) or not len(trained):
-        return Finding(check, Verdict.PASS, "no frame of the mapping flights is held out")
+        return AuditFinding(check, AuditVerdict.PASS, "no frame of the mapping flights is held out")
     centers = labels.poses.centers
     tree = cKDTree(centers[trained])
     listed = []
@@ -207,16 +207,18 @@ def check_revisits(labels: Labels, split: Split) -> Finding:
             )
     near_text = f"within {REVISIT_M:g} m and {REVISIT_DEG:g} deg of a training frame"
     if not listed:
-        return Finding(check, Verdict.PASS, f"none of {len(held)} held-out frames lies {near_text}")
-    return Finding(
+        return AuditFinding(
+            check, AuditVerdict.PASS, f"none of {len(held)} held-out frames lies {near_text}"
+        )
+    return AuditFinding(
         check,
-        Verdict.NOTICE,
+        AuditVerdict.NOTICE,
         f"{len(listed)} of {len(held)} held-out frames lie {near_text}: the flight came back there",
         tuple(listed),
     )
 
 
-def training_points(labels: Labels, seen: SeenPoints, split: Split) -> np.ndarray:
+def training_points(labels: Labels, seen: LabelObservations, split: Split) -> np.ndarray:
     """Ids, ascending, of map points that at least two chosen training frames see.
 
     labels, seen : the chosen frames of the mapping flights, whose tracks made the points. A point that only
@@ -229,8 +231,8 @@ def training_points(labels: Labels, seen: SeenPoints, split: Split) -> np.ndarra
 
 
 def check_training_points(
-    given: np.ndarray, labels: Labels, seen: SeenPoints, split: Split
-) -> Finding:
+    given: np.ndarray, labels: Labels, seen: LabelObservations, split: Split
+) -> AuditFinding:
     """(c) Points given for training are seen by at least two training frames. given : their ids."""
     unseen = np.setdiff1d(given, training_points(labels, seen, split))
     return finding_of(
@@ -242,7 +244,7 @@ def check_training_points(
     )
 
 
-def check_marks(for_training: Mapping[str, bool]) -> Finding:
+def check_marks(for_training: Mapping[str, bool]) -> AuditFinding:
     """(d) Points of no group but train are marked for training. for_training : mark by group."""
     bad = [
         f"points of group {name} are marked for training"
@@ -260,16 +262,16 @@ def check_marks(for_training: Mapping[str, bool]) -> Finding:
     )
 
 
-def check_test_is_apart(split: Split) -> Finding:
+def check_test_is_apart(split: Split) -> AuditFinding:
     """Whether the test frames are of another flight than the training frames."""
     check = "test apart from training"
     if split.optimistic:
-        return Finding(check, Verdict.NOTICE, OPTIMISTIC)
+        return AuditFinding(check, AuditVerdict.NOTICE, OPTIMISTIC)
     tests = ", ".join(name for name in split.groups() if name not in (TRAIN, VALIDATION))
-    return Finding(check, Verdict.PASS, f"evaluation sequences of their own: {tests}")
+    return AuditFinding(check, AuditVerdict.PASS, f"evaluation sequences of their own: {tests}")
 
 
-def check_fresh(reason: str | None) -> Finding:
+def check_fresh(reason: str | None) -> AuditFinding:
     """The split is made from the area as it is now. reason : why not."""
     return finding_of(
         "up to date",
@@ -279,5 +281,5 @@ def check_fresh(reason: str | None) -> Finding:
     )
 
 
-def has_failed(findings: Sequence[Finding]) -> bool:
-    return any(finding.verdict is Verdict.FAIL for finding in findings)
+def has_failed(findings: Sequence[AuditFinding]) -> bool:
+    return any(finding.verdict is AuditVerdict.FAIL for finding in findings)

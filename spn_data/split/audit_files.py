@@ -9,14 +9,14 @@ import numpy as np
 
 from spn_data.geometry.pose import Poses
 from spn_data.labels.labels import Labels
-from spn_data.split.audit import Finding, finding_of
+from spn_data.split.audit import AuditFinding, finding_of
 from spn_data.split.groups import LEFT_OUT, TEST, TRAIN, VALIDATION, Split
 
 # Half a unit of the sixth decimal, and what rounding adds.
 _PRINTED = 0.5e-6 + 1e-9
 
 
-def check_labels(parts: Mapping[str, Labels]) -> Finding:
+def check_labels(parts: Mapping[str, Labels]) -> AuditFinding:
     """Every pose is finite with a unit quaternion; a covariance is unknown, or finite and not negative."""
     bad: list[str] = []
     count = without = 0
@@ -45,7 +45,7 @@ def check_labels(parts: Mapping[str, Labels]) -> Finding:
     )
 
 
-def check_covered(parts: Mapping[str, Labels], split: Split) -> Finding:
+def check_covered(parts: Mapping[str, Labels], split: Split) -> AuditFinding:
     """The split knows every frame exactly once; those with a pose have a group or a reason, others none.
 
     parts : all labels, "mapping", "tracked", and each evaluation sequence by its name.
@@ -100,7 +100,7 @@ class PoseList:
 
 def check_dataset(
     stored: Mapping[str, PoseList], parts: Mapping[str, Labels], split: Split
-) -> Finding:
+) -> AuditFinding:
     """Each group of dataset.h5 holds just the frames that the split puts in it, with their labels' poses."""
     bad = []
     for name in sorted({*stored, *split.groups()}):
@@ -127,7 +127,7 @@ def check_dataset(
     )
 
 
-def check_cambridge(listed: Mapping[str, PoseList], stored: Mapping[str, PoseList]) -> Finding:
+def check_cambridge(listed: Mapping[str, PoseList], stored: Mapping[str, PoseList]) -> AuditFinding:
     """Lists of Cambridge Landmarks agree with dataset.h5 to the printed digits.
 
     listed : by file, as read back; stored : by the same file, what should stand in it. Names are compared
@@ -155,7 +155,7 @@ def check_cambridge(listed: Mapping[str, PoseList], stored: Mapping[str, PoseLis
     )
 
 
-def check_measured(measured: Sequence[str], split: Split) -> Finding:
+def check_measured(measured: Sequence[str], split: Split) -> AuditFinding:
     """The model beside the lists holds measurements of training frames alone.
 
     measured : images that have any; compared without their suffix.

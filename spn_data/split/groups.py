@@ -51,7 +51,7 @@ class SplitOptions:
 
 
 @dataclass(frozen=True)
-class Block:
+class HeldOutBlock:
     """What is held out as `group`: a stretch of one sequence, cells in plan view, or a band of heights.
 
     Bounds belong to the block. One of seconds, cells and heights_m is given.
@@ -92,7 +92,7 @@ class Split:
     group: np.ndarray
     reason: np.ndarray
     options: SplitOptions
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[HeldOutBlock, ...] = ()
     optimistic: bool = False
     notes: tuple[str, ...] = ()
 

@@ -20,7 +20,7 @@ from spn_data.split.groups import (
     TEST,
     TRAIN,
     VALIDATION,
-    Block,
+    HeldOutBlock,
     Policy,
     Split,
     SplitOptions,
@@ -99,7 +99,7 @@ class _Plan:
     options: SplitOptions
     group: np.ndarray
     reason: np.ndarray
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[HeldOutBlock, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -111,7 +111,7 @@ class _Plan:
         """Of its own for each purpose, so that one draw does not move another."""
         return np.random.default_rng([self.options.seed, zlib.crc32(purpose.encode())])
 
-    def with_block(self, block: Block) -> _Plan:
+    def with_block(self, block: HeldOutBlock) -> _Plan:
         """The plan with a block held out, and its guard left out."""
         held = block.holds(self.flights) & (self.group == TRAIN)
         group = np.where(held, block.group, self.group)
@@ -129,7 +129,7 @@ class _Plan:
 
 
 def _within_guard(
-    flights: Labels, held: np.ndarray, block: Block, options: SplitOptions
+    flights: Labels, held: np.ndarray, block: HeldOutBlock, options: SplitOptions
 ) -> np.ndarray:
     """(N,) bool: nearer to a held frame than a block in space or height allows."""
     near = np.zeros(len(flights), dtype=bool)
@@ -213,13 +213,15 @@ def _rows(plan: _Plan, sequence: str) -> np.ndarray:
     return np.asarray(rows[np.lexsort((flights.names[rows], flights.time_s[rows]))])
 
 
-def _windows(plan: _Plan, rows: np.ndarray, part: np.ndarray, group: str, size: int) -> list[Block]:
+def _windows(
+    plan: _Plan, rows: np.ndarray, part: np.ndarray, group: str, size: int
+) -> list[HeldOutBlock]:
     """Every stretch of `size` frames in succession that all train as yet and lie in `part` of `rows`."""
     flights = plan.flights
     free = plan.trained[rows] & np.isin(rows, part)
     starts = np.flatnonzero(np.convolve(free, np.ones(size), "valid") > size - 0.5)
     return [
-        Block(
+        HeldOutBlock(
             group,
             sequence=str(flights.sequences[rows[k]]),
             seconds=(float(flights.time_s[rows[k]]), float(flights.time_s[rows[k + size - 1]])),
@@ -229,7 +231,7 @@ def _windows(plan: _Plan, rows: np.ndarray, part: np.ndarray, group: str, size: 
 
 
 def _hold_out_one(
-    plan: _Plan, blocks: Sequence[Block], rng: np.random.Generator, rows: np.ndarray
+    plan: _Plan, blocks: Sequence[HeldOutBlock], rng: np.random.Generator, rows: np.ndarray
 ) -> _Plan:
     """Hold out one of the blocks: any of those that leave enough of `rows` to training, else the best.
 
@@ -264,7 +266,9 @@ def _hold_out_in_space(plan: _Plan) -> _Plan:
     wanted = plan.options.validation_share * counts.sum()
     regions = dict.fromkeys(_grown(cell, occupied, wanted) for cell in sorted(occupied))
     blocks = [
-        Block(VALIDATION, cells=region, cell_m=plan.options.cell_m) for region in regions if region
+        HeldOutBlock(VALIDATION, cells=region, cell_m=plan.options.cell_m)
+        for region in regions
+        if region
     ]
     return _hold_out_one(plan, blocks, plan.rng("validation space"), np.flatnonzero(plan.trained))
 
@@ -292,7 +296,7 @@ def _hold_out_in_height(plan: _Plan) -> _Plan:
     heights = np.sort(plan.flights.poses.centers[plan.trained, 2])
     size = max(1, round(plan.options.validation_share * len(heights)))
     blocks = [
-        Block(VALIDATION, heights_m=(float(heights[k]), float(heights[k + size - 1])))
+        HeldOutBlock(VALIDATION, heights_m=(float(heights[k]), float(heights[k + size - 1])))
         for k in range(len(heights) - size + 1)
     ]
     return _hold_out_one(plan, blocks, plan.rng("validation height"), np.flatnonzero(plan.trained))

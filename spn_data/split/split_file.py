@@ -14,7 +14,7 @@ from spn_data.split.groups import (
     LEFT_OUT,
     OPTIMISTIC,
     VALIDATION,
-    Block,
+    HeldOutBlock,
     Policy,
     Split,
     SplitOptions,
@@ -95,7 +95,7 @@ def read_split(path: Path) -> Split:
     return split
 
 
-def _block_to_json(block: Block) -> dict[str, Any]:
+def _block_to_json(block: HeldOutBlock) -> dict[str, Any]:
     if block.seconds is not None:
         first, last = block.seconds
         where: dict[str, Any] = {"sequence": block.sequence, "first_s": first, "last_s": last}
@@ -106,12 +106,12 @@ def _block_to_json(block: Block) -> dict[str, Any]:
     return {"group": block.group, **where}
 
 
-def _block_from_json(table: dict[str, Any]) -> Block:
+def _block_from_json(table: dict[str, Any]) -> HeldOutBlock:
     group = str(table["group"])
     if "first_s" in table:
         seconds = (float(table["first_s"]), float(table["last_s"]))
-        return Block(group, sequence=str(table["sequence"]), seconds=seconds)
+        return HeldOutBlock(group, sequence=str(table["sequence"]), seconds=seconds)
     if "low_m" in table:
-        return Block(group, heights_m=(float(table["low_m"]), float(table["high_m"])))
+        return HeldOutBlock(group, heights_m=(float(table["low_m"]), float(table["high_m"])))
     cells = tuple((int(i), int(j)) for i, j in table["cells"])
-    return Block(group, cells=cells, cell_m=float(table["cell_m"]))
+    return HeldOutBlock(group, cells=cells, cell_m=float(table["cell_m"]))

@@ -49,7 +49,7 @@ _BRACKETS = re.compile(r"(.*?)\s*[(\[]\s*([^()\[\]]*?)\s*[)\]]\s*")
 
 
 @dataclass(frozen=True)
-class Column:
+class CsvColumn:
     """One column that is understood."""
 
     index: int
@@ -58,13 +58,13 @@ class Column:
     unit: str  # as the file has it; "" where it states none
 
 
-def columns_of(header: Sequence[str]) -> dict[str, Column]:
+def columns_of(header: Sequence[str]) -> dict[str, CsvColumn]:
     """What is known of a header row, by meaning; of equal names the first column counts."""
     parsed: dict[str, tuple[int, str]] = {}
     for index, cell in enumerate(header):
         name, unit = _name_and_unit(cell)
         parsed.setdefault(name, (index, unit))
-    found: dict[str, Column] = {}
+    found: dict[str, CsvColumn] = {}
     for meaning, names in COLUMNS.items():
         units = _UNITS.get(meaning, {})
         for name in names:
@@ -76,7 +76,7 @@ def columns_of(header: Sequence[str]) -> dict[str, Column]:
             index, unit = parsed[match[0]]
             unit = unit or match[1]
             scale = 1.0 if not unit or not units else units.get(unit, math.nan)
-            found[meaning] = Column(index, header[index], scale, unit)
+            found[meaning] = CsvColumn(index, header[index], scale, unit)
             break
     return found
 

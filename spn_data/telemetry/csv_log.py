@@ -11,7 +11,7 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
-from spn_data.telemetry.csv_columns import COLUMNS, Column, columns_of
+from spn_data.telemetry.csv_columns import COLUMNS, CsvColumn, columns_of
 from spn_data.telemetry.textfile import MAX_RECORDS, csv_rows, read_text
 from spn_data.telemetry.track import Telemetry, increasing
 
@@ -117,7 +117,7 @@ class _Table:
         return int(np.isfinite(self[name]).sum())
 
 
-def _understood(header: list[str], line: int, path: Path | str) -> dict[str, Column]:
+def _understood(header: list[str], line: int, path: Path | str) -> dict[str, CsvColumn]:
     """The columns by meaning. Raises InputError where one that is needed is missing."""
     columns = columns_of(header)
     missing = [name for name in ("latitude", "longitude") if name not in columns]
@@ -143,7 +143,7 @@ def _understood(header: list[str], line: int, path: Path | str) -> dict[str, Col
 
 
 def _record(
-    row: list[str], columns: dict[str, Column], width: int
+    row: list[str], columns: dict[str, CsvColumn], width: int
 ) -> tuple[dict[str, float], bool]:
     """The numbers of a row in our units, and whether its date is of an unknown zone.
 
@@ -175,7 +175,7 @@ def _record(
     return record, zoneless
 
 
-def _moment(cell: str, column: Column) -> tuple[float, bool, bool]:
+def _moment(cell: str, column: CsvColumn) -> tuple[float, bool, bool]:
     """(seconds, whether they count from 1970, whether that is in a zone that is not known)."""
     try:
         seconds = float(cell)
@@ -198,7 +198,7 @@ def _moment(cell: str, column: Column) -> tuple[float, bool, bool]:
     return seconds, seconds > _ABSOLUTE_S, column.unit == "local" and seconds > _ABSOLUTE_S
 
 
-def _number(cell: str, column: Column) -> float:
+def _number(cell: str, column: CsvColumn) -> float:
     try:
         value = float(cell)
     except ValueError:

@@ -11,7 +11,7 @@ import numpy as np
 from spn_data.capture.frames import Frames
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.tracking.point_tracking import between, track_segment
 from spn_data.tracking.segments import SequenceToLabel, read_segments
@@ -26,14 +26,14 @@ def track_frames(
     videos: Sequence[Path],
     frames: Frames,
     labelled: Labels,
-    seen: SeenPoints,
+    seen: LabelObservations,
     cameras: dict[str, Camera],
     points: MapPoints,
     options: TrackingOptions,
     *,
     workers: int = 1,
     progress: Progress | None = None,
-) -> tuple[Labels, SeenPoints]:
+) -> tuple[Labels, LabelObservations]:
     """Labels of all frames of one sequence that `labelled` does not name, and the map points they see.
 
     videos : the sequence's files in their order; frames : all its frames; labelled, seen : those whose pose
@@ -105,7 +105,9 @@ def drop_jumps(
                 excesses[order[near]] = excess(near)
 
 
-def _labels(sequence: SequenceToLabel, found: dict[int, TrackedFrame]) -> tuple[Labels, SeenPoints]:
+def _labels(
+    sequence: SequenceToLabel, found: dict[int, TrackedFrame]
+) -> tuple[Labels, LabelObservations]:
     frames = sequence.frames.select(sequence.wanted)
     results = [found[row] for row in sequence.wanted.tolist()]
     n = len(results)
@@ -121,7 +123,7 @@ def _labels(sequence: SequenceToLabel, found: dict[int, TrackedFrame]) -> tuple[
     )
     counts = labels.inliers
     nothing = np.zeros((0, 2))
-    seen = SeenPoints(
+    seen = LabelObservations(
         np.repeat(np.arange(n), counts),
         np.concatenate([np.zeros(0, np.int64), *(r.point_ids for r in results)]),
         np.concatenate([nothing, *(r.pixels for r in results)]),

@@ -11,7 +11,7 @@ import numpy as np
 from spn_data.capture import video
 from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
-from spn_data.labels.labels import Labels, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.tracking.tracked_frames import Anchor, Segment, TrackingOptions
 
@@ -25,7 +25,7 @@ class SequenceToLabel:
 
     frames: Frames
     labelled: Labels
-    seen: SeenPoints
+    seen: LabelObservations
     cameras: dict[str, Camera]
     points: MapPoints
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spn_data.colmap.model import Observations, Scene
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.camera import MODELS, Camera
 from spn_data.geometry.least_squares import (
     POSE,
@@ -58,7 +58,7 @@ def _lens_parameters(camera: Camera, refine_principal_point: bool) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
+class LinearizedBundle:
     """All M measurements of P points, linearised; n is the number of unknowns that stay.
 
     points : (P,) positions in Scene.points. point : (M,) 0..P-1.
@@ -87,8 +87,8 @@ class Bundle:
 
 
 def linearize_bundle(
-    scene: Scene, seen: Observations, unknowns: Unknowns, rows: np.ndarray
-) -> Bundle:
+    scene: Scene, seen: MapObservations, unknowns: Unknowns, rows: np.ndarray
+) -> LinearizedBundle:
     """At the scene as it is, of the measurements at `rows` (M,): all those of their points, all finite."""
     frame = seen.image_idx[rows]
     points, point = np.unique(seen.point_idx[rows], return_inverse=True)
@@ -115,7 +115,7 @@ def linearize_bundle(
     by_points = rows_to_sparse(whitened, 3 * point[:, None] + np.arange(3), 3 * len(points))
     residuals = seen.residuals_px[rows].ravel()
     distance = np.linalg.norm(offsets, axis=1, keepdims=True)
-    return Bundle(
+    return LinearizedBundle(
         points,
         point,
         design,

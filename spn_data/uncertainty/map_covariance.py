@@ -19,10 +19,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spn_data.colmap.model import Observations, Scene
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.errors import GeometryError
 from spn_data.geometry.least_squares import POSE, cluster_pulls
-from spn_data.uncertainty.bundle_jacobians import GAUGE, Bundle, Unknowns, linearize_bundle
+from spn_data.uncertainty.bundle_jacobians import (
+    GAUGE,
+    LinearizedBundle,
+    Unknowns,
+    linearize_bundle,
+)
 from spn_data.uncertainty.gauged_inverse import GaugedInverse
 from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, own_errors
 
@@ -78,7 +83,7 @@ class MapCovariance:
 
     @classmethod
     def of(
-        cls, scene: Scene, seen: Observations, options: MapCovarianceOptions | None = None
+        cls, scene: Scene, seen: MapObservations, options: MapCovarianceOptions | None = None
     ) -> MapCovariance:
         """Of a map that bundle adjustment has brought to its least squares, and all its measurements.
 
@@ -180,7 +185,7 @@ class MapCovariance:
         return by_own, right
 
 
-def _clusters_of_points(seen: Observations, rows: np.ndarray, points: int) -> np.ndarray:
+def _clusters_of_points(seen: MapObservations, rows: np.ndarray, points: int) -> np.ndarray:
     """(P,) cluster of each point: those of one spot of the image that first saw them; -1 where none did."""
     order = rows[np.lexsort((seen.image_idx[rows], seen.point_idx[rows]))]
     point, first = np.unique(seen.point_idx[order], return_index=True)
@@ -205,7 +210,7 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
         first = last
 
 
-def _clustered_pull(bundle: Bundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
+def _clustered_pull(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
     """(n, n) sum over clusters of the outer product of their pull on frames and lenses."""
     cluster = np.unique(cluster_of_point, return_inverse=True)[1]
     pulls = cluster_pulls(bundle.residuals, cluster[bundle.point], bundle.design)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import optimize
 from scipy.special import gammaln
 
-from spn_data.uncertainty.bundle_jacobians import Bundle
+from spn_data.uncertainty.bundle_jacobians import LinearizedBundle
 
 # Much more than any track sees: what a drift does over a track's views grows with their change. It is not
 # estimated, as only its ratio to the variance matters then.
@@ -56,7 +56,7 @@ class _Tracks:
     residuals: np.ndarray
 
 
-def fit_track_noise(bundle: Bundle) -> TrackNoise:
+def fit_track_noise(bundle: LinearizedBundle) -> TrackNoise:
     """Most likely noise of a bundle's tracks, from a sample of them."""
     lengths = np.bincount(bundle.point)
     usable = np.flatnonzero((lengths >= _TRACK_LENGTHS[0]) & (lengths <= _TRACK_LENGTHS[1]))
@@ -80,7 +80,7 @@ def fit_track_noise(bundle: Bundle) -> TrackNoise:
     return _noise(found.x)
 
 
-def own_errors(bundle: Bundle, noise: TrackNoise | None) -> np.ndarray:
+def own_errors(bundle: LinearizedBundle, noise: TrackNoise | None) -> np.ndarray:
     """(P, 3, 3) F, with Q^T F Q the covariance of a point by its own errors (Q of Bundle.whitening).
 
     Without a model of noise: of independent errors of 1 px.
@@ -117,7 +117,7 @@ def _noise(x: np.ndarray) -> TrackNoise:
     )
 
 
-def _tracks(bundle: Bundle, points: np.ndarray) -> Iterator[_Tracks]:
+def _tracks(bundle: LinearizedBundle, points: np.ndarray) -> Iterator[_Tracks]:
     """The tracks of some points, by their length."""
     order = np.argsort(bundle.point, kind="stable")
     starts = np.searchsorted(bundle.point[order], points)

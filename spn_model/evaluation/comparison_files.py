@@ -13,12 +13,12 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_whole
 from spn_model.evaluation import figures
 from spn_model.evaluation.baselines import MEAN
-from spn_model.evaluation.evaluate import Comparison, Cost, Judged
+from spn_model.evaluation.evaluate import EvaluatedGroup, NetworkComparison, NetworkCost
 from spn_model.evaluation.tables import write_errors, write_metrics
 from spn_model.models.checkpoint import Checkpoint
 
 
-def of_network(comparison: Comparison, name: str) -> Comparison:
+def of_network(comparison: NetworkComparison, name: str) -> NetworkComparison:
     """The same with one network alone (and its dropout), beside all baselines."""
     others = {n for n in comparison.networks if n != name and not n.startswith(f"{name}, ")}
     return replace(
@@ -37,7 +37,7 @@ def of_network(comparison: Comparison, name: str) -> Comparison:
 
 
 def write_comparison(
-    comparison: Comparison,
+    comparison: NetworkComparison,
     facts: Mapping[str, Any],
     *,
     metrics: Path,
@@ -78,23 +78,23 @@ def write_comparison(
 
 def network_facts(network: Checkpoint) -> dict[str, Any]:
     """What a network is and how it was trained, for `facts`."""
-    state = network.member.network.state_dict().values()
+    state = network.model.network.state_dict().values()
     return {
-        "kind": network.member.kind,
-        "options": network.member.options,
-        "parameters": sum(p.numel() for p in network.member.network.parameters()),
+        "kind": network.model.kind,
+        "options": network.model.options,
+        "parameters": sum(p.numel() for p in network.model.network.parameters()),
         "bytes": sum(t.numel() * t.element_size() for t in state),
         "trained_on": network.view.dataset,
         "training": network.facts,
     }
 
 
-def cost_facts(cost: Cost) -> dict[str, Any]:
+def cost_facts(cost: NetworkCost) -> dict[str, Any]:
     """As metrics.json has it."""
     return {**asdict(cost), "ms_an_image": round(1000 * cost.seconds / cost.images, 3)}
 
 
-def drawn(group: Judged, comparison: Comparison) -> dict[str, str]:
+def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str]:
     """Figures of a group by what they show; none of training images, whose nearest frame is themselves."""
     if group.role is Role.TRAIN:
         return {}
@@ -120,7 +120,7 @@ def _of(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
     return [by_method[method] for method in methods]
 
 
-def _file_names(groups: Sequence[Judged]) -> list[str]:
+def _file_names(groups: Sequence[EvaluatedGroup]) -> list[str]:
     """Names that any file system takes, each another one whatever groups are called."""
     names: list[str] = []
     for group in groups:

@@ -11,19 +11,19 @@ from torch import nn
 
 from spn_data.geometry.pose import Poses, rotation_vectors
 from spn_model.evaluation.baselines import mean_pose
-from spn_model.models.member import Member, PoseEstimates
+from spn_model.models.pose_model import PoseEstimates, PoseModel
 
 _DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout)
 _FEWEST = 7  # samples with which a covariance over six numbers can have full rank
 
 
-def has_dropout(member: Member) -> bool:
+def has_dropout(model: PoseModel) -> bool:
     """Whether any layer drops something."""
-    return any(True for _ in _layers(member))
+    return any(True for _ in _layers(model))
 
 
 def dropout_estimates(
-    member: Member, images: np.ndarray, intrinsics: np.ndarray, samples: int, *, seed: int = 0
+    model: PoseModel, images: np.ndarray, intrinsics: np.ndarray, samples: int, *, seed: int = 0
 ) -> PoseEstimates:
     """Mean and scatter of poses of images (B, H, W, 3) under dropout that stays on.
 
@@ -33,14 +33,14 @@ def dropout_estimates(
     """
     if samples < _FEWEST:
         raise ValueError(f"{samples} samples leave a covariance without full rank")
-    if not has_dropout(member):
+    if not has_dropout(model):
         raise ValueError("a network without dropout has nothing to sample")
     drawn = []
-    devices = [next(member.network.parameters()).device]
-    with torch.random.fork_rng([d for d in devices if d.type == "cuda"]), _dropping(member):
+    devices = [next(model.network.parameters()).device]
+    with torch.random.fork_rng([d for d in devices if d.type == "cuda"]), _dropping(model):
         torch.manual_seed(seed)
         for _ in range(samples):
-            drawn.append(member.estimate(images, intrinsics).poses)
+            drawn.append(model.estimate(images, intrinsics).poses)
     poses = Poses.unknown(len(images))
     covariance = np.full((len(images), 6, 6), np.nan)
     reasons = np.full(len(images), "", dtype=object)
@@ -58,8 +58,8 @@ def dropout_estimates(
 
 
 @contextmanager
-def _dropping(member: Member) -> Iterator[None]:
-    layers = list(_layers(member))
+def _dropping(model: PoseModel) -> Iterator[None]:
+    layers = list(_layers(model))
     for layer in layers:
         layer.train()
     try:
@@ -69,7 +69,7 @@ def _dropping(member: Member) -> Iterator[None]:
             layer.eval()
 
 
-def _layers(member: Member) -> Iterator[nn.Module]:
-    for layer in member.network.modules():
+def _layers(model: PoseModel) -> Iterator[nn.Module]:
+    for layer in model.network.modules():
         if isinstance(layer, _DROPOUT) and layer.p > 0:
             yield layer

@@ -29,7 +29,7 @@ from spn_model.evaluation.metrics import (
 from spn_model.evaluation.retrieval import most_alike
 from spn_model.evaluation.validation import spread_rows
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.models.member import Member, PoseEstimates
+from spn_model.models.pose_model import PoseEstimates, PoseModel
 from spn_model.onboard.view import View
 
 _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
@@ -48,7 +48,7 @@ class EvaluateOptions:
 
 
 @dataclass(frozen=True)
-class Cost:
+class NetworkCost:
     """Of one network, after a first image that does not count: images as they lie in the data set to poses.
 
     seconds : wall clock; cpu_seconds : of this process, all its threads; batch : images given at once.
@@ -63,7 +63,7 @@ class Cost:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class EvaluatedGroup:
     """One group. estimates, evaluations : of the same methods, networks first. retrieval : the better one
     of the two, None without baselines and for training images, each of which would find itself."""
 
@@ -75,7 +75,7 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class NetworkComparison:
     """Networks and baselines on all groups: test, validation, training.
 
     networks : names of networks, of Monte-Carlo dropout too; costs : by network; notes : one sentence each.
@@ -85,9 +85,9 @@ class Comparison:
     units: str
     dataset: Path
     fingerprint: str
-    groups: tuple[Judged, ...]
+    groups: tuple[EvaluatedGroup, ...]
     networks: tuple[str, ...]
-    costs: Mapping[str, Cost]
+    costs: Mapping[str, NetworkCost]
     notes: tuple[str, ...] = field(default=())
 
 
@@ -99,7 +99,7 @@ def compare(
     options: EvaluateOptions | None = None,
     *,
     kept: Path | None = None,
-) -> Comparison:
+) -> NetworkComparison:
     """Judge networks, by name, on all test groups, validation frames and a sample of the training frames.
 
     world_names : fingerprints of a data set that decide its world; kept : see `most_alike`.
@@ -134,16 +134,16 @@ def compare(
                     f"{name} was trained on {', '.join(learnt)} too: there its errors are those of training "
                     "images, and baselines knew less."
                 )
-            parts, costs[name] = _estimated(network.member, chosen, progress, name, options)
+            parts, costs[name] = _estimated(network.model, chosen, progress, name, options)
             for estimates, part in zip(found, parts, strict=True):
                 estimates.append(Estimates(name, part.poses, part.covariance))
             if options.dropout_samples:
-                if not has_dropout(network.member):
+                if not has_dropout(network.model):
                     notes.append(f"{name} has no dropout: there is nothing to sample.")
                     continue
                 told = f"{name}, {options.dropout_samples} dropout samples"
                 parts, costs[told] = _estimated(
-                    network.member, chosen, progress, told, options, options.dropout_samples
+                    network.model, chosen, progress, told, options, options.dropout_samples
                 )
                 for estimates, part in zip(found, parts, strict=True):
                     estimates.append(Estimates(told, part.poses, part.covariance))
@@ -158,10 +158,10 @@ def compare(
             evaluations = tuple(evaluate(one, frames[k]) for one in found[k])
             retrieval = [e for e in evaluations if e.method in (VLAD, GEM)]
             best = better(retrieval).method if retrieval else None
-            judged.append(Judged(group.role, frames[k], tuple(found[k]), evaluations, best))
+            judged.append(EvaluatedGroup(group.role, frames[k], tuple(found[k]), evaluations, best))
         if len(rows) < len(training):
             notes.append(f"Of {len(training)} training images, {len(rows)} are judged.")
-        return Comparison(
+        return NetworkComparison(
             training.poses,
             data.info.units,
             path,
@@ -191,7 +191,7 @@ def check_world(
             "nothing. Train anew on this data set, or name the one that it was trained on",
             path=data.path,
         )
-    if not network.member.any_camera and not _same_camera(view, data):
+    if not network.model.any_camera and not _same_camera(view, data):
         raise InputError(
             f"its images are of another camera than the one that {name} was trained for, and its kind of "
             "network knows no other; make the data set with the same rendering",
@@ -251,18 +251,18 @@ def _groups(data: Dataset) -> tuple[DatasetGroup, list[DatasetGroup], list[str]]
 
 
 def _estimated(
-    member: Member,
+    model: PoseModel,
     chosen: Sequence[tuple[DatasetGroup, np.ndarray]],
     progress: Progress,
     name: str,
     options: EvaluateOptions,
     samples: int = 0,
-) -> tuple[list[PoseEstimates], Cost]:
+) -> tuple[list[PoseEstimates], NetworkCost]:
     """What a network says of each part's rows, and what it cost without reading the images."""
     total, done, seconds, cpu = sum(len(rows) for _, rows in chosen), 0, 0.0, 0.0
     group, rows = chosen[0]
     # Caches, threads and kernels are set up by a first image, which would otherwise be counted.
-    member.estimate(group.image(int(rows[0]))[None], group.intrinsics[rows[:1]])
+    model.estimate(group.image(int(rows[0]))[None], group.intrinsics[rows[:1]])
     parts = []
     for group, rows in chosen:
         batches = []
@@ -272,15 +272,15 @@ def _estimated(
             started, started_cpu = time.perf_counter(), time.process_time()
             if samples:
                 batch = dropout_estimates(
-                    member, images, group.intrinsics[of], samples, seed=options.seed
+                    model, images, group.intrinsics[of], samples, seed=options.seed
                 )
             else:
-                batch = member.estimate(images, group.intrinsics[of])
+                batch = model.estimate(images, group.intrinsics[of])
             seconds += time.perf_counter() - started
             cpu += time.process_time() - started_cpu
             batches.append(batch)
             done += len(of)
             progress(name, done, total)
         parts.append(PoseEstimates.concatenate(batches))
-    device = next(member.network.parameters()).device.type
-    return parts, Cost(total, seconds, cpu, options.batch, torch.get_num_threads(), device)
+    device = next(model.network.parameters()).device.type
+    return parts, NetworkCost(total, seconds, cpu, options.batch, torch.get_num_threads(), device)

@@ -9,12 +9,12 @@ import numpy as np
 
 from spn_data.geometry.pose import Poses
 from spn_model.evaluation.metrics import Estimates, frame_errors, quantile
-from spn_model.models.member import Member, PoseEstimates
+from spn_model.models.pose_model import PoseEstimates, PoseModel
 
 _AT_ONCE = 8  # images given to `estimate`
 
 
-class Frames(Protocol):
+class PosedImages(Protocol):
     """Images with poses: a group of a data set, or rendered views."""
 
     @property
@@ -55,15 +55,15 @@ def spread_rows(count: int, limit: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
 
 
-def judge(member: Member, frames: Frames, rows: np.ndarray) -> tuple[Errors, PoseEstimates]:
+def judge(model: PoseModel, frames: PosedImages, rows: np.ndarray) -> tuple[Errors, PoseEstimates]:
     """The member's estimates of these rows, and their errors. The network is left in eval mode."""
-    member.network.eval()
+    model.network.eval()
     intrinsics = frames.intrinsics
     found = []
     for first in range(0, len(rows), _AT_ONCE):
         part = rows[first : first + _AT_ONCE]
         images = np.stack([frames.image(int(row)) for row in part])
-        found.append(member.estimate(images, intrinsics[part]))
+        found.append(model.estimate(images, intrinsics[part]))
     estimates = PoseEstimates.concatenate(found)
     errors = frame_errors(Estimates("network", estimates.poses), frames.poses[rows])
     position, rotation = (

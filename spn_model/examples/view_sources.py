@@ -64,7 +64,7 @@ def projected(
     return index, np.column_stack([x[index], y[index]]), depth[index]
 
 
-class Sources:
+class ViewSources:
     """Training images as sources of views.
 
     rows (S,) : which images; ground : None where there is none, or up is not known; occluders : of each

@@ -21,7 +21,7 @@ _SEAM_PX = 6.0  # by more, what neighbouring cells show lies on different surfac
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions:
+class NovelViewOptions:
     """Where virtual cameras stand, against the real one."""
 
     rise_m: float = 11.0  # largest, evenly from 0
@@ -30,7 +30,7 @@ class ViewOptions:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, of length 1
 
 
-def random_place(generator: np.random.Generator, seen: Surface, options: ViewOptions) -> Poses:
+def random_place(generator: np.random.Generator, seen: Surface, options: NovelViewOptions) -> Poses:
     """(1,) pose of a camera that rose and moved, and turned the shortest way to keep its view in sight.
 
     Raises ValueError where nothing of the surface is known.
@@ -55,7 +55,10 @@ def random_place(generator: np.random.Generator, seen: Surface, options: ViewOpt
 
 
 def high_place(
-    generator: np.random.Generator, centers: np.ndarray, scene: np.ndarray, options: ViewOptions
+    generator: np.random.Generator,
+    centers: np.ndarray,
+    scene: np.ndarray,
+    options: NovelViewOptions,
 ) -> Poses:
     """(1,) pose of a level camera above the scene, which looks down at one of its places (P, 3).
 

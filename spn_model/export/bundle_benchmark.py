@@ -39,7 +39,7 @@ class BenchmarkOptions:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cost:
+class BundleCost:
     """Of one graph. bytes : of its file; found : as `spn_model.onboard.benchmark` prints it."""
 
     precision: str
@@ -49,7 +49,7 @@ class Cost:
 
 def benchmark(
     folder: Path, frames: Sequence[Path], camera: Path, options: BenchmarkOptions | None = None
-) -> tuple[Cost, ...]:
+) -> tuple[BundleCost, ...]:
     """Of each graph of a bundle, on frames of a flying camera, whose file is given.
 
     Raises InputError or FormatError where the bundle cannot be used, StageError with what the process said
@@ -58,7 +58,7 @@ def benchmark(
     options = options or BenchmarkOptions()
     bundle = read_bundle(folder)
     return tuple(
-        Cost(
+        BundleCost(
             precision=precision,
             bytes=bundle.graphs[precision].bytes,
             found=_timed(folder, precision, frames, camera, options),

@@ -23,7 +23,7 @@ _LEAST_POSES = 8  # with fewer of them outputs alone are compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
+class BundleOptions:
     """What goes into a bundle, and how it is checked."""
 
     int8: bool = True  # the 8-bit graph as well
@@ -81,7 +81,7 @@ def compare_with_pytorch(
     checkpoint: Checkpoint,
     deployed: Deployment,
     data: Dataset,
-    options: ExportOptions,
+    options: BundleOptions,
     progress: Progress,
 ) -> Parity:
     """Compare, or raise GeometryError."""
@@ -99,7 +99,7 @@ def compare_with_pytorch(
             size = max(float(np.abs(wanted).max()), 1e-6)
             output = max(output, float(np.abs(found - wanted).max()) / size)
         # Its own poses come to be by another path than the bundle's.
-        own = checkpoint.member.estimate(image[None], matrix[None])
+        own = checkpoint.model.estimate(image[None], matrix[None])
         told = localizer.decode(outputs, _scaled(matrix, deployed, image))
         disagree += bool(told.reason) != bool(own.reasons[0])
         if not told.reason and not own.reasons[0]:
@@ -146,7 +146,7 @@ def _scaled(matrix: np.ndarray, deployed: Deployment, image: np.ndarray) -> np.n
 
 
 def measure_errors(
-    folder: Path, deployed: Deployment, data: Dataset, options: ExportOptions, progress: Progress
+    folder: Path, deployed: Deployment, data: Dataset, options: BundleOptions, progress: Progress
 ) -> tuple[GroupErrors, ...]:
     found = []
     precisions = [FLOAT32, INT8] if options.int8 else [FLOAT32]

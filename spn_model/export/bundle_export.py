@@ -22,11 +22,11 @@ from spn_data.work.timing import Progress
 from spn_model.evaluation.evaluate import check_world
 from spn_model.evaluation.validation import spread_rows
 from spn_model.export.bundle_checks import (
-    ExportOptions,
+    BundleOptions,
     compare_with_pytorch,
     measure_errors,
 )
-from spn_model.export.exported import Exported
+from spn_model.export.exported import ExportedBundle
 from spn_model.export.graphs import Deployment, deployment, write_graph
 from spn_model.export.model_card import model_card
 from spn_model.export.quantization import quantize
@@ -52,12 +52,12 @@ def export(
     folder: Path,
     facts: Mapping[str, Any],
     progress: Progress,
-    options: ExportOptions | None = None,
+    options: BundleOptions | None = None,
     *,
     world_names: Sequence[str] = (),
     metrics: Mapping[str, Any] | None = None,
     overwrite: bool = False,
-) -> Exported:
+) -> ExportedBundle:
     """Write a bundle of a trained network; the folder appears whole, or not at all.
 
     dataset : that it was trained on, or another of its world: 8 bits are calibrated on its training images
@@ -67,7 +67,7 @@ def export(
     InputError where data set and network do not belong together; GeometryError where the graph gives
     other poses than PyTorch.
     """
-    options = options or ExportOptions()
+    options = options or BundleOptions()
     _check_free(folder, overwrite)
     partial = folder.with_name(f".{folder.name}.partial")
     with Dataset(dataset) as data:
@@ -78,7 +78,7 @@ def export(
             world_names,
             content_fingerprint(dataset),
         )
-        deployed = deployment(checkpoint.member, checkpoint.view.size)
+        deployed = deployment(checkpoint.model, checkpoint.view.size)
         camera = _camera(checkpoint, data).scaled(*deployed.size)
         view = replace(checkpoint.view, camera=_camera(checkpoint, data))
         try:
@@ -89,7 +89,7 @@ def export(
                 "format": FORMAT,
                 "version": VERSION,
                 "conventions": CONVENTIONS,
-                "kind": checkpoint.member.kind,
+                "kind": checkpoint.model.kind,
                 "view": view.to_json(),
                 "input": camera_to_json(camera),
                 "decoding": deployed.decoding.to_json(),
@@ -99,7 +99,7 @@ def export(
             write_json(partial / DOCUMENT, document)
             parity = compare_with_pytorch(partial, checkpoint, deployed, data, options, progress)
             errors = measure_errors(partial, deployed, data, options, progress)
-            made = Exported(
+            made = ExportedBundle(
                 folder=folder,
                 units=view.units,
                 bytes={name: entry["bytes"] for name, entry in _graphs(partial).items()},
@@ -122,7 +122,7 @@ def export(
     return made
 
 
-def is_made_of(folder: Path, facts: Mapping[str, Any], options: ExportOptions) -> bool:
+def is_made_of(folder: Path, facts: Mapping[str, Any], options: BundleOptions) -> bool:
     """Whether a whole bundle stands there that another export would make again."""
     try:
         bundle = read_bundle(folder)
@@ -157,7 +157,7 @@ def _camera(checkpoint: Checkpoint, data: Dataset) -> Camera:
     view = checkpoint.view
     if view.camera is not None:
         return view.camera
-    if not checkpoint.member.any_camera:
+    if not checkpoint.model.any_camera:
         raise InputError(
             "the network was trained on images of several cameras, and its kind knows one: on board there "
             "would be none to render into. Train it on a data set with a common camera",
@@ -183,7 +183,7 @@ def _training(data: Dataset) -> DatasetGroup:
 
 
 def _write_graphs(
-    folder: Path, deployed: Deployment, data: Dataset, options: ExportOptions, progress: Progress
+    folder: Path, deployed: Deployment, data: Dataset, options: BundleOptions, progress: Progress
 ) -> None:
     progress("float32", 0, 1)
     write_graph(folder / GRAPHS[FLOAT32], deployed)

@@ -10,7 +10,7 @@ from spn_model.export.bundle_checks import GroupErrors, Parity
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Exported:
+class ExportedBundle:
     """What was written, and what was found. bytes : by precision; errors : float32, then int8, of a group."""
 
     folder: Path

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from spn_data.errors import InputError
-from spn_model.models.member import Member
-from spn_model.models.regression import RegressionMember
+from spn_model.models.pose_model import PoseModel
+from spn_model.models.regression import RegressionModel
 from spn_model.models.regression_examples import input_size, resized
-from spn_model.models.scene_coordinates import SceneCoordinatesMember
+from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.onboard.bundle import INPUT, CellDecoding, Decoding, PoseDecoding
 
@@ -40,23 +40,23 @@ class Deployment:
         return np.ascontiguousarray(resized(image, self.size[0]))[None]
 
 
-def deployment(member: Member, size: tuple[int, int]) -> Deployment:
+def deployment(model: PoseModel, size: tuple[int, int]) -> Deployment:
     """For images of size (width, height), as the data set has them.
 
     Raises InputError for a kind of network that has no graph.
     """
-    if isinstance(member, SceneCoordinatesMember):
+    if isinstance(model, SceneCoordinatesModel):
         cells = CellDecoding(
-            first_px=member.network.first_cell_px,
-            stride_px=member.network.stride_px,
-            options=member.decoding_options,
+            first_px=model.network.first_cell_px,
+            stride_px=model.network.stride_px,
+            options=model.decoding_options,
         )
-        return Deployment(member.network, cells, size)
-    if isinstance(member, RegressionMember):
-        pose = PoseDecoding(center=member.network.targets.center.cpu().numpy())
-        width = int(member.options["width"])
-        return Deployment(member.network, pose, input_size(*size, width))
-    raise InputError(f"a network of kind {member.kind!r} cannot be exported")
+        return Deployment(model.network, cells, size)
+    if isinstance(model, RegressionModel):
+        pose = PoseDecoding(center=model.network.targets.center.cpu().numpy())
+        width = int(model.options["width"])
+        return Deployment(model.network, pose, input_size(*size, width))
+    raise InputError(f"a network of kind {model.kind!r} cannot be exported")
 
 
 def write_graph(path: Path, deployed: Deployment) -> None:

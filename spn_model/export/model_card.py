@@ -13,23 +13,23 @@ from spn_model.pretrained.weights import of_name
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_checks import GroupErrors
-    from spn_model.export.exported import Exported
+    from spn_model.export.exported import ExportedBundle
 
 
 def model_card(
     checkpoint: Checkpoint,
-    made: Exported,
+    made: ExportedBundle,
     facts: Mapping[str, Any],
     metrics: Mapping[str, Any] | None,
 ) -> str:
     """Markdown. metrics : of the run's evaluation, as metrics.json has it; None: says that there is none."""
-    view, member = checkpoint.view, checkpoint.member
+    view, model = checkpoint.view, checkpoint.model
     unit = "m" if view.units == "m" else "units of the model"
-    parameters = sum(p.numel() for p in member.network.parameters())
+    parameters = sum(p.numel() for p in model.network.parameters())
     place = view.origin
     parts = [
         f"# {facts.get('run', 'Network')}",
-        f"Pose of a camera from one image, in one area: a network of kind {member.kind} with "
+        f"Pose of a camera from one image, in one area: a network of kind {model.kind} with "
         f"{parameters:,} parameters.",
         _list(
             f"Input: {view.size[0]} x {view.size[1]} px, horizontal field of view "
@@ -150,7 +150,7 @@ def _licence(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> str:
         return "Not recorded with the run."
     if weights == "none":
         return "None: training started from random weights."
-    name = checkpoint.member.weights_name if weights == "published" else str(weights)
+    name = checkpoint.model.weights_name if weights == "published" else str(weights)
     try:
         known = of_name(name)
     except InputError:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import writing_whole
-from spn_model.models.member import Member
+from spn_model.models.pose_model import PoseModel
 from spn_model.models.registry import make
 from spn_model.onboard.view import View
 
@@ -30,20 +30,20 @@ _MAX_DOCUMENT = 2_000_000  # characters of JSON
 class Checkpoint:
     """A member with its weights, in eval mode; what it sees; facts of its training, plain values."""
 
-    member: Member
+    model: PoseModel
     view: View
     facts: dict[str, Any]
 
 
-def save(path: Path, member: Member, view: View, facts: Mapping[str, Any]) -> None:
+def save(path: Path, model: PoseModel, view: View, facts: Mapping[str, Any]) -> None:
     """Write whole, in place of what stood there. Raises StageError where the disk does not take it."""
     document = {
-        "kind": member.kind,
-        "options": member.options,
+        "kind": model.kind,
+        "options": model.options,
         "view": view.to_json(),
         "facts": dict(facts),
     }
-    write_tensors(path, FORMAT, member.network.state_dict(), document)
+    write_tensors(path, FORMAT, model.network.state_dict(), document)
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
@@ -58,12 +58,12 @@ def load(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(f"{path}: is a damaged checkpoint ({error!r})") from error
     try:
-        member = make(kind, options)
+        model = make(kind, options)
     except InputError as error:
         raise FormatError(f"{path}: this program cannot make its network: {error}") from error
-    set_state(member.network, tensors, path)
-    member.network.to(device).eval()
-    return Checkpoint(member, view, facts)
+    set_state(model.network, tensors, path)
+    model.network.to(device).eval()
+    return Checkpoint(model, view, facts)
 
 
 def set_state(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:

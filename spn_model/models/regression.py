@@ -13,8 +13,8 @@ from torch import Tensor
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.models.option_parsing import from_mapping
+from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
 from spn_model.models.regression_examples import (
     FeatureCache,
     example,
@@ -22,7 +22,7 @@ from spn_model.models.regression_examples import (
     resized,
     visible_points,
 )
-from spn_model.models.regression_options import RegressionOptions, StageOptions
+from spn_model.models.regression_options import RegressionOptions, RegressionStageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import start_as_identity
 from spn_model.networks.pose_loss import beta_weighted, laplace, reprojection, residuals
@@ -38,7 +38,7 @@ _AT_ONCE = 8  # images
 _CACHE_BYTES = 4_000_000_000
 
 
-class RegressionMember(Member):
+class RegressionModel(PoseModel):
     """Answers with a pose at once; learns the poses of training images, whose cameras are turned about.
 
     Fixed options, in `make`: those of RegressionOptions, and network_options, of `networks.registry`. Of a
@@ -51,11 +51,11 @@ class RegressionMember(Member):
     def __init__(self, network: PoseNetwork, options: RegressionOptions):
         self.network = network
         self._options = options
-        self._stage = StageOptions()
+        self._stage = RegressionStageOptions()
         self._cache: FeatureCache | None = None
 
     @classmethod
-    def make(cls, options: Mapping[str, Any], seed: int = 0) -> RegressionMember:
+    def make(cls, options: Mapping[str, Any], seed: int = 0) -> RegressionModel:
         """With weights drawn by the seed. Raises InputError for an option or a value that there isn't."""
         own = dict(options)
         of_network = own.pop("network_options", {})
@@ -103,7 +103,7 @@ class RegressionMember(Member):
     def begin_stage(
         self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
     ) -> None:
-        chosen = from_mapping(StageOptions, stage, f"stage of {self.kind}")
+        chosen = from_mapping(RegressionStageOptions, stage, f"stage of {self.kind}")
         if chosen.loss == "reprojection" and not data.has_points:
             raise InputError(
                 "the loss reprojection needs map points, and the data set holds none to learn from; "

@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.geometry.pose import Poses
 from spn_model.examples.augment import LookOptions, change_look, random_warp
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.regression_options import StageOptions
+from spn_model.models.regression_options import RegressionStageOptions
 
 
 def input_size(width: int, height: int, wanted_width: int) -> tuple[int, int]:
@@ -34,7 +34,7 @@ def example(
     data: TrainingSet,
     row: int,
     wanted_width: int,
-    options: StageOptions,
+    options: RegressionStageOptions,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, Poses]:
     """A training image (h, w, 3) uint8, varied, and its pose, exactly (1).

@@ -25,7 +25,7 @@ class RegressionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageOptions:
+class RegressionStageOptions:
     """How one stage of a training varies its images, and what it descends."""
 
     freeze_trunk: bool = False  # train the added layers alone

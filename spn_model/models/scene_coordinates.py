@@ -16,9 +16,9 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
-from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
 from spn_model.models.option_parsing import from_mapping
-from spn_model.models.scene_examples import Examples, StageOptions
+from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
+from spn_model.models.scene_examples import Examples, SceneStageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
@@ -34,7 +34,7 @@ _UNSURE = 0.25  # spreads of the scene; a cell of a larger scale does not know w
 
 
 @dataclass(frozen=True, kw_only=True)
-class MemberOptions(DecodingOptions):
+class SceneCoordinatesOptions(DecodingOptions):
     """What makes a member."""
 
     shrink: int = 2  # factor by which images are reduced: more surroundings, a quarter of the time
@@ -44,7 +44,7 @@ class MemberOptions(DecodingOptions):
             raise InputError(f"shrink is {self.shrink}, needs to lie from 1 to 8")
 
 
-class SceneCoordinatesMember(Member):
+class SceneCoordinatesModel(PoseModel):
     """Learns, for each cell of an image, the point of the map that it shows; PnP makes a pose of them.
 
     Fixed options, in `make`: `shrink`, and those of DecodingOptions. Of a stage: StageOptions.
@@ -58,14 +58,14 @@ class SceneCoordinatesMember(Member):
     def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):
         self.network = network
         self.decoding = decoding
-        self._stage, self._images = StageOptions(), ANY_NUMBER
+        self._stage, self._images = SceneStageOptions(), ANY_NUMBER
         self._examples: tuple[TrainingSet, Examples] | None = None
         self._making_examples = Lock()
 
     @classmethod
-    def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesMember:
+    def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesModel:
         """With weights drawn by the seed. Raises InputError for an unknown option."""
-        chosen = from_mapping(MemberOptions, options, f"network {cls.kind}")
+        chosen = from_mapping(SceneCoordinatesOptions, options, f"network {cls.kind}")
         decoding = DecodingOptions(
             **{f.name: getattr(chosen, f.name) for f in fields(DecodingOptions)}
         )
@@ -103,7 +103,7 @@ class SceneCoordinatesMember(Member):
     def begin_stage(
         self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
     ) -> None:
-        self._stage = from_mapping(StageOptions, stage, f"stage of {self.kind}")
+        self._stage = from_mapping(SceneStageOptions, stage, f"stage of {self.kind}")
         self._images = images
         self.network.freeze_features(self._stage.freeze_layers)
         self._examples = None

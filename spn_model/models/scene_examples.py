@@ -20,8 +20,8 @@ from spn_model.examples.point_targets import (
 )
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
-from spn_model.examples.view_sources import Sources
-from spn_model.examples.virtual_views import ViewOptions, high_place, random_place, view_from
+from spn_model.examples.view_sources import ViewSources
+from spn_model.examples.virtual_views import NovelViewOptions, high_place, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -43,7 +43,7 @@ _RAMP_FROM = 0.3  # of turns, and of zooms in their logarithm, at a stage's begi
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageOptions:
+class SceneStageOptions:
     """How one stage of a training varies its images, and what it trains."""
 
     freeze_layers: int = 5  # first layers of SqueezeNet that stay as published
@@ -102,7 +102,7 @@ class Examples:
     def __init__(
         self,
         data: TrainingSet,
-        options: StageOptions,
+        options: SceneStageOptions,
         center: np.ndarray,
         spread: float,
         shrink: int,
@@ -112,7 +112,7 @@ class Examples:
         self._center, self._spread = center, spread
         level = _LEVEL * spread if data.up_is_known else 0.0
         self._surface_options = SurfaceOptions(level_m=level)
-        self._view_options = ViewOptions(
+        self._view_options = NovelViewOptions(
             rise_m=options.views_rise * spread,
             side_m=options.views_side * spread,
             height_m=options.views_height * spread,
@@ -129,10 +129,10 @@ class Examples:
         worth = max(_FIRST_VIEWS, images // _IMAGES_A_VIEW)
         self._view_count = min(options.views, kept, worth)
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
-        self._sources: Sources | None = None
+        self._sources: ViewSources | None = None
         self._looks_down = False
         if options.views_share and options.views_fused:
-            self._sources = Sources(data, center, spread, _FAR * spread)
+            self._sources = ViewSources(data, center, spread, _FAR * spread)
             lies_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
             self._looks_down = data.up_is_known and bool(lies_below.any())
 

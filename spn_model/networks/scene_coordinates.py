@@ -38,7 +38,7 @@ def grid_size(width: int, height: int) -> tuple[int, int]:
     return cells(width), cells(height)
 
 
-class Fire(nn.Module):
+class TorchvisionFire(nn.Module):
     """1 x 1 squeeze, then 1 x 1 and 3 x 3 expand side by side; torchvision's names of parameters."""
 
     def __init__(self, inputs: int, squeeze: int, expand: int):
@@ -120,16 +120,16 @@ class SceneCoordinates(nn.Module):
             nn.Conv2d(3, 64, 3, stride=2),  # (B, 64, H/2, W/2)
             nn.ReLU(inplace=True),
             nn.MaxPool2d(3, stride=2, ceil_mode=True),  # stride 4
-            Fire(64, 16, 64),
-            Fire(128, 16, 64),
+            TorchvisionFire(64, 16, 64),
+            TorchvisionFire(128, 16, 64),
             nn.MaxPool2d(3, stride=2, ceil_mode=True),  # stride 8
-            Fire(128, 32, 128),
-            Fire(256, 32, 128),  # (B, 256, h, w)
+            TorchvisionFire(128, 32, 128),
+            TorchvisionFire(256, 32, 128),  # (B, 256, h, w)
             nn.MaxPool2d(3, stride=2, ceil_mode=True),  # stride 16
-            Fire(256, 48, 192),
-            Fire(384, 48, 192),
-            Fire(384, 64, 256),
-            Fire(512, 64, 256),  # (B, 512, h/2, w/2)
+            TorchvisionFire(256, 48, 192),
+            TorchvisionFire(384, 48, 192),
+            TorchvisionFire(384, 64, 256),
+            TorchvisionFire(512, 64, 256),  # (B, 512, h/2, w/2)
         )
         self.coarse = nn.Conv2d(512, 128, 1)
         self.context = nn.Conv2d(128, 128, 3, padding=2, dilation=2)

@@ -12,7 +12,7 @@ import onnxruntime
 from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.geometry.rendering import Renderer
+from spn_data.geometry.rendering import PinholeRenderer
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -71,7 +71,7 @@ class Localizer:
         except Exception as error:  # onnxruntime has a type for each status, none in common
             raise FormatError(f"{path}: onnxruntime cannot load it ({error})") from error
         self._check_graph(path)
-        self._renderers: dict[tuple[object, ...], Renderer] = {}
+        self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
 
     def localize(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> Located:
         """Of a flying camera's image (H, W, 3) uint8: BGR as OpenCV reads it, or RGB.
@@ -112,7 +112,7 @@ class Localizer:
             return Located.nowhere(str(error))
         return Located(found.poses, found.covariance)
 
-    def renderer(self, camera: Camera, width: int, height: int) -> Renderer:
+    def renderer(self, camera: Camera, width: int, height: int) -> PinholeRenderer:
         """From images of that size into the network's camera; made at first use, then kept.
 
         Its `valid` tells which pixels of the view the camera sees. Raises InputError as `localize` does.
@@ -124,7 +124,7 @@ class Localizer:
                     f"the image is {width}x{height}, the camera is of {camera.width}x{camera.height}: "
                     "give the camera of these images"
                 )
-            made = Renderer(
+            made = PinholeRenderer(
                 camera.scaled(width, height), self.camera, sample_step_px=SAMPLE_STEP_PX
             )
             if not made.valid.any():

@@ -5,16 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from spn_data.dataset.hdf5_schema import Role
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.storage.record import content_fingerprint
-
-if TYPE_CHECKING:
-    from spn_data.dataset.hdf5_reader import Dataset  # not on board: it needs h5py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,24 +29,6 @@ class View:
     up_is_known: bool
     dataset: str
     made_from: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, dataset: Dataset) -> View:
-        """Raises ValueError for a data set without training images."""
-        sizes = {g.image_size for g in dataset.groups.values() if g.role is Role.TRAIN} - {None}
-        if len(sizes) != 1:
-            raise ValueError(f"training images are of {len(sizes)} sizes")
-        info, size = dataset.info, sizes.pop()
-        assert size is not None
-        return cls(
-            camera=info.camera,
-            size=size,
-            units=info.units,
-            origin=info.origin,
-            up_is_known=info.up_is_known,
-            dataset=content_fingerprint(dataset.path),
-            made_from=dict(info.fingerprints),
-        )
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for json.dumps; what is not known is null."""

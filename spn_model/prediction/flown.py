@@ -17,7 +17,7 @@ from spn_data.capture.sources import Source, SourceKind, discover
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import at_size, of_focal_length
-from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
+from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_model.onboard.view import View
 
@@ -32,7 +32,7 @@ _MOST_LENSES = 16  # whose maps of pixels are kept
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class FrameFilter:
     """Which frames of a video. All of them by default; photos are always taken."""
 
     every: int = 1  # each so-many-th
@@ -147,10 +147,10 @@ class Views:
 
     def __init__(self, view: View):
         self._view = view
-        self._renderers: dict[tuple[object, ...], Renderer] = {}
+        self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
         self.seen = 1.0
 
-    def of(self, camera: Camera) -> Renderer:
+    def of(self, camera: Camera) -> PinholeRenderer:
         """Raises GeometryError where the lens sees nothing of the view."""
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         if key not in self._renderers:
@@ -160,7 +160,7 @@ class Views:
             if target is None:
                 width_px = self._view.size[0]
                 target = canonical_camera([camera], RenderingOptions(width_px=width_px))
-            renderer = Renderer(camera, target)
+            renderer = PinholeRenderer(camera, target)
             if not renderer.valid.any():
                 raise GeometryError(
                     "the camera sees nothing of the view that the network was trained on"
@@ -170,14 +170,14 @@ class Views:
         return self._renderers[key]
 
 
-def frames(flight: Flight, views: Views, choice: Choice) -> Iterator[FlownFrame]:
+def frames(flight: Flight, views: Views, choice: FrameFilter) -> Iterator[FlownFrame]:
     """The chosen frames in their order, rendered one by one; what fails has its reason."""
     if flight.source.kind is SourceKind.VIDEO:
         return _of_video(flight, views, choice)
     return _of_photos(flight, views)
 
 
-def _of_video(flight: Flight, views: Views, choice: Choice) -> Iterator[FlownFrame]:
+def _of_video(flight: Flight, views: Views, choice: FrameFilter) -> Iterator[FlownFrame]:
     begin_s, count = 0.0, 0
     for part, camera in zip(flight.source.parts, flight.cameras, strict=True):
         assert camera is not None
@@ -209,7 +209,7 @@ def _of_video(flight: Flight, views: Views, choice: Choice) -> Iterator[FlownFra
 class _Chosen:
     """Which frames of a part are wanted; latest : index of the last one that was."""
 
-    def __init__(self, choice: Choice, count: int, begin_s: float):
+    def __init__(self, choice: FrameFilter, count: int, begin_s: float):
         self._choice, self._count, self._begin_s = choice, count, begin_s
         self._interval = -1
         self.latest: tuple[int, ...] = ()

@@ -17,7 +17,7 @@ from spn_data.storage.files import exchange, write_whole
 from spn_data.storage.record import write_json
 from spn_data.work.timing import Progress
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.prediction.flown import Choice, Flight, FlownFrame, Views, frames
+from spn_model.prediction.flown import Flight, FlownFrame, FrameFilter, Views, frames
 from spn_model.prediction.predicted_files import PoseTable, Rows, write_tum, write_wgs84
 
 VERSION = 1
@@ -29,7 +29,7 @@ FORMATS = ("csv", "tum", "wgs84")
 class PredictOptions:
     """What is written of which frames."""
 
-    choice: Choice = field(default_factory=Choice)
+    choice: FrameFilter = field(default_factory=FrameFilter)
     formats: tuple[str, ...] = ("csv",)  # of FORMATS; the CSV is always there
     batch: int = 8  # images given to the network at once
 
@@ -142,11 +142,11 @@ def predict(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     if stop is not None:
-        raise Stopped(found) from stop
+        raise PredictionStopped(found) from stop
     return found
 
 
-class Stopped(KeyboardInterrupt):
+class PredictionStopped(KeyboardInterrupt):
     """Raised where Ctrl-C ended the work; what was done stands in the folder."""
 
     def __init__(self, predicted: Predicted):
@@ -198,7 +198,7 @@ def _of_batch(network: Checkpoint, batch: Sequence[FlownFrame]) -> tuple[Rows, f
         images = np.stack([frame.image for frame in (batch[k] for k in of)])
         matrices = np.stack([batch[k].matrix for k in of])
         started = time.perf_counter()
-        estimates = network.member.estimate(images, matrices)
+        estimates = network.model.estimate(images, matrices)
         seconds += time.perf_counter() - started
         rows.put(of, estimates)
     return rows, seconds

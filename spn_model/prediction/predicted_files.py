@@ -18,7 +18,7 @@ from spn_data.exports.exported_frames import timestamps_us
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
 from spn_data.storage.files import write_csv
-from spn_model.models.member import PoseEstimates
+from spn_model.models.pose_model import PoseEstimates
 from spn_model.prediction.flown import FlownFrame
 
 ESTIMATED, FAILED, UNREADABLE = "estimated", "failed", "unreadable"

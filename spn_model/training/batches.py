@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from spn_model.models.member import Batch
+from spn_model.models.pose_model import Batch
 
 
 def rows_of_step(

@@ -8,7 +8,7 @@ from scipy.special import chdtri
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, rotation_vectors
 from spn_model.evaluation.calibration import DOF, squared_distances
-from spn_model.models.member import PoseEstimates
+from spn_model.models.pose_model import PoseEstimates
 
 LEAST_FRAMES = 10
 

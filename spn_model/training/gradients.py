@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from spn_model.models.member import Batch, Member
+from spn_model.models.pose_model import Batch, PoseModel
 from spn_model.training.machine import Machine
 
 
@@ -17,9 +17,9 @@ class Gradients:
     """Sets the gradients of parameters; threads compute as many parts at once as the pool has."""
 
     def __init__(
-        self, member: Member, parameters: Sequence[nn.Parameter], pool: ThreadPoolExecutor | None
+        self, model: PoseModel, parameters: Sequence[nn.Parameter], pool: ThreadPoolExecutor | None
     ):
-        self._member, self._parameters, self._pool = member, parameters, pool
+        self._model, self._parameters, self._pool = model, parameters, pool
 
     def of(self, parts: Sequence[Batch]) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss of a step's parts, and its figures, detached; parameters have the mean's gradient.
@@ -40,14 +40,14 @@ class Gradients:
         return losses.mean(), figures
 
     def _part(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor], Sequence[Tensor | None]]:
-        loss, figures = self._member.loss(batch)
+        loss, figures = self._model.loss(batch)
         gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
         return loss.detach(), figures, gradients
 
 
 @contextmanager
 def gradients(
-    member: Member, parameters: Sequence[nn.Parameter], parts: int, machine: Machine
+    model: PoseModel, parameters: Sequence[nn.Parameter], parts: int, machine: Machine
 ) -> Iterator[Gradients]:
     """Threads for the parts of each step, which end with the block.
 
@@ -56,13 +56,13 @@ def gradients(
     """
     threads = min(parts, machine.cores) if machine.device.type == "cpu" else 1
     if threads == 1:
-        yield Gradients(member, parameters, None)
+        yield Gradients(model, parameters, None)
         return
     each = max(1, machine.threads // threads)
     pool = ThreadPoolExecutor(
         threads, "gradients", initializer=torch.set_num_threads, initargs=(each,)
     )
     try:
-        yield Gradients(member, parameters, pool)
+        yield Gradients(model, parameters, pool)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

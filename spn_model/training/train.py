@@ -20,10 +20,10 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, StageError
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.member import Batch, Member
+from spn_model.models.pose_model import Batch, PoseModel
 from spn_model.models.registry import make
-from spn_model.onboard.view import View
 from spn_model.training.batches import (
     batches_ahead,
     generator_of_step,
@@ -72,7 +72,7 @@ class Data:
         return named.get(stage.data, Path(stage.data))
 
 
-class Stopped(Exception):
+class TrainingStopped(Exception):
     """Raised when the watcher wanted a stop; the state is saved."""
 
 
@@ -92,17 +92,17 @@ def train(
         stack.enter_context(prepared(machine))
         state = read_state(files.state)
         position = Position() if state is None else state.position
-        member = make(recipe.kind, recipe.options, seed=options.seed)
-        if not member.has_parts and any(stage.parts > 1 for stage in recipe.stages):
+        model = make(recipe.kind, recipe.options, seed=options.seed)
+        if not model.has_parts and any(stage.parts > 1 for stage in recipe.stages):
             raise InputError(
                 f"a network of kind {recipe.kind} computes a batch as a whole: parts needs to be 1"
             )
-        member.bfloat16 = machine.bfloat16
+        model.bfloat16 = machine.bfloat16
         if state is not None:
-            state.restore_network(member.network)
+            state.restore_network(model.network)
         elif recipe.weights != "none":
             published = recipe.weights == "published"
-            member.load_pretrained(member.weights_name if published else recipe.weights)
+            model.load_pretrained(model.weights_name if published else recipe.weights)
         area = stack.enter_context(Dataset(data.area))
         record = None
         if ranks.leads:
@@ -111,7 +111,7 @@ def train(
             )
             facts = {"recipe": recipe.plain(), "seed": options.seed, **machine.plain()}
             facts["processes"] = ranks.world
-            record = Record(files, watch, member, View.of(area), judged, position, facts)
+            record = Record(files, watch, model, view_of(area), judged, position, facts)
             stack.enter_context(closing(record))
         path, frames, images = None, "", None
         for index in range(position.stage, len(recipe.stages)):
@@ -123,22 +123,22 @@ def train(
                 groups = _groups_of(dataset, frames)
                 images = TrainingSet(*groups, up_is_known=dataset.info.up_is_known)
                 if is_new and state is None:
-                    member.fit(images)
+                    model.fit(images)
             if record is not None:
                 on_area = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
                 learnt = {g.name: None for s in on_area for g in _groups_of(area, s.frames)}
                 record.trains_on(list(learnt), images)
-            member.network.to(machine.device)
-            member.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-            member.begin_stage(stage.options, images, stage.images_about)
-            ranks.start_alike(list(member.network.state_dict().values()))
-            optimizer = optimizer_of(recipe, stage, member)
+            model.network.to(machine.device)
+            model.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+            model.begin_stage(stage.options, images, stage.images_about)
+            ranks.start_alike(list(model.network.state_dict().values()))
+            optimizer = optimizer_of(recipe, stage, model)
             if state is not None:
                 state.restore_optimizer(optimizer)
                 state = None
             validations = max(1, round(options.validations * recipe.shares[index]))
             run_stage(
-                *(stage, index, images, member, optimizer, position),
+                *(stage, index, images, model, optimizer, position),
                 *(machine, ranks, record, watch, options.seed, validations),
             )
             position.stage, position.step = index + 1, 0
@@ -150,7 +150,7 @@ def run_stage(
     stage: Stage,
     index: int,
     images: TrainingSet,
-    member: Member,
+    model: PoseModel,
     optimizer: torch.optim.Optimizer,
     at: Position,
     machine: Machine,
@@ -175,16 +175,16 @@ def run_stage(
     def part_of(number: int) -> Batch:
         # A budget in minutes is as far as it was when the batch was begun.
         spent = progress if stage.minutes else 0.0
-        return _pinned(made_part(member, images, stage, index, number, seed, ranks, spent), machine)
+        return _pinned(made_part(model, images, stage, index, number, seed, ranks, spent), machine)
 
     logged = saved = time.perf_counter()
     shown, save_s = at.shown, 0.0
     with (
         batches_ahead(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
-        gradients(member, parameters, stage.parts, machine) as gradient,
+        gradients(model, parameters, stage.parts, machine) as gradient,
     ):
         waited_s = at.wait_s
-        member.network.train()
+        model.network.train()
         while progress < 1:
             rate = stage.rate_at(at.step, progress)
             for group in optimizer.param_groups:
@@ -217,19 +217,19 @@ def run_stage(
                     record.steps(stage.name, progress, rate, means)
                     if is_judged:
                         record.validate(stage.name, progress)
-                        member.network.train()
+                        model.network.train()
                     if is_saved:
                         began = time.perf_counter()
                         record.save(optimizer)
                         save_s = time.perf_counter() - began
                 if stop:
-                    raise Stopped
+                    raise TrainingStopped
             logged, shown = time.perf_counter(), at.shown
             saved = logged if is_saved else saved
 
 
 def made_part(
-    member: Member,
+    model: PoseModel,
     images: TrainingSet,
     stage: Stage,
     index: int,
@@ -248,7 +248,7 @@ def made_part(
         len(images), stage.batch // stage.parts, step, seed, index, rank=part, world=world
     )
     spent = max(stage.progress(step * stage.batch * ranks.world, 0.0), spent)
-    return member.batch(images, rows, generator_of_step(seed, index, step, part), min(spent, 1.0))
+    return model.batch(images, rows, generator_of_step(seed, index, step, part), min(spent, 1.0))
 
 
 @contextmanager
@@ -289,9 +289,9 @@ def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:
     return groups
 
 
-def optimizer_of(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Optimizer:
+def optimizer_of(recipe: Recipe, stage: Stage, model: PoseModel) -> torch.optim.Optimizer:
     """Raises InputError where the stage trains nothing."""
-    groups = [group for group in member.parameter_groups() if group["params"]]
+    groups = [group for group in model.parameter_groups() if group["params"]]
     if not groups:
         raise InputError(f"stage {stage.name} trains nothing: all layers are frozen")
     rate, decay = stage.rate, stage.weight_decay
@@ -300,7 +300,7 @@ def optimizer_of(recipe: Recipe, stage: Stage, member: Member) -> torch.optim.Op
             groups, rate, momentum=recipe.momentum, weight_decay=decay, fused=True
         )
     if recipe.optimizer == "muon":
-        return Muon(groups, rate, decay, torch.bfloat16 if member.bfloat16 else torch.float32)
+        return Muon(groups, rate, decay, torch.bfloat16 if model.bfloat16 else torch.float32)
     return torch.optim.AdamW(groups, rate, weight_decay=decay, fused=True)
 
 

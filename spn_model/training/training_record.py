@@ -15,10 +15,10 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
-from spn_model.evaluation.validation import Errors, Frames, judge, spread_rows
+from spn_model.evaluation.validation import Errors, PosedImages, judge, spread_rows
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import checkpoint
-from spn_model.models.member import Member
+from spn_model.models.pose_model import PoseModel
 from spn_model.onboard.view import View
 from spn_model.training.covariance_scale import LEAST_FRAMES, measured_scale
 from spn_model.training.training_state import Log, Position, save_state
@@ -56,36 +56,38 @@ class Watch(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ValidationFrames:
     """Frames that a member is judged by: some rows of a group of a name, or views, of none."""
 
     event: str
-    frames: Frames
+    frames: PosedImages
     rows: np.ndarray
     group: str = ""
 
-    def errors(self, member: Member, *, scales: bool) -> Errors:
+    def errors(self, model: PoseModel, *, scales: bool) -> Errors:
         """Of the member's estimates; scales : they also tell how large its covariances have to be."""
-        errors, found = judge(member, self.frames, self.rows)
+        errors, found = judge(model, self.frames, self.rows)
         if scales:
             # Too few frames with a pose: covariances stay as they are.
             with suppress(GeometryError):
                 factor = measured_scale(found, self.frames.poses[self.rows])
-                member.set_covariance_scale(min(max(factor, 1e-6), 1e6))
+                model.set_covariance_scale(min(max(factor, 1e-6), 1e6))
         return errors
 
 
 def judged_frames(
     dataset: Dataset, training: DatasetGroup, frames: int, sample: int
-) -> list[Judged]:
+) -> list[ValidationFrames]:
     """Validation frames, where there are any, and a sample of those that are trained on."""
     judged = []
     for group in [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size][:1]:
         rows = _shown_to_training(group, training)
-        judged.append(Judged("validation", group, rows[spread_rows(len(rows), frames)], group.name))
+        judged.append(
+            ValidationFrames("validation", group, rows[spread_rows(len(rows), frames)], group.name)
+        )
     return [
         *judged,
-        Judged("training", training, spread_rows(len(training), sample), training.name),
+        ValidationFrames("training", training, spread_rows(len(training), sample), training.name),
     ]
 
 
@@ -110,9 +112,9 @@ class Record:
 
     files: Files
     watch: Watch
-    member: Member
+    model: PoseModel
     view: View
-    judged: list[Judged]
+    judged: list[ValidationFrames]
     position: Position
     facts: dict[str, Any]
     _learnt: list[str] = field(default_factory=list)
@@ -147,13 +149,13 @@ class Record:
         if "validation" in latest:
             latest["held out"] = latest.pop("validation")
 
-    def _with_views(self) -> list[Judged]:
+    def _with_views(self) -> list[ValidationFrames]:
         """What judges, with the stage's views, which are rendered when first asked for."""
         if self._images is not None:
-            views = self.member.unseen_views(self._images, _VIEWS)
+            views = self.model.unseen_views(self._images, _VIEWS)
             if views is not None:
                 rows = np.arange(len(views.poses))
-                self.judged = [Judged("views", views, rows), *self.judged]
+                self.judged = [ValidationFrames("views", views, rows), *self.judged]
             self._images = None
         return self.judged
 
@@ -164,7 +166,7 @@ class Record:
         judged = self._with_views()
         events = [one.event for one in judged]
         by = next((event for event in _SCALING if event in events), None)
-        found = {one.event: one.errors(self.member, scales=one.event == by) for one in judged}
+        found = {one.event: one.errors(self.model, scales=one.event == by) for one in judged}
         at.validate_s += time.perf_counter() - began
         for event, errors in found.items():
             plain = errors.plain()
@@ -176,16 +178,16 @@ class Record:
                 return
             at.best = score if at.best is None else min(at.best, score)
         at.kept = {"stage": stage, "steps": at.steps, "drawn": at.drawn, **at.latest}
-        checkpoint.save(self.files.checkpoint, self.member, self.view, self.told())
+        checkpoint.save(self.files.checkpoint, self.model, self.view, self.told())
 
     def save(self, optimizer: torch.optim.Optimizer | None) -> None:
         """The state to go on from."""
-        save_state(self.files.state, self.member.network, optimizer, self.position)
+        save_state(self.files.state, self.model.network, optimizer, self.position)
 
     def finish(self) -> dict[str, Any]:
         """The network as it is at the end; facts of the training."""
         told = self.told()
-        checkpoint.save(self.files.last, self.member, self.view, told)
+        checkpoint.save(self.files.last, self.model, self.view, told)
         return told
 
     def told(self) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def save_state(
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class TrainingState:
     """What `save_state` saved."""
 
     path: Path
@@ -102,7 +102,7 @@ class State:
         optimizer.load_state_dict({"state": state, "param_groups": whole["param_groups"]})
 
 
-def read_state(path: Path) -> State | None:
+def read_state(path: Path) -> TrainingState | None:
     """None where there is none. Raises FormatError for a damaged one."""
     if not path.exists():
         return None
@@ -118,7 +118,7 @@ def read_state(path: Path) -> State | None:
             setattr(position, name, float(values[name]))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: is a damaged state of a training ({error!r})") from error
-    return State(path, position, tensors)
+    return TrainingState(path, position, tensors)
 
 
 class Log:

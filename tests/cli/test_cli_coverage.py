@@ -17,7 +17,7 @@ from spn_cli.data import main
 from spn_data.area.area import EVALUATION, FRAMES, GEO, Area
 from spn_data.coverage.nearest_frame import CoverageOptions, strata_of
 from spn_data.coverage.sequence_table import COLUMNS
-from spn_data.coverage.waypoints import Place, read_waypoints
+from spn_data.coverage.waypoints import WaypointFrame, read_waypoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, angles_from_rotations
@@ -27,7 +27,7 @@ from spn_data.inputs.area_labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.labels.labels import Labels, SeenPoints, write_labels, write_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, write_labels, write_seen_points
 from spn_data.pipeline.area_coverage import PLANNED, read_coverage, stale_because
 from spn_data.storage.record import read_json, write_json
 
@@ -60,7 +60,7 @@ def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
     write_labels(work.path / "poses.csv", labels)
     nothing = np.zeros(0, np.int64)
     write_seen_points(
-        work.path / "observations.npz", SeenPoints(nothing, nothing, np.zeros((0, 2)))
+        work.path / "observations.npz", LabelObservations(nothing, nothing, np.zeros((0, 2)))
     )
     camera = next(iter(read_json(area.folder("1-frames") / "cameras.json")["cameras"].values()))
     write_json(work.path / "camera.json", {"version": 1, **camera})
@@ -127,7 +127,7 @@ def test_places_to_fly_again_close_the_gaps(area, labelled, tmp_path):
     shown = run("--area", area, "--fly-again", tmp_path / "again.csv")
     assert "away: 6 of 6 lie above the highest mapping frame" in shown
     assert "would bring 6 frames to high coverage" in shown
-    stops = read_waypoints(tmp_path / "again.csv", Place(labelled.origin, 0.0))
+    stops = read_waypoints(tmp_path / "again.csv", WaypointFrame(labelled.origin, 0.0))
     assert 1 <= len(stops) < 6
     assert set(strata_of(away, labelled.mapping.poses).tolist()) == {"low"}
     assert set(strata_of(away, stops.poses).tolist()) == {"high"}

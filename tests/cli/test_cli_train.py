@@ -152,7 +152,7 @@ def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
     assert resumed.exit_code == 0, resumed.output
     assert "Going on from where it was stopped" in resumed.output
     both = [
-        load(place / "area" / "runs" / name / "last.safetensors").member.network.state_dict()
+        load(place / "area" / "runs" / name / "last.safetensors").model.network.state_dict()
         for name in ("whole", "cut")
     ]
     assert all(torch.equal(both[0][name], both[1][name]) for name in both[0])

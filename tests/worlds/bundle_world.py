@@ -9,10 +9,10 @@ import torch
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.camera import Camera
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.models.scene_coordinates import SceneCoordinatesMember
-from spn_model.onboard.view import View
+from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.training.precision import bfloat16_is_fast
 
 STEPS = 100
@@ -27,23 +27,23 @@ _AS_THEY_ARE = {
 def learnt(dataset: Path) -> Checkpoint:
     """A scene-coordinate network after 100 steps on the data set's training images, as they are."""
     with Dataset(dataset) as data:
-        training, view = TrainingSet(data.groups["train"]), View.of(data)
-    member = SceneCoordinatesMember.make({"shrink": 2}, seed=0)
-    member.load_pretrained(member.weights_name)
-    member.fit(training)
-    member.begin_stage(_AS_THEY_ARE, training)
-    member.bfloat16 = bfloat16_is_fast("cpu")
-    optimizer = torch.optim.AdamW([{**group, "lr": 0.0} for group in member.parameter_groups()])
+        training, view = TrainingSet(data.groups["train"]), view_of(data)
+    model = SceneCoordinatesModel.make({"shrink": 2}, seed=0)
+    model.load_pretrained(model.weights_name)
+    model.fit(training)
+    model.begin_stage(_AS_THEY_ARE, training)
+    model.bfloat16 = bfloat16_is_fast("cpu")
+    optimizer = torch.optim.AdamW([{**group, "lr": 0.0} for group in model.parameter_groups()])
     generator, rows = np.random.default_rng(0), np.arange(len(training))
-    member.network.train()
+    model.network.train()
     for step in range(STEPS):
         rate = 3e-3 * min(1, (step + 1) / 10) * (1 + np.cos(np.pi * step / STEPS)) / 2
         for group in optimizer.param_groups:
             group["lr"] = rate * group["rate"]
-        loss, _ = member.loss(member.batch(training, rows, generator, step / STEPS))
+        loss, _ = model.loss(model.batch(training, rows, generator, step / STEPS))
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(member.network.parameters(), 5.0)
+        torch.nn.utils.clip_grad_norm_(model.network.parameters(), 5.0)
         optimizer.step()
-    member.network.eval()
-    return Checkpoint(member, view, {"recipe": {"weights": "published"}})
+    model.network.eval()
+    return Checkpoint(model, view, {"recipe": {"weights": "published"}})

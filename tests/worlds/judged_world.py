@@ -9,10 +9,10 @@ from typing import Any
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import Checkpoint, load, save
 from spn_model.models.registry import make
-from spn_model.onboard.view import View
 from tests.worlds.training_world import INFO, frame
 
 ROLES = {
@@ -38,8 +38,8 @@ def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: An
 
 def write_network(path: Path, dataset: Path, seed: int = 0, **options: Any) -> Checkpoint:
     """A network of the kind tiny, whose targets are those of the data set and whose weights are drawn."""
-    member = make("tiny", options, seed=seed)
+    model = make("tiny", options, seed=seed)
     with Dataset(dataset) as data:
-        member.fit(TrainingSet(data.groups["train"]))
-        save(path, member, View.of(data), {"images_shown": 40, "train_s": 3.0})
+        model.fit(TrainingSet(data.groups["train"]))
+        save(path, model, view_of(data), {"images_shown": 40, "train_s": 3.0})
     return load(path)

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.registration.solution import Sequence
+from spn_data.registration.solution import UnsolvedSequence
 from spn_data.registration.tracks import find_tracks
 
 PITCH_M = 2.0  # between window columns
@@ -47,9 +47,9 @@ class Flight:
             found.append(np.column_stack([np.flatnonzero(there), point[there]]))
         return found
 
-    def sequence(self, putative: list[np.ndarray]) -> Sequence:
+    def sequence(self, putative: list[np.ndarray]) -> UnsolvedSequence:
         tracks = find_tracks(self.pairs, [len(p) for p in self.pixels])
-        return Sequence(self.pixels, putative, tracks, self.points)
+        return UnsolvedSequence(self.pixels, putative, tracks, self.points)
 
 
 def flight(frames: int = 8, *, noise_px: float = 0.3, seed: int = 5) -> Flight:

@@ -142,8 +142,10 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
         ),
         split=Split(frames.names, group, frames.reason, SplitOptions()),
         audit=(
-            audit.Finding("no evaluation frame in the map", audit.Verdict.PASS, "none is"),
-            audit.Finding("guard gap", audit.Verdict.PASS, "kept"),
+            audit.AuditFinding(
+                "no evaluation frame in the map", audit.AuditVerdict.PASS, "none is"
+            ),
+            audit.AuditFinding("guard gap", audit.AuditVerdict.PASS, "kept"),
         ),
     )
 

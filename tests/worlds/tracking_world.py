@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels, LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.simulate.video_out import write_video
 from spn_data.tracking.segments import SequenceToLabel
@@ -151,7 +151,7 @@ class World:
         self.points = map_points(self.poses)
         self.labelled = labels_of(self.frames, LABELLED, self.poses)
         views = [visible(self.points, self.poses[k : k + 1]) for k in LABELLED]
-        self.seen = SeenPoints(
+        self.seen = LabelObservations(
             np.repeat(np.arange(len(LABELLED)), [len(ids) for ids, _ in views]),
             np.concatenate([ids for ids, _ in views]),
             np.concatenate([pixels for _, pixels in views]),

@@ -21,7 +21,7 @@ from spn_data.geometry.pose import Poses, canonical_quats
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import registry
 from spn_model.models.checkpoint import load
-from spn_model.models.member import ANY_NUMBER, Batch, Member, PoseEstimates
+from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
 from spn_model.training.train import TrainOptions
 from spn_model.training.training_record import Files
 
@@ -108,7 +108,7 @@ class TinyNet(nn.Module):
         return self.out(self.dropout(x.mean(dim=(2, 3))))
 
 
-class TinyMember(Member):
+class TinyModel(PoseModel):
     """A real regression, small enough for tests."""
 
     kind: ClassVar[str] = "tiny"
@@ -197,7 +197,7 @@ class TinyMember(Member):
 
 def register_tiny() -> None:
     """Let recipes and checkpoints of this process know the kind."""
-    registry.KINDS["tiny"] = (__name__, "TinyMember")
+    registry.KINDS["tiny"] = (__name__, "TinyModel")
 
 
 class Follower:
@@ -222,7 +222,7 @@ def files(folder: Path) -> Files:
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
-    return load(path).member.network.state_dict()
+    return load(path).model.network.state_dict()
 
 
 def log(folder: Path) -> list[dict[str, str]]:

@@ -23,7 +23,7 @@ from spn_data.coverage.sequence_table import (
     remarks,
     write_coverage,
 )
-from spn_data.coverage.view_share import SeenMap, ViewOptions, view_shares
+from spn_data.coverage.view_share import SeenMap, ViewShareOptions, view_shares
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
@@ -241,7 +241,7 @@ class TestViews:
                 SeenMap.of(
                     xyz, np.zeros((1, 3)), np.zeros(len(beyond), int), np.arange(len(beyond))
                 ),
-                ViewOptions(columns=8, rows=4),
+                ViewShareOptions(columns=8, rows=4),
             )
             assert found[0] == (share if share else pytest.approx(1.0, abs=0.04))
 

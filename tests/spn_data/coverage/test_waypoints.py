@@ -7,21 +7,21 @@ import re
 import numpy as np
 import pytest
 
-from spn_data.coverage.waypoints import Place, read_waypoints, waypoint_columns
+from spn_data.coverage.waypoints import WaypointFrame, read_waypoints, waypoint_columns
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import angles_from_rotations
 from spn_data.storage.files import write_csv
 
 LAT, LON = 49.0153, 8.4250
-TAKEOFF = Place(GeoOrigin(LAT, LON, 0.0, HeightReference.TAKEOFF), 0.0)
+TAKEOFF = WaypointFrame(GeoOrigin(LAT, LON, 0.0, HeightReference.TAKEOFF), 0.0)
 # An area above the ellipsoid whose zero lies 2 m above the point of take-off.
-ELLIPSOID = Place(GeoOrigin(LAT, LON, 112.0, HeightReference.ELLIPSOID), -2.0)
+ELLIPSOID = WaypointFrame(GeoOrigin(LAT, LON, 112.0, HeightReference.ELLIPSOID), -2.0)
 HEADER = "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg"
 GOOD = f"{LAT},{LON},10,90,-30"
 
 
-def read(tmp_path, text: str | bytes, place: Place = TAKEOFF):
+def read(tmp_path, text: str | bytes, place: WaypointFrame = TAKEOFF):
     path = tmp_path / "plan.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_waypoints(path, place)
@@ -125,7 +125,7 @@ class TestRefusing:
             read(tmp_path, text)
         with pytest.raises(InputError, match="needs alt_ellipsoid_m or height_takeoff_m"):
             read(tmp_path, text, ELLIPSOID)
-        unknown = Place(GeoOrigin(LAT, LON, -6.0, HeightReference.UNKNOWN))
+        unknown = WaypointFrame(GeoOrigin(LAT, LON, -6.0, HeightReference.UNKNOWN))
         with pytest.raises(InputError, match="needs x, y, z: it knows no zero of heights"):
             read(tmp_path, text, unknown)
 

@@ -45,7 +45,13 @@ from spn_data.inputs.area_labels import (
     similarity_to_json,
 )
 from spn_data.inputs.frame_images import image_path
-from spn_data.labels.labels import Labels, SeenPoints, read_labels, write_labels, write_seen_points
+from spn_data.labels.labels import (
+    LabelObservations,
+    Labels,
+    read_labels,
+    write_labels,
+    write_seen_points,
+)
 from spn_data.labels.map_points import MapPoints
 from spn_data.pipeline.area_export import Format
 from spn_data.storage.record import VERSION, write_json
@@ -95,7 +101,7 @@ def add_evaluation(root: Path) -> None:
     kept = seen.frame_idx != 5
     write_seen_points(
         work.path / SEEN,
-        SeenPoints(seen.frame_idx[kept], seen.point_ids[kept], seen.pixels[kept]),
+        LabelObservations(seen.frame_idx[kept], seen.point_ids[kept], seen.pixels[kept]),
     )
     lens = Camera("OPENCV", 320, 180, np.array([210.0, 211, 160.5, 89, -0.05, 0.01, 1e-3, -1e-3]))
     write_json(work.path / CAMERA, {"version": VERSION, **camera_to_json(lens)})
@@ -545,7 +551,7 @@ def one_frame(reference: HeightReference, center: np.ndarray) -> ExportedFrames:
         GeoOrigin(49.0, 8.4, 100.0, reference),
         labels,
         np.zeros(1, bool),
-        SeenPoints(nothing, nothing, np.zeros((0, 2))),
+        LabelObservations(nothing, nothing, np.zeros((0, 2))),
         MapPoints(nothing, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing),
         {},
     )

@@ -11,12 +11,12 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.observe import Fixes
-from spn_data.georegistration.problem import SHARED, Kind, Problem, State
+from spn_data.georegistration.problem import SHARED, FitState, Kind, Problem
 
 ROTATION = rotations_from_vectors(np.array([0.3, 1.2, -0.5]))
 
 
-def _problem(noise: float) -> tuple[Problem, State]:
+def _problem(noise: float) -> tuple[Problem, FitState]:
     """Nine cameras of two flights, one straight down and one on its side, and the state that fits them."""
     rng = np.random.default_rng(0)
     n = 9
@@ -27,7 +27,7 @@ def _problem(noise: float) -> tuple[Problem, State]:
     )
     angles[0], angles[1] = [40.0, -90.0, 0.0], [40.0, 5.0, 90.0]
     attitude = rotations_from_angles(angles)
-    state = State(
+    state = FitState(
         ROTATION,
         7.0,
         np.array([3.0, -2.0, 5.0]),

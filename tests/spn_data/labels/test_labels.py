@@ -14,8 +14,8 @@ from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles
 from spn_data.labels.labels import (
+    LabelObservations,
     Labels,
-    SeenPoints,
     read_labels,
     read_seen_points,
     write_labels,
@@ -136,8 +136,8 @@ def test_labels_are_selected_and_put_together() -> None:
         replace(one, inliers=np.zeros(2, int))
 
 
-def seen() -> SeenPoints:
-    return SeenPoints(
+def seen() -> LabelObservations:
+    return LabelObservations(
         np.array([0, 0, 2, 2, 2]), np.array([7, 3, 3, 9, 7]), np.arange(10.0).reshape(5, 2)
     )
 
@@ -150,7 +150,7 @@ def test_seen_points_are_selected_by_frame_and_come_back_from_their_file(tmp_pat
     assert some.of_frame(2)[1].tolist() == [[0, 1], [2, 3]]
     write_seen_points(tmp_path / "o.npz", seen())
     read = read_seen_points(tmp_path / "o.npz")
-    for column in fields(SeenPoints):
+    for column in fields(LabelObservations):
         assert np.array_equal(getattr(read, column.name), getattr(seen(), column.name))
 
 

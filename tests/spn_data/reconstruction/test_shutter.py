@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from spn_data.colmap import pycolmap
-from spn_data.colmap.model import Observations, Scene, read_observations
+from spn_data.colmap.model import MapObservations, Scene, read_observations
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import projection_jacobians
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
@@ -42,7 +42,7 @@ class Filmed:
     """A bundle-adjusted model with its truth; displacement_p95_px is the readout's true effect."""
 
     scene: Scene
-    seen: Observations
+    seen: MapObservations
     time_s: np.ndarray
     truth: Poses
     displacement_p95_px: float

@@ -10,10 +10,10 @@ import pytest
 
 from spn_data.geometry.pose import pose_errors
 from spn_data.labels.map_points import MapPoints
-from spn_data.registration.checks import Evidence, Verdict, gather_evidence, judge, same_pose
+from spn_data.registration.checks import Evidence, PoseVerdict, gather_evidence, judge, same_pose
 from spn_data.registration.register import accept
 from spn_data.registration.register_options import CheckOptions, RegisterOptions
-from spn_data.registration.solution import Sequence, Solution, settle, without
+from spn_data.registration.solution import SequenceSolution, UnsolvedSequence, settle, without
 from spn_data.registration.solve import solve
 from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
 
@@ -50,7 +50,7 @@ def with_frame(found: Evidence, row: int, **values: Any) -> Evidence:
     return replace(found, **columns)
 
 
-def judged(found: Evidence, posed: np.ndarray | None = None) -> Verdict:
+def judged(found: Evidence, posed: np.ndarray | None = None) -> PoseVerdict:
     return judge(
         np.ones(len(found.direct), bool) if posed is None else posed, found, CheckOptions()
     )
@@ -145,7 +145,9 @@ def test_a_frame_without_a_pose_says_why() -> None:
     assert verdict.accepted.tolist() == [False, False, True]
 
 
-def solved(made: Flight, putative: list[np.ndarray]) -> tuple[Sequence, Solution, Evidence]:
+def solved(
+    made: Flight, putative: list[np.ndarray]
+) -> tuple[UnsolvedSequence, SequenceSolution, Evidence]:
     sequence = made.sequence(putative)
     solution = solve(sequence, LENS, True, OPTIONS)
     covariances = np.tile(1e-6 * np.eye(6), (len(made.poses), 1, 1))
@@ -285,9 +287,9 @@ def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatc
     """One fails at first, another once that one is gone: each keeps its own reason."""
     rounds = iter([({3}, "first"), ({3, 5}, "second"), ({3, 5}, "third")])
 
-    def scripted(posed: np.ndarray, *_: object) -> Verdict:
+    def scripted(posed: np.ndarray, *_: object) -> PoseVerdict:
         failing, reason = next(rounds)
-        return Verdict(
+        return PoseVerdict(
             np.array([k not in failing for k in range(8)]),
             tuple(reason if k in failing else "" for k in range(8)),
         )

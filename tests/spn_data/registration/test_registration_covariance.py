@@ -18,8 +18,8 @@ from spn_data.registration.adjustment import (
 )
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frame_covariance import (
-    FramePoints,
     LensUncertainty,
+    PointObservations,
     frame_covariances,
 )
 from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
@@ -211,7 +211,7 @@ def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
     for k in range(FRAMES):
         mine = (observations.frame == k) & (rows >= 0)
         frames.append(
-            FramePoints(observations.pixels[mine], rows[mine], observations.map_xyz[mine])
+            PointObservations(observations.pixels[mine], rows[mine], observations.map_xyz[mine])
         )
     alone = frame_covariances(
         state.poses, state.camera, frames, LensUncertainty(covariance=whole.lens), map_covariance
@@ -246,7 +246,7 @@ def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
             seen = true.project((truth.scene.points - poses.centers[k]) @ poses.rotations[k].T)
             rows = np.flatnonzero(((seen > 0) & (seen < [true.width, true.height])).all(axis=1))
             pixels = seen[rows] + rng.normal(0, NOISE_PX, (len(rows), 2))
-            frame = FramePoints(pixels, rows, mapped.scene.points[rows])
+            frame = PointObservations(pixels, rows, mapped.scene.points[rows])
             start = SequenceState(
                 map_from_true.apply_to_poses(poses[k : k + 1]), camera, np.zeros((0, 3))
             )
@@ -311,7 +311,7 @@ def test_a_lens_of_the_map_counts_as_one_of_the_sequence_with_the_same_covarianc
     mapped, _ = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
     mine = (observations.frame == 0) & (rows >= 0)
-    frames = [FramePoints(observations.pixels[mine], rows[mine], observations.map_xyz[mine])]
+    frames = [PointObservations(observations.pixels[mine], rows[mine], observations.map_xyz[mine])]
     lens = np.diag([4.0, 1e-4, 4e-4])
     place = np.zeros((8, 3))
     place[[0, 1], 0] = place[4, 1] = place[5, 2] = 1.0

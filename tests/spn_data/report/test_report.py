@@ -75,8 +75,8 @@ def of_evaluation(failed: int) -> FrameTable:
     )
 
 
-def audited(verdict_: audit.Verdict) -> tuple[audit.Finding, ...]:
-    return (audit.Finding("guard gap", verdict_, "frames lie within 2 s", ("a is near b",)),)
+def audited(verdict_: audit.AuditVerdict) -> tuple[audit.AuditFinding, ...]:
+    return (audit.AuditFinding("guard gap", verdict_, "frames lie within 2 s", ("a is near b",)),)
 
 
 STALE = (StageFacts(record("3-geo"), "2-model was made anew since", "spn-data georegister"),)
@@ -128,12 +128,12 @@ RULES = {
     "optimistic": (optimistic, Level.CAUTION, "same flight as training: optimistic"),
     "not audited": (lambda d: replace(d, audit=None), Level.STOP, "is not checked"),
     "audit failed": (
-        lambda d: replace(d, audit=audited(audit.Verdict.FAIL)),
+        lambda d: replace(d, audit=audited(audit.AuditVerdict.FAIL)),
         Level.STOP,
         "The audit failed (guard gap): frames lie within 2 s.",
     ),
     "audit notices": (
-        lambda d: replace(d, audit=audited(audit.Verdict.NOTICE)),
+        lambda d: replace(d, audit=audited(audit.AuditVerdict.NOTICE)),
         Level.CAUTION,
         "Audit, guard gap: frames lie",
     ),
@@ -259,7 +259,7 @@ def test_no_text_of_the_area_becomes_markup():
         ),
         coverage=CoverageFacts({HOSTILE: {HOSTILE: 3}}, (), HOSTILE),
         split=replace(data.split, group=np.full(190, HOSTILE), notes=(HOSTILE,)),
-        audit=(audit.Finding(HOSTILE, audit.Verdict.FAIL, HOSTILE, (HOSTILE,)),),
+        audit=(audit.AuditFinding(HOSTILE, audit.AuditVerdict.FAIL, HOSTILE, (HOSTILE,)),),
     )
     html = render(hostile)
     assert "<img" not in html

@@ -15,8 +15,8 @@ from spn_data.simulate.faces import Face, Texture, mirror_face
 from spn_data.simulate.flight import exposure_poses
 from spn_data.simulate.paths import Motion
 from spn_data.simulate.produce import render_frame
-from spn_data.simulate.render import HAZE_RGB, Renderer
-from spn_data.simulate.scene import Place, SceneOptions, build_place, paint_all
+from spn_data.simulate.render import HAZE_RGB, SceneRenderer
+from spn_data.simulate.scene import SceneFaces, SceneOptions, build_place, paint_all
 
 CELLS = 16
 LENSES = {
@@ -83,7 +83,7 @@ def wide_enough(camera: Camera, expected: np.ndarray, neighbours: np.ndarray) ->
 def test_known_corners_appear_within_a_tenth_of_a_pixel(lens: str) -> None:
     """Chessboard corners lie where Camera.project says, from several poses through a distorted lens."""
     camera, face = LENSES[lens], wall("board")
-    renderer = Renderer([face], {"board": chessboard()}, camera)
+    renderer = SceneRenderer([face], {"board": chessboard()}, camera)
     views = [
         pose((0.3, 0, 1), (0, 0, 0)),
         pose((1.5, 1, 2), (-12, -4, 3)),
@@ -114,7 +114,7 @@ def test_outlines_lie_within_a_fiftieth_of_a_pixel() -> None:
         "white", np.array([0.2, 5, 1.6]), np.array([0.8, 0.1, 0.1]), np.array([0.1, 0, -0.7])
     )
     textures = {"white": plain((250, 250, 250)), "dark": plain((0, 0, 0))}
-    renderer = Renderer([wall("dark", half=40.0), square], textures, camera)
+    renderer = SceneRenderer([wall("dark", half=40.0), square], textures, camera)
     shares = (np.arange(200) + 0.5) / 200
     s, t = (axis.reshape(-1, 1) for axis in np.meshgrid(shares, shares))
     points = square.origin + s * square.u_edge + t * square.v_edge
@@ -136,12 +136,12 @@ def test_nearer_faces_hide_farther_ones_and_rays_past_all_see_haze() -> None:
     near, far = wall("near", y=4.0, half=0.5), wall("far", half=2.0)
     center, rotation = pose((0, 0, 1), (0, 0, 0))
     for faces in ([near, far], [far, near]):
-        image = Renderer(faces, textures, camera).render(center, rotation)
+        image = SceneRenderer(faces, textures, camera).render(center, rotation)
         assert tuple(image[180, 320]) == (200, 0, 0)
         assert tuple(image[180, 240]) == (0, 200, 0)
         assert tuple(image[5, 5]) == HAZE_RGB
     behind = pose((0, 12, 1), (180, 0, 0))
-    assert (Renderer([far], textures, camera).render(*behind) == HAZE_RGB).all()
+    assert (SceneRenderer([far], textures, camera).render(*behind) == HAZE_RGB).all()
 
 
 def test_panes_show_the_mirror_image_of_what_lies_opposite() -> None:
@@ -151,7 +151,7 @@ def test_panes_show_the_mirror_image_of_what_lies_opposite() -> None:
     board = Face("board", np.array([7.0, -6, 8]), np.array([-14.0, 0, 0]), np.array([0, 0, -14.0]))
     glass = Texture.from_image(np.full((64, 64, 4), (0, 0, 0, 255), np.uint8))
     mirror = replace(mirror, mirrored=mirror_face(board, mirror))
-    renderer = Renderer([mirror], {"glass": glass, "board": chessboard()}, camera)
+    renderer = SceneRenderer([mirror], {"glass": glass, "board": chessboard()}, camera)
     corner = board.origin + 0.5 * board.u_edge + 0.5 * board.v_edge
     mirrored = corner * [1, -1, 1] + [0, 2 * 8.0, 0]
     for center, rotation in (pose((0.5, 0, 1.2), (0, 0, 0)), pose((-1.5, 1, 0.4), (6, 3, 4))):
@@ -161,21 +161,21 @@ def test_panes_show_the_mirror_image_of_what_lies_opposite() -> None:
 
 
 @pytest.fixture(scope="module")
-def place() -> Place:
+def place() -> SceneFaces:
     return build_place(SceneOptions(texels_per_m=60.0, seed=3))
 
 
 @pytest.fixture(scope="module")
-def textures(place: Place) -> dict[str, Texture]:
+def textures(place: SceneFaces) -> dict[str, Texture]:
     return paint_all(place)
 
 
 def test_survey_targets_of_the_courtyard_appear_where_they_are(
-    place: Place, textures: dict[str, Texture]
+    place: SceneFaces, textures: dict[str, Texture]
 ) -> None:
     """The centres of the targets painted on the four facades project to within a tenth of a pixel."""
     camera = LENSES["72 degrees"]
-    renderer = Renderer(place.faces, textures, camera)
+    renderer = SceneRenderer(place.faces, textures, camera)
     for landmark, heading in zip(place.landmarks, (0, 180, 90, 270), strict=True):
         away = np.array([np.sin(np.deg2rad(heading)), np.cos(np.deg2rad(heading)), 0])
         center, rotation = pose(
@@ -194,7 +194,7 @@ def test_detail_finer_than_a_pixel_turns_grey() -> None:
     floor = Face(
         "board", np.array([-57.6, 57.6, 0]), np.array([115.2, 0, 0]), np.array([0, -115.2, 0])
     )
-    renderer = Renderer([floor], {"board": board}, camera)
+    renderer = SceneRenderer([floor], {"board": board}, camera)
     for heading in (0.0, 20.0, 45.0):
         # Cells of 0.16 m have 3 px at 32 m, and 0.6 px at 140 m.
         near = renderer.render(*pose((0.3, 0.2, 32), (heading, -89, 4)))
@@ -204,14 +204,16 @@ def test_detail_finer_than_a_pixel_turns_grey() -> None:
         assert image.std() < 6  # of 80 where they are seen sharply
 
 
-def test_courtyard_is_rendered_without_aliasing(place: Place, textures: dict[str, Texture]) -> None:
+def test_courtyard_is_rendered_without_aliasing(
+    place: SceneFaces, textures: dict[str, Texture]
+) -> None:
     """A frame differs from the area mean of a render at four times its size by no more than a lens's blur."""
     camera = Camera.from_horizontal_fov(320, 180, 72.0, (-0.05, 0.015))
     fine = camera.scaled(1280, 720)
     for center, rotation in (pose((0, -9, 3), (20, 5, 0)), pose((-9, -8, 20.8), (45, -46, 0))):
-        image = Renderer(place.faces, textures, camera).render(center, rotation)
+        image = SceneRenderer(place.faces, textures, camera).render(center, rotation)
         reference = cv2.resize(
-            Renderer(place.faces, textures, fine).render(center, rotation),
+            SceneRenderer(place.faces, textures, fine).render(center, rotation),
             (320, 180),
             interpolation=cv2.INTER_AREA,
         )
@@ -221,13 +223,13 @@ def test_courtyard_is_rendered_without_aliasing(place: Place, textures: dict[str
 
 
 def test_blurred_frame_is_the_mean_of_its_exposure_about_the_true_pose(
-    place: Place, textures: dict[str, Texture]
+    place: SceneFaces, textures: dict[str, Texture]
 ) -> None:
     """Sub-exposures lie symmetrically about the truth, and their sharp renders average to the frame."""
     options = replace(preset("standard"), width=320, height=180, only=("medium",))
     path = simulate_paths(options)["medium"]
     frame = int(np.flatnonzero(path.blurred)[0])
-    renderer = Renderer(place.faces, textures, path.camera)
+    renderer = SceneRenderer(place.faces, textures, path.camera)
     poses = exposure_poses(path, frame)
     middle = path.poses.rotations[frame]
     early, late = poses.rotations[0] @ middle.T, poses.rotations[-1] @ middle.T
@@ -252,7 +254,7 @@ def test_rolling_shutter_reads_each_row_at_its_own_time() -> None:
     path = replace(path, camera=camera, motion=motion, time_s=np.zeros(1), poses=still)
     face = wall("board")
     readout_s = 0.03
-    image = render_frame(Renderer([face], {"board": chessboard()}, camera), path, 0, readout_s)
+    image = render_frame(SceneRenderer([face], {"board": chessboard()}, camera), path, 0, readout_s)
     moved = 0.0
     for s, t in ((0.5, 0.25), (0.5, 0.75), (0.25, 0.5), (0.6875, 0.6875)):
         point = face.origin + s * face.u_edge + t * face.v_edge

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_data.labels.labels import Labels, LabelStatus, SeenPoints
+from spn_data.labels.labels import LabelObservations, Labels, LabelStatus
 from spn_data.split import audit, audit_files
-from spn_data.split.audit import Finding, MapHashes, Verdict
+from spn_data.split.audit import AuditFinding, AuditVerdict, MapHashes
 from spn_data.split.audit_files import PoseList
 from spn_data.split.groups import LEFT_OUT, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.split.holdout import make_split
@@ -72,9 +72,9 @@ def regrouped(split: Split, name: str, group: str) -> Split:
     return replace(split, group=np.where(split.names == name, group, split.group))
 
 
-def assert_fails(finding: Finding, *words: str) -> None:
+def assert_fails(finding: AuditFinding, *words: str) -> None:
     """It failed, and one line of its evidence holds all the words."""
-    assert finding.verdict is Verdict.FAIL
+    assert finding.verdict is AuditVerdict.FAIL
     assert any(all(word in line for word in words) for line in finding.evidence), finding.evidence
 
 
@@ -85,7 +85,7 @@ EVALUATION_SOURCES = {"medium": {"medium/medium.mp4": "bbbb"}}
 def test_evaluation_frames_apart_from_the_map_pass(mapping, evaluation):
     names = mapping.names[~mapping.tracked].tolist()
     found = audit.check_not_in_map(names, SOURCES, evaluation, EVALUATION_SOURCES)
-    assert found.verdict is Verdict.PASS
+    assert found.verdict is AuditVerdict.PASS
     assert "30 evaluation frames" in found.text
 
 
@@ -109,31 +109,31 @@ def test_an_evaluation_sequence_of_unknown_source_is_found(mapping, evaluation):
 
 def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
     """Every fourth frame of the flight, 2 cm off, as labels of a copy are; another flight passes."""
-    assert audit.check_copies(mapping, evaluation).verdict is Verdict.PASS
+    assert audit.check_copies(mapping, evaluation).verdict is AuditVerdict.PASS
     rows = np.arange(0, 100, 4)
     copy = frames("copy", 100).select(rows)
     copy = replace(copy, poses=Poses(copy.poses.centers + 0.01, copy.poses.quats_wxyz))
     found = audit.check_copies(mapping, {**evaluation, "copy": copy})
-    assert found.verdict is Verdict.NOTICE
+    assert found.verdict is AuditVerdict.NOTICE
     assert found.evidence == ("copy: 25 of 25 frames",)
     crossing = frames("crossing", 20, north_m=3.0)
     centers = crossing.poses.centers.copy()
     centers[:2] = mapping.poses.centers[:2]
     crossing = replace(crossing, poses=Poses(centers, crossing.poses.quats_wxyz))
-    assert audit.check_copies(mapping, {"crossing": crossing}).verdict is Verdict.PASS
+    assert audit.check_copies(mapping, {"crossing": crossing}).verdict is AuditVerdict.PASS
 
 
 def test_a_map_hash_that_changed_is_found():
     """During a registration, or since."""
     same = audit.check_map_unchanged("m1", {"medium": MapHashes("m1", "m1")})
-    assert same.verdict is Verdict.PASS
+    assert same.verdict is AuditVerdict.PASS
     assert_fails(audit.check_map_unchanged("m2", {"medium": MapHashes("m1", "m2")}), "m1", "m2")
     assert_fails(audit.check_map_unchanged("m2", {"medium": MapHashes("m1", "m1")}), "m2 now")
 
 
 def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
     for check in (audit.check_blocks, audit.check_gap):
-        assert check(mapping, split).verdict is Verdict.PASS
+        assert check(mapping, split).verdict is AuditVerdict.PASS
 
 
 @pytest.mark.parametrize("tracked", [False, True])
@@ -159,7 +159,7 @@ def test_a_dense_training_frame_in_the_guard_gap_is_found(mapping, split):
 def test_a_gap_smaller_than_the_stated_one_is_found(mapping, split):
     """Blocks cut for 2 s do not pass as cut for 3 s."""
     stated = replace(split, options=SplitOptions(gap_s=3.0))
-    assert audit.check_gap(mapping, stated).verdict is Verdict.FAIL
+    assert audit.check_gap(mapping, stated).verdict is AuditVerdict.FAIL
 
 
 def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping, split):
@@ -177,18 +177,18 @@ def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping,
             reason=np.append(split.reason, ""),
         )
         found = audit.check_revisits(both, with_back)
-        assert (found.verdict is Verdict.NOTICE) == listed
+        assert (found.verdict is AuditVerdict.NOTICE) == listed
         if listed:
             (line,) = (e for e in found.evidence if mapping.names[row] in e)
             assert "back/f00000.jpg (train): 0.50 m, 5.0 deg" in line
 
 
-def seen_points(mapping: Labels, views: dict[int, list[str]]) -> SeenPoints:
+def seen_points(mapping: Labels, views: dict[int, list[str]]) -> LabelObservations:
     """Observations of points by id, each in the frames named."""
     row_of = {name: k for k, name in enumerate(mapping.names.tolist())}
     pairs = sorted((row_of[name], point) for point, names in views.items() for name in names)
     rows, points = np.array(pairs, dtype=np.int64).T
-    return SeenPoints(rows, points, np.zeros((len(rows), 2)))
+    return LabelObservations(rows, points, np.zeros((len(rows), 2)))
 
 
 def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
@@ -204,7 +204,7 @@ def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
     seen = seen_points(chosen, views)
     assert audit.training_points(chosen, seen, split).tolist() == [1]
     fine = audit.check_training_points(np.array([1, 1]), chosen, seen, split)
-    assert fine.verdict is Verdict.PASS
+    assert fine.verdict is AuditVerdict.PASS
     assert_fails(audit.check_training_points(np.array([1, 2]), chosen, seen, split), "point 2")
     assert_fails(audit.check_training_points(np.array([3]), chosen, seen, split), "point 3")
 
@@ -213,7 +213,7 @@ def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
     """Two pixels of one training frame are no second view."""
     chosen = mapping.select(~mapping.tracked)
     row = np.flatnonzero(split.of(chosen.names) == TRAIN)[0]
-    seen = SeenPoints(np.array([row, row]), np.array([7, 7]), np.zeros((2, 2)))
+    seen = LabelObservations(np.array([row, row]), np.array([7, 7]), np.zeros((2, 2)))
     assert len(audit.training_points(chosen, seen, split)) == 0
 
 
@@ -229,16 +229,16 @@ def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
 def test_a_wrong_mark_is_found(marks, word):
     """Only the training group's points are for training."""
     sound = audit.check_marks({"train": True, "validation": False, "medium": False})
-    assert sound.verdict is Verdict.PASS
+    assert sound.verdict is AuditVerdict.PASS
     assert_fails(audit.check_marks(marks), word)
 
 
 def test_labels_that_are_not_finite_are_found(parts):
     """A position, a covariance in part, a quaternion of another length, a negative variance."""
-    assert audit_files.check_labels(parts).verdict is Verdict.PASS
+    assert audit_files.check_labels(parts).verdict is AuditVerdict.PASS
     unknown = replace(parts["mapping"], covariance=np.full((100, 6, 6), np.nan))
     found = audit_files.check_labels({"mapping": unknown})
-    assert found.verdict is Verdict.PASS
+    assert found.verdict is AuditVerdict.PASS
     assert "100 have no covariance" in found.text
     for field, index, value, word in (
         ("centers", (3, 1), np.inf, "position"),
@@ -259,7 +259,7 @@ def test_labels_that_are_not_finite_are_found(parts):
 
 
 def test_a_frame_that_the_split_lacks_or_holds_twice_is_found(parts, split):
-    assert audit_files.check_covered(parts, split).verdict is Verdict.PASS
+    assert audit_files.check_covered(parts, split).verdict is AuditVerdict.PASS
     name = split.names[0]
     missing = replace(split, names=split.names[1:], group=split.group[1:], reason=split.reason[1:])
     assert_fails(audit_files.check_covered(parts, missing), name, "missing")
@@ -303,7 +303,7 @@ def lists(parts: dict[str, Labels], split: Split) -> dict[str, PoseList]:
 def test_a_data_set_that_differs_from_the_split_is_found(parts, split):
     """A frame too many, one too few, and a pose that moved by a nanometre."""
     stored = lists(parts, split)
-    assert audit_files.check_dataset(stored, parts, split).verdict is Verdict.PASS
+    assert audit_files.check_dataset(stored, parts, split).verdict is AuditVerdict.PASS
     medium = stored["medium"]
     short = {**stored, "medium": medium.select(np.arange(29))}
     assert_fails(audit_files.check_dataset(short, parts, split), "medium/f00029.jpg", "missing")
@@ -328,7 +328,7 @@ def test_lists_that_differ_from_the_data_set_are_found(parts, split):
     png = tuple(name.replace(".jpg", ".png") for name in wanted.names)
     rounded = Poses(wanted.poses.centers.round(6), -wanted.poses.quats_wxyz.round(6))
     listed = {"dataset_train.txt": PoseList(png, rounded)}
-    assert audit_files.check_cambridge(listed, stored).verdict is Verdict.PASS
+    assert audit_files.check_cambridge(listed, stored).verdict is AuditVerdict.PASS
     off = Poses(rounded.centers + 1.1e-6, rounded.quats_wxyz)
     found = audit_files.check_cambridge({"dataset_train.txt": PoseList(png, off)}, stored)
     assert_fails(found, png[0].removesuffix(".png"), "another pose")
@@ -344,20 +344,20 @@ def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split)
     group = split.of(mapping.names)
     train, held = mapping.names[group == TRAIN][:5].tolist(), mapping.names[group == VALIDATION][0]
     png = [name.replace(".jpg", ".png") for name in train]
-    assert audit_files.check_measured(png, split).verdict is Verdict.PASS
+    assert audit_files.check_measured(png, split).verdict is AuditVerdict.PASS
     assert_fails(audit_files.check_measured([*png, held], split), held)
     assert_fails(audit_files.check_measured([*png, "medium/f00001.png"], split), "medium/f00001")
 
 
 def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
-    assert audit.check_test_is_apart(split).verdict is Verdict.PASS
+    assert audit.check_test_is_apart(split).verdict is AuditVerdict.PASS
     chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
     alone = make_split(chosen, tracked, {}, SplitOptions())
     found = audit.check_test_is_apart(alone)
-    assert found.verdict is Verdict.NOTICE
+    assert found.verdict is AuditVerdict.NOTICE
     assert found.text == "same flight as training: optimistic"
 
 
 def test_a_stale_split_fails():
-    assert audit.check_fresh(None).verdict is Verdict.PASS
+    assert audit.check_fresh(None).verdict is AuditVerdict.PASS
     assert audit.has_failed([audit.check_fresh("3-geo was made anew since")])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from spn_data.colmap import pycolmap
-from spn_data.colmap.model import Observations, Scene, read_observations
+from spn_data.colmap.model import MapObservations, Scene, read_observations
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import POSE
@@ -24,7 +24,7 @@ from spn_data.geometry.pose import (
     rotations_from_vectors,
 )
 from spn_data.uncertainty.bundle_jacobians import (
-    Bundle,
+    LinearizedBundle,
     Unknowns,
     gauge_directions,
     linearize_bundle,
@@ -40,7 +40,7 @@ class Small:
     """Two lenses, frames along an arc about a heap of points, and who sees what; no noise."""
 
     scene: Scene
-    seen: Observations
+    seen: MapObservations
 
     def noisy(self, noise_px: np.ndarray) -> Small:
         """Measurements that are off by (M, 2), and the bundle adjustment of them."""
@@ -70,7 +70,7 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
         frame.append(np.full(len(index), k))
         point.append(index)
         pixels.append(projected[index])
-    seen = Observations(
+    seen = MapObservations(
         np.concatenate(frame),
         np.concatenate(point),
         np.concatenate(pixels),
@@ -83,7 +83,7 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
     return Small(scene, seen)
 
 
-def adjusted(scene: Scene, seen: Observations, pixels: np.ndarray) -> Small:
+def adjusted(scene: Scene, seen: MapObservations, pixels: np.ndarray) -> Small:
     """COLMAP's bundle adjustment of measurements, from the scene as it is."""
     tracks: list[list[tuple[int, int]]] = [[] for _ in scene.points]
     measured = []
@@ -106,13 +106,13 @@ def adjusted(scene: Scene, seen: Observations, pixels: np.ndarray) -> Small:
     return Small(*_observed(model))
 
 
-def _observed(model: pycolmap.Reconstruction) -> tuple[Scene, Observations]:
+def _observed(model: pycolmap.Reconstruction) -> tuple[Scene, MapObservations]:
     with TemporaryDirectory() as folder:
         model.write(folder)
         return read_observations(Path(folder))
 
 
-def drifting(rng: np.random.Generator, seen: Observations, sigma_px: float) -> np.ndarray:
+def drifting(rng: np.random.Generator, seen: MapObservations, sigma_px: float) -> np.ndarray:
     """(M, 2) errors that walk along each track: neighbours in it correlate by 0.9."""
     noise = sigma_px * rng.standard_normal((len(seen.point_idx), 2))
     for k in range(int(seen.point_idx.max()) + 1):
@@ -136,7 +136,7 @@ def scores(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     return np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
 
 
-def linearized(scene: Scene, seen: Observations) -> tuple[Unknowns, Bundle]:
+def linearized(scene: Scene, seen: MapObservations) -> tuple[Unknowns, LinearizedBundle]:
     unknowns = Unknowns.of(scene, refine_principal_point=False)
     rows = np.arange(len(seen.point_idx))
     return unknowns, linearize_bundle(scene, seen, unknowns, rows)
@@ -182,7 +182,7 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
     assert np.abs(pull).max() < 1e-9 * information.diagonal().max()
 
 
-def dense_covariance(scene: Scene, seen: Observations, sigma_px: float) -> np.ndarray:
+def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np.ndarray:
     """Of all unknowns, points last: the whole normal matrix inverted under the seven conditions."""
     unknowns, bundle = linearized(scene, seen)
     n, p = bundle.design.shape[1], 3 * len(scene.points)
@@ -359,7 +359,7 @@ def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> Non
     point, frames = 17, np.flatnonzero(seen.point_idx == 17)
     drop = np.ones(len(seen.point_idx), dtype=bool)
     drop[frames[2:]] = False
-    kept = Observations(
+    kept = MapObservations(
         seen.image_idx[drop], seen.point_idx[drop], seen.pixels[drop], seen.residuals_px[drop]
     )
     far = scene.points.copy()
@@ -381,7 +381,7 @@ def test_a_map_in_two_pieces_is_refused() -> None:
     seen = whole.seen
     left = np.bincount(seen.point_idx, seen.image_idx < 6) / whole.scene.track_lengths
     keep = (seen.image_idx < 6) == (left[seen.point_idx] > 0.5)
-    part = Observations(
+    part = MapObservations(
         seen.image_idx[keep], seen.point_idx[keep], seen.pixels[keep], seen.residuals_px[keep]
     )
     with pytest.raises(GeometryError, match="tie"):

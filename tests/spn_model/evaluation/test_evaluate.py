@@ -23,12 +23,17 @@ from spn_model.evaluation import retrieval
 from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, VLAD
 from spn_model.evaluation.comparison_files import drawn, of_network, write_comparison
 from spn_model.evaluation.dropout import dropout_estimates, has_dropout
-from spn_model.evaluation.evaluate import Comparison, EvaluateOptions, Judged, compare
+from spn_model.evaluation.evaluate import (
+    EvaluatedGroup,
+    EvaluateOptions,
+    NetworkComparison,
+    compare,
+)
 from spn_model.models.checkpoint import Checkpoint, load
 from spn_model.training.training_figure import read_log, training_figure
 from spn_model.training.training_state import COLUMNS
 from tests.worlds.judged_world import write_judged, write_network
-from tests.worlds.training_world import INFO, TinyMember
+from tests.worlds.training_world import INFO, TinyModel
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
@@ -43,7 +48,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def beside(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+def beside(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> NetworkComparison:
     """Two networks, a and b, beside all baselines."""
     folder = tmp_path_factory.mktemp("networks")
     networks = {n: write_network(folder / n, dataset, seed=k) for k, n in enumerate("ab")}
@@ -54,16 +59,18 @@ def silent(step: str, done: int, total: int) -> None:
     assert 0 < done <= total
 
 
-def judged(dataset: Path, options: EvaluateOptions = ALONE, **networks: Checkpoint) -> Comparison:
+def judged(
+    dataset: Path, options: EvaluateOptions = ALONE, **networks: Checkpoint
+) -> NetworkComparison:
     return compare(dataset, networks, WORLD, silent, options)
 
 
-def group_of(found: Comparison, name: str) -> Judged:
+def group_of(found: NetworkComparison, name: str) -> EvaluatedGroup:
     return next(group for group in found.groups if group.frames.group == name)
 
 
 def test_errors_are_those_of_what_the_network_says(dataset, tmp_path):
-    """Medians are of the member's own estimates against the labels of each group, every frame of it."""
+    """Medians are of the model's own estimates against the labels of each group, every frame of it."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     found = judged(dataset, n=network)
     assert [g.frames.group for g in found.groups] == ["low", "medium", "validation", "train"]
@@ -71,7 +78,7 @@ def test_errors_are_those_of_what_the_network_says(dataset, tmp_path):
         for group in found.groups:
             of = data.groups[group.frames.group]
             images = np.stack([of.image(k) for k in range(len(of))])
-            away, _ = pose_errors(network.member.estimate(images, of.intrinsics).poses, of.poses)
+            away, _ = pose_errors(network.model.estimate(images, of.intrinsics).poses, of.poses)
             (one,) = group.evaluations
             assert one.summary.frames == len(of)
             assert one.summary.position.median == pytest.approx(np.median(away))
@@ -84,8 +91,8 @@ def test_nothing_is_aligned(dataset, tmp_path):
     """A network that says everything 5 m too far east is 5 m worse, and the signed error says so."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     before = group_of(judged(dataset, n=network), "medium").evaluations[0].errors
-    assert isinstance(network.member, TinyMember)
-    network.member.network.center[0] += 5
+    assert isinstance(network.model, TinyModel)
+    network.model.network.center[0] += 5
     after = group_of(judged(dataset, n=network), "medium").evaluations[0].errors
     np.testing.assert_allclose(after.signed_m - before.signed_m, [[5, 0, 0]] * 7, atol=1e-5)
 
@@ -156,7 +163,7 @@ def test_another_camera_needs_a_network_that_takes_any(dataset, tmp_path, monkey
     other = write_judged(tmp_path / "b.h5", camera=lens)
     with pytest.raises(InputError, match="of another camera than the one that n was trained for"):
         judged(other, n=network)
-    monkeypatch.setattr(TinyMember, "any_camera", True)
+    monkeypatch.setattr(TinyModel, "any_camera", True)
     judged(other, n=network)
 
 
@@ -243,15 +250,15 @@ def test_dropout_scatters_and_leaves_the_network_as_it_was(dataset, tmp_path):
     with Dataset(dataset) as data:
         of = data.groups["medium"]
         images, k = np.stack([of.image(row) for row in range(3)]), of.intrinsics[:3]
-    before = network.member.estimate(images, k).poses.centers
-    found = dropout_estimates(network.member, images, k, 40, seed=1)
-    again = dropout_estimates(network.member, images, k, 40, seed=1)
+    before = network.model.estimate(images, k).poses.centers
+    found = dropout_estimates(network.model, images, k, 40, seed=1)
+    again = dropout_estimates(network.model, images, k, 40, seed=1)
     np.testing.assert_array_equal(found.covariance, again.covariance)
-    others = dropout_estimates(network.member, images, k, 40, seed=2)
+    others = dropout_estimates(network.model, images, k, 40, seed=2)
     assert not np.array_equal(found.covariance, others.covariance)
     assert (np.linalg.eigvalsh(found.covariance[:, :3, :3])[:, -1] > 1e-6).all()
-    np.testing.assert_array_equal(network.member.estimate(images, k).poses.centers, before)
-    single = dropout_estimates(network.member, images[:1], k[:1], 40, seed=1)
+    np.testing.assert_array_equal(network.model.estimate(images, k).poses.centers, before)
+    single = dropout_estimates(network.model, images[:1], k[:1], 40, seed=1)
     assert np.linalg.norm(single.poses.centers[0] - before[0]) < 3 * np.sqrt(
         np.trace(single.covariance[0, :3, :3])
     )
@@ -261,7 +268,7 @@ def test_dropout_stands_beside_its_network_where_there_is_any(dataset, tmp_path)
     """Networks with dropout get a second row; of one without, a note says that there is nothing to sample."""
     some = write_network(tmp_path / "a.safetensors", dataset, dropout=0.5)
     none = write_network(tmp_path / "b.safetensors", dataset, dropout=0.0)
-    assert has_dropout(some.member)
+    assert has_dropout(some.model)
     found = judged(dataset, replace(ALONE, dropout_samples=8), some=some, none=none)
     assert found.networks == ("some", "some, 8 dropout samples", "none")
     assert "none has no dropout: there is nothing to sample." in found.notes
@@ -440,13 +447,13 @@ def test_an_area_without_a_split_says_what_to_do(tmp_path):
 def test_a_frame_without_a_pose_counts_as_infinitely_wrong(dataset, tmp_path, monkeypatch):
     """Where the network finds none, medians are none too, and nothing is made up."""
     network = write_network(tmp_path / "n.safetensors", dataset)
-    real = network.member.estimate
+    real = network.model.estimate
 
     def lost(images, intrinsics):
         found = real(images, intrinsics)
         return replace(found, poses=Poses.unknown(len(images)))
 
-    monkeypatch.setattr(network.member, "estimate", lost)
+    monkeypatch.setattr(network.model, "estimate", lost)
     summary = group_of(judged(dataset, n=network), "medium").evaluations[0].summary
     assert summary.located == 0
     assert summary.position.median == np.inf

@@ -13,10 +13,10 @@ from spn_model.examples.fused_views import fused_view
 from spn_model.examples.ground import level_ground
 from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.view_sources import Occluders, Sources
-from spn_model.examples.virtual_views import ViewOptions, high_place
-from spn_model.models.member import ANY_NUMBER
-from spn_model.models.scene_examples import Examples, StageOptions
+from spn_model.examples.view_sources import Occluders, ViewSources
+from spn_model.examples.virtual_views import NovelViewOptions, high_place
+from spn_model.models.pose_model import ANY_NUMBER
+from spn_model.models.scene_examples import Examples, SceneStageOptions
 from tests.worlds.box_world import CAMERA, SIZE_M, seen_by, write_box
 
 CENTER, SPREAD = SIZE_M / 2, 8.0
@@ -32,8 +32,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> TrainingSet:
 
 
 @pytest.fixture(scope="module")
-def sources(data: TrainingSet) -> Sources:
-    return Sources(data, CENTER, SPREAD, 4 * SPREAD)
+def sources(data: TrainingSet) -> ViewSources:
+    return ViewSources(data, CENTER, SPREAD, 4 * SPREAD)
 
 
 def above(pitch_deg: float = -60.0) -> Poses:
@@ -109,7 +109,7 @@ def test_without_up_there_is_no_ground(data):
 def _without_up(data: TrainingSet) -> tuple[np.ndarray, Surface]:
     data.up_is_known = False
     try:
-        sources = Sources(data, CENTER, SPREAD, 4 * SPREAD)
+        sources = ViewSources(data, CENTER, SPREAD, 4 * SPREAD)
         assert sources.ground is None
         return view(data, sources, above(), surface_of=unknown_surfaces(data))
     finally:
@@ -206,7 +206,7 @@ def test_a_scene_without_level_ground_has_none():
 def test_high_places_look_down_at_the_scene(data, sources):
     """Level cameras above the middle training image, within the options, at all pitches from 30°."""
     centers, scene = data.poses.centers, sources.samples
-    options = ViewOptions(side_m=1.5, height_m=6.0)
+    options = NovelViewOptions(side_m=1.5, height_m=6.0)
     rng = np.random.default_rng(0)
     places = [high_place(rng, centers, scene, options) for _ in range(150)]
     at = np.concatenate([place.centers for place in places])
@@ -226,17 +226,17 @@ def test_a_camera_may_look_straight_down():
     """The azimuth is then drawn, and no number is unknown."""
     below = np.array([[3.0, 4.0, 0.0]])
     place = high_place(
-        np.random.default_rng(1), np.array([[3.0, 4.0, 5.0]]), below, ViewOptions(side_m=0.0)
+        np.random.default_rng(1), np.array([[3.0, 4.0, 5.0]]), below, NovelViewOptions(side_m=0.0)
     )
     assert place.rotations[0, 2] == pytest.approx([0, 0, -1])
     assert np.linalg.det(place.rotations[0]) == pytest.approx(1)
     with pytest.raises(ValueError, match="nothing of the scene lies below"):
-        high_place(np.random.default_rng(1), below, below + 50, ViewOptions(height_m=1.0))
+        high_place(np.random.default_rng(1), below, below + 50, NovelViewOptions(height_m=1.0))
 
 
 def test_a_stage_begins_with_few_views(data):
     """At its beginning a batch is drawn from the first 32 views alone, near its end from all."""
-    options = StageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
+    options = SceneStageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
     numbers: dict[float, set[int]] = {}
     for progress in (0.0, 0.5, 0.9):
         examples = Examples(data, options, CENTER, SPREAD, 2, ANY_NUMBER)
@@ -256,7 +256,7 @@ def test_a_stage_begins_with_few_views(data):
 def test_views_are_kept_within_their_memory(data, monkeypatch):
     """Fewer are made where they would take more, of images spread over all of them."""
     monkeypatch.setattr("spn_model.models.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
-    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
+    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     assert examples._view_count == 10
     views = [examples._view(n) for n in range(10)]
     assert sum(i.nbytes + s.inverse_depth.nbytes for i, s in views) <= 7 * 160 * 90 * 10
@@ -265,7 +265,7 @@ def test_views_are_kept_within_their_memory(data, monkeypatch):
 def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     """After some attempts; its targets are the image's own."""
     monkeypatch.setattr("spn_model.models.scene_examples._LEAST_SHOWN", 1.1)
-    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
+    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
     assert examples._view(0) is None
     image, seen = examples._training_image(0)
     assert np.array_equal(image, data.image(0))
@@ -276,7 +276,7 @@ def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
     """Each is what a camera at its pose sees; none is among those that batches are drawn from."""
-    options = StageOptions(views_share=1.0, views=8)
+    options = SceneStageOptions(views_share=1.0, views=8)
     examples = Examples(data, options, CENTER, SPREAD, shrink, ANY_NUMBER)
     views = examples.unseen_views(5)
     assert len(views.poses) == len(views.small) == 5
@@ -293,7 +293,9 @@ def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink)
         assert np.median(off) < 12
         wrong, _ = seen_by(views.poses[k - 1 :][:1])
         assert np.median(np.abs(image.astype(float) - wrong).mean(axis=2)) > 2 * np.median(off)
-    assert Examples(data, StageOptions(), CENTER, SPREAD, 2, ANY_NUMBER).unseen_views(5) is None
+    assert (
+        Examples(data, SceneStageOptions(), CENTER, SPREAD, 2, ANY_NUMBER).unseen_views(5) is None
+    )
 
 
 def test_shares_of_high_views_are_as_told(data):
@@ -301,7 +303,7 @@ def test_shares_of_high_views_are_as_told(data):
     highest = data.poses.centers[:, 2].max()
 
     def heights(**options: float) -> np.ndarray:
-        stage = StageOptions(views_share=1.0, views_rise=0.0, views_side=0.0, **options)
+        stage = SceneStageOptions(views_share=1.0, views_rise=0.0, views_side=0.0, **options)
         examples = Examples(data, stage, CENTER, SPREAD, 2, ANY_NUMBER)
         return np.array([examples._view(n)[1].pose.centers[0, 2] for n in range(6)])
 
@@ -312,5 +314,5 @@ def test_shares_of_high_views_are_as_told(data):
 @pytest.mark.parametrize(("images", "views"), [(100, 32), (6000, 50), (ANY_NUMBER, 1000)])
 def test_a_short_stage_makes_few_views(data, images, views):
     """One for 120 images that it draws: a view takes the time of ten of them."""
-    examples = Examples(data, StageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
+    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
     assert examples._view_count == views

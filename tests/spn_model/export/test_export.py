@@ -20,22 +20,22 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
 from spn_data.storage.record import write_json
-from spn_model.export.bundle_checks import ExportOptions
+from spn_model.examples.dataset_view import view_of
+from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export
-from spn_model.export.exported import Exported
+from spn_model.export.exported import ExportedBundle
 from spn_model.export.graphs import _CellMeans, deployment, reference, write_graph
 from spn_model.models import checkpoint
 from spn_model.models.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
 from spn_model.onboard.localizer import Localizer
-from spn_model.onboard.view import View
 from tests.worlds.box_world import write_box
 from tests.worlds.bundle_world import learnt
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FILES = {"bundle.json", "model.onnx", "model-int8.onnx", "MODEL_CARD.md"}
-OPTIONS = ExportOptions(calibration_images=4)
+OPTIONS = BundleOptions(calibration_images=4)
 
 
 def quiet(step: str, done: int, total: int) -> None:
@@ -55,7 +55,7 @@ def network(hall: Path) -> checkpoint.Checkpoint:
 @pytest.fixture(scope="module")
 def made(
     hall: Path, network: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactory
-) -> Exported:
+) -> ExportedBundle:
     folder = tmp_path_factory.mktemp("run") / "bundle"
     return export(network, hall, folder, {**network.facts, "run": "first"}, quiet, OPTIONS)
 
@@ -75,16 +75,16 @@ def made(
 def test_a_graph_computes_what_torch_computes(hall, tmp_path, kind, options):
     """Outputs of every kind of network equal PyTorch's, on a real image, to rounding."""
     torch.manual_seed(0)
-    member = make(kind, options, seed=1)
+    model = make(kind, options, seed=1)
     with torch.no_grad():
-        for module in member.network.modules():
+        for module in model.network.modules():
             if isinstance(module, nn.Conv2d):  # so that signals last to the end
                 nn.init.kaiming_normal_(module.weight)
             if isinstance(module, nn.BatchNorm2d):  # as after training: not 0 and 1
                 module.running_mean.uniform_(-0.1, 0.1)
                 module.running_var.uniform_(0.5, 1.5)
-    member.network.eval()
-    deployed = deployment(member, (320, 180))
+    model.network.eval()
+    deployed = deployment(model, (320, 180))
     write_graph(tmp_path / "m.onnx", deployed)
     session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"))
     with Dataset(hall) as data:
@@ -117,7 +117,7 @@ def test_a_bundle_is_whole(made, hall, network):
     assert isinstance(bundle.decoding, CellDecoding)
     # Reduced by two: cells of 16 pixels, the first one 15 in.
     assert (bundle.decoding.first_px, bundle.decoding.stride_px) == (15.0, 16.0)
-    assert bundle.decoding.options == network.member.decoding_options
+    assert bundle.decoding.options == network.model.decoding_options
     assert bundle.view.dataset == network.view.dataset
     measured = bundle.document["measured"]
     assert [one["precision"] for one in measured["errors"]] == ["float32", "int8"]
@@ -131,7 +131,7 @@ def test_its_poses_are_the_networks(made, hall, network):
         group = data.groups["train"]
         images = np.stack([group.image(k) for k in range(len(group))])
         intrinsics, truth = group.intrinsics, group.poses
-    own = network.member.estimate(images, intrinsics)
+    own = network.model.estimate(images, intrinsics)
     for k, image in enumerate(images):
         found = localizer.decode(localizer.run(image[None]))
         apart, turned = pose_errors(found.poses, own.poses[k : k + 1])
@@ -188,7 +188,7 @@ def test_a_graph_that_computes_something_else_is_not_written(hall, network, tmp_
     """Where parity fails there is no bundle, and nothing half-made."""
     monkeypatch.setattr("spn_model.export.graphs.MEAN", (0.48, 0.45, 0.41))
     broken = tmp_path / "graph.onnx"
-    write_graph(broken, deployment(network.member, (320, 180)))
+    write_graph(broken, deployment(network.model, (320, 180)))
     monkeypatch.undo()
     monkeypatch.setattr(
         "spn_model.export.bundle_export.write_graph",
@@ -230,7 +230,7 @@ def test_the_command_makes_a_bundle_once(hall, network, tmp_path):
     run.mkdir(parents=True)
     checkpoint.save(
         run / "checkpoint.safetensors",
-        network.member,
+        network.model,
         network.view,
         {"recipe": {"weights": "none"}},
     )
@@ -281,23 +281,23 @@ def test_a_run_that_is_not_there_is_told(tmp_path):
 
 def test_regressors_keep_their_covariance(hall, tmp_path):
     """A bundle of a regressor gives the poses and the stated deviations of the network itself."""
-    member = make("regression", {"network": "squeezeposenet", "width": 160}, seed=2)
+    model = make("regression", {"network": "squeezeposenet", "width": 160}, seed=2)
     with Dataset(hall) as data:
         group = data.groups["train"]
-        member.network.targets.fit(group.poses)
-        view, images, matrices = View.of(data), group.image(0)[None], group.intrinsics[:1]
+        model.network.targets.fit(group.poses)
+        view, images, matrices = view_of(data), group.image(0)[None], group.intrinsics[:1]
     with torch.no_grad():
-        member.network.uncertainty.bias.copy_(torch.linspace(-3, -1, 6))
-        member.network.regressor.q.bias.fill_(0.5)
-    member.set_covariance_scale(2.5)
-    member.network.eval()
+        model.network.uncertainty.bias.copy_(torch.linspace(-3, -1, 6))
+        model.network.regressor.q.bias.fill_(0.5)
+    model.set_covariance_scale(2.5)
+    model.network.eval()
     made = export(
-        checkpoint.Checkpoint(member, view, {}), hall, tmp_path / "bundle", {}, quiet, OPTIONS
+        checkpoint.Checkpoint(model, view, {}), hall, tmp_path / "bundle", {}, quiet, OPTIONS
     )
-    own = member.estimate(images, matrices)
+    own = model.estimate(images, matrices)
     localizer = Localizer(made.folder)
     assert (localizer.camera.width, localizer.camera.height) == (160, 90)
-    small = deployment(member, view.size).sized(images[0])
+    small = deployment(model, view.size).sized(images[0])
     found = localizer.decode(localizer.run(small))
     assert found.poses.centers == pytest.approx(own.poses.centers, abs=1e-4)
     assert found.covariance == pytest.approx(own.covariance[0], rel=1e-4)

@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError, StageError
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import FORMAT, Checkpoint, load, save
 from spn_model.onboard.view import View
-from tests.worlds.training_world import CAMERA, INFO, TinyMember, write_field
+from tests.worlds.training_world import CAMERA, INFO, TinyModel, write_field
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
@@ -27,17 +28,17 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def saved(field: Path, tmp_path: Path) -> tuple[Path, TinyMember, View]:
+def saved(field: Path, tmp_path: Path) -> tuple[Path, TinyModel, View]:
     """A checkpoint of a member with weights, statistics and a counter that are not those of a new one."""
-    member = TinyMember.make({"width": 5, "dropout": 0.25}, seed=3)
+    model = TinyModel.make({"width": 5, "dropout": 0.25}, seed=3)
     with Dataset(field) as dataset:
-        member.fit(TrainingSet(dataset.groups["train"]))
-        view = View.of(dataset)
-    member.network.train()
-    member.network(torch.rand(4, 3, 48, 64))
+        model.fit(TrainingSet(dataset.groups["train"]))
+        view = view_of(dataset)
+    model.network.train()
+    model.network(torch.rand(4, 3, 48, 64))
     path = tmp_path / "runs" / "a" / "checkpoint.safetensors"
-    save(path, member, view, {"images": 96, "error": float("inf"), "table": [1.5, None]})
-    return path, member, view
+    save(path, model, view, {"images": 96, "error": float("inf"), "table": [1.5, None]})
+    return path, model, view
 
 
 def rewritten(path: Path, **changes: object) -> Path:
@@ -63,22 +64,22 @@ def rewritten(path: Path, **changes: object) -> Path:
 
 def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
     """The member that is loaded estimates bit for bit what the saved one does, and knows its camera."""
-    path, member, view = saved
+    path, model, view = saved
     found = load(path)
     assert isinstance(found, Checkpoint)
-    assert found.member.options == {"width": 5, "dropout": 0.25, "normalised": True}
+    assert found.model.options == {"width": 5, "dropout": 0.25, "normalised": True}
     assert found.facts == {"images": 96, "error": None, "table": [1.5, None]}
     assert found.view.to_json() == view.to_json()
     assert found.view.camera is not None
     assert found.view.camera.params.tolist() == CAMERA.params.tolist()
     assert (found.view.size, found.view.units, found.view.origin) == ((64, 48), "m", INFO.origin)
-    assert not found.member.network.training
-    member.network.eval()
+    assert not found.model.network.training
+    model.network.eval()
     with Dataset(field) as dataset:
         group = dataset.groups["validation"]
         images = np.stack([group.image(k) for k in range(len(group))])
-        old = member.estimate(images, group.intrinsics)
-        new = found.member.estimate(images, group.intrinsics)
+        old = model.estimate(images, group.intrinsics)
+        new = found.model.estimate(images, group.intrinsics)
     assert np.array_equal(old.poses.centers, new.poses.centers)
     assert np.array_equal(old.poses.quats_wxyz, new.poses.quats_wxyz)
     assert np.ptp(old.poses.centers, axis=0).max() > 1e-3
@@ -86,18 +87,18 @@ def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
 
 def test_weights_in_channels_last_are_saved_as_they_are(saved, tmp_path):
     """A network whose memory is laid out for speed is saved in the ordinary order."""
-    _, member, view = saved
-    before = {k: v.clone() for k, v in member.network.state_dict().items()}
-    member.network.to(memory_format=torch.channels_last)
-    save(tmp_path / "b.safetensors", member, view, {})
-    after = load(tmp_path / "b.safetensors").member.network.state_dict()
+    _, model, view = saved
+    before = {k: v.clone() for k, v in model.network.state_dict().items()}
+    model.network.to(memory_format=torch.channels_last)
+    save(tmp_path / "b.safetensors", model, view, {})
+    after = load(tmp_path / "b.safetensors").model.network.state_dict()
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
 def test_a_full_disk_keeps_the_old_checkpoint(saved, monkeypatch):
     """One line names the file and the reason; the old file stands and nothing lies beside it."""
-    path, member, view = saved
+    path, model, view = saved
     before = path.read_bytes()
 
     def full(_: int) -> None:
@@ -107,7 +108,7 @@ def test_a_full_disk_keeps_the_old_checkpoint(saved, monkeypatch):
     with pytest.raises(
         StageError, match=r"checkpoint\.safetensors cannot be written: No space left"
     ):
-        save(path, member, view, {})
+        save(path, model, view, {})
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
@@ -173,7 +174,7 @@ def test_the_view_is_that_of_the_data_set(saved, field, tmp_path):
     """It changes with the file, and its JSON is read as strictly as it is written."""
     _, _, view = saved
     with Dataset(write_field(tmp_path / "other.h5", 5, 1)) as dataset:
-        assert View.of(dataset).dataset != view.dataset
+        assert view_of(dataset).dataset != view.dataset
     value = json.loads(json.dumps(view.to_json()))
     assert View.from_json(value).to_json() == view.to_json()
     for name, wrong in (("units", "ft"), ("size", [0, 3]), ("size", [3]), ("up_is_known", 1)):

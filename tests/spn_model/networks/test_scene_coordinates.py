@@ -19,7 +19,7 @@ from spn_model.examples.point_targets import (
     cell_targets,
     surface,
 )
-from spn_model.examples.virtual_views import ViewOptions, random_place, view_from
+from spn_model.examples.virtual_views import NovelViewOptions, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -274,7 +274,7 @@ def test_without_points_nothing_is_known(count):
     seen = surface(few, pose, LENS.matrix, SIZE, SurfaceOptions())
     assert np.isnan(seen.xyz(np.array([[100.0, 100.0]]))).all()
     with pytest.raises(ValueError, match="nothing is known"):
-        random_place(np.random.default_rng(0), seen, ViewOptions())
+        random_place(np.random.default_rng(0), seen, NovelViewOptions())
 
 
 def test_targets_of_a_virtual_camera_are_what_its_pixels_show():
@@ -344,7 +344,7 @@ def test_virtual_cameras_rise_and_keep_their_view():
     rng = np.random.default_rng(0)
     aim = np.array([[240.0, 135.0]])
     for _ in range(20):
-        place = random_place(rng, seen, ViewOptions(rise_m=6.0, side_m=2.0))
+        place = random_place(rng, seen, NovelViewOptions(rise_m=6.0, side_m=2.0))
         move = (place.centers - pose.centers)[0]
         assert 0 <= move[2] <= 6
         assert np.abs(move[:2]).max() <= 2

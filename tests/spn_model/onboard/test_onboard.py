@@ -28,9 +28,9 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.geometry.rendering import Renderer, RenderingOptions, canonical_camera
+from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.storage.record import write_json
-from spn_model.export.bundle_checks import ExportOptions
+from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export
 from spn_model.onboard import lines
 from spn_model.onboard.bundle import read_bundle, sha256_of
@@ -66,7 +66,7 @@ def bundle(hall: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("run") / "bundle"
-    export(learnt(hall), hall, folder, {}, lambda *_: None, ExportOptions(calibration_images=4))
+    export(learnt(hall), hall, folder, {}, lambda *_: None, BundleOptions(calibration_images=4))
     torch.set_num_threads(before)
     return folder
 
@@ -123,8 +123,8 @@ def test_the_view_on_board_is_that_of_the_data_set(flown):
     image = cv2.resize(flown[0], (1280, 720), interpolation=cv2.INTER_CUBIC)
     noise = np.random.default_rng(0).normal(0, 12, image.shape)
     image = np.clip(image + noise, 0, 255).astype(np.uint8)  # detail as fine as a pixel
-    wanted = Renderer(lens, view).render(image).astype(float)
-    found = Renderer(lens, view, sample_step_px=SAMPLE_STEP_PX).render(image).astype(float)
+    wanted = PinholeRenderer(lens, view).render(image).astype(float)
+    found = PinholeRenderer(lens, view, sample_step_px=SAMPLE_STEP_PX).render(image).astype(float)
     assert 0 < np.abs(found - wanted).mean() < 1.5
     assert np.percentile(np.abs(found - wanted), 99) < 6
     # Neither brighter nor darker: of means of 2 x 2, OpenCV rounds halves up, which is an eighth.
@@ -139,9 +139,9 @@ def test_images_are_rendered_with_the_coarser_step(bundle, flown):
     lens, localizer = LENS.scaled(896, 504), Localizer(bundle)
     image = cv2.resize(flown[0], (896, 504), interpolation=cv2.INTER_CUBIC)
     found = localizer.view(image, lens)[0][..., ::-1]
-    coarse = Renderer(lens, localizer.camera, sample_step_px=SAMPLE_STEP_PX).render(image)
+    coarse = PinholeRenderer(lens, localizer.camera, sample_step_px=SAMPLE_STEP_PX).render(image)
     assert np.array_equal(found, coarse)
-    assert not np.array_equal(found, Renderer(lens, localizer.camera).render(image))
+    assert not np.array_equal(found, PinholeRenderer(lens, localizer.camera).render(image))
 
 
 def test_another_size_of_the_same_shape_is_scaled(bundle, flown, truth):

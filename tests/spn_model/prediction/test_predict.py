@@ -27,8 +27,8 @@ from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.record import write_json
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.prediction.flown import Choice, Views, find_flights, frames
-from spn_model.prediction.predict import Predicted, PredictOptions, Stopped, predict
+from spn_model.prediction.flown import FrameFilter, Views, find_flights, frames
+from spn_model.prediction.predict import Predicted, PredictionStopped, PredictOptions, predict
 from spn_model.prediction.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
 from tests.worlds.judged_world import write_judged, write_network
 from tests.worlds.training_world import CAMERA, frame
@@ -97,7 +97,7 @@ def test_poses_are_what_the_network_says_of_the_same_images(network, photos, dat
     with Dataset(dataset) as data:
         group = data.groups["medium"]
         images = np.stack([group.image(k) for k in range(7)])
-        expected = network.member.estimate(images, group.intrinsics)
+        expected = network.model.estimate(images, group.intrinsics)
     away, turned = pose_errors(poses_of(rows), expected.poses)
     assert away.max() < 1e-9
     assert turned.max() < 1e-6
@@ -113,7 +113,7 @@ def test_images_are_rendered_into_the_view_of_the_training(network, tmp_path):
     """Another lens at another size comes out as the training's camera would have seen it."""
     lens = Camera("SIMPLE_RADIAL", 512, 384, np.array([200.0, 250.0, 200.0, -0.02]))
     (flight,), _ = find_flights([_gradient(tmp_path, lens)], lens)
-    (seen,) = frames(flight, Views(network.view), Choice())
+    (seen,) = frames(flight, Views(network.view), FrameFilter())
     assert seen.image is not None
     assert seen.image.shape == (48, 64, 3)
     np.testing.assert_allclose(seen.matrix, CAMERA.matrix)
@@ -136,8 +136,8 @@ def test_frames_of_a_video_have_its_own_times(network, video, tmp_path):
     """Each frame, each third, and at most two a second, by the container's clock and by place."""
     for name, options, indices in (
         ("all", {}, range(10)),
-        ("third", {"choice": Choice(every=3)}, (0, 3, 6, 9)),
-        ("two", {"choice": Choice(fps=2)}, (0, 3, 5, 8)),
+        ("third", {"choice": FrameFilter(every=3)}, (0, 3, 6, 9)),
+        ("two", {"choice": FrameFilter(fps=2)}, (0, 3, 5, 8)),
     ):
         predicted(network, video, tmp_path / name, **options)
         rows = rows_of(tmp_path / name)
@@ -189,7 +189,7 @@ def test_photos_may_tell_their_own_focal_length(network, tmp_path):
 def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp_path, monkeypatch):
     """Damaged photos and images that the network knows nothing of are rows like all others, but empty."""
     (photos / "003.png").write_bytes((photos / "003.png").read_bytes()[:60])
-    real = network.member.estimate
+    real = network.model.estimate
 
     def lost(images, intrinsics):
         found = real(images, intrinsics)
@@ -199,7 +199,7 @@ def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp
         reasons[0] = "12 cells agree, need 20"
         return replace(found, reasons=reasons)
 
-    monkeypatch.setattr(network.member, "estimate", lost)
+    monkeypatch.setattr(network.model, "estimate", lost)
     found = predicted(network, photos, tmp_path / "out", formats=("csv", "tum", "wgs84"))
     assert found.counts == {ESTIMATED: 4, FAILED: 2, UNREADABLE: 1}
     rows = rows_of(tmp_path / "out")
@@ -257,7 +257,7 @@ def test_stopped_work_keeps_whole_rows_and_says_so(network, photos, tmp_path):
                 file.write("flight/002.jpg,2.0,estim")
             raise KeyboardInterrupt
 
-    with pytest.raises(Stopped) as stopped:
+    with pytest.raises(PredictionStopped) as stopped:
         predict(network, flights, tmp_path / "out", stop, PredictOptions(batch=1), facts={})
     assert stopped.value.predicted.counts[ESTIMATED] == 2
     assert len(rows_of(tmp_path / "out")) == 2
@@ -271,7 +271,7 @@ def test_a_failure_leaves_nothing(network, photos, tmp_path, monkeypatch):
     def broken(images, intrinsics):
         raise StageError("poses.csv cannot be written: No space left on device")
 
-    monkeypatch.setattr(network.member, "estimate", broken)
+    monkeypatch.setattr(network.model, "estimate", broken)
     with pytest.raises(StageError, match="No space left"):
         predicted(network, photos, tmp_path / "out")
     assert not list(tmp_path.glob("*out*"))

@@ -11,13 +11,13 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.scene_coordinates import SceneCoordinatesMember
+from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.training.gradients import gradients
 from spn_model.training.machine import choose
 from spn_model.training.recipe import Recipe, Stage
-from spn_model.training.train import Data, Stopped, train
+from spn_model.training.train import Data, TrainingStopped, train
 from tests.worlds.box_world import write_box
-from tests.worlds.training_world import ONE_THREAD, Follower, TinyMember, files, weights
+from tests.worlds.training_world import ONE_THREAD, Follower, TinyModel, files, weights
 
 STAGE = Stage(name="all", images=180, batch=6, parts=3, rate=0.02)
 RECIPE = Recipe(
@@ -27,41 +27,41 @@ RECIPE = Recipe(
 
 @pytest.fixture
 def in_parts(tiny_kind: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(TinyMember, "has_parts", True)
+    monkeypatch.setattr(TinyModel, "has_parts", True)
 
 
 @pytest.fixture(scope="module")
-def member_and_parts(tmp_path_factory: pytest.TempPathFactory):
+def model_and_parts(tmp_path_factory: pytest.TempPathFactory):
     """A scene-coordinate network, and two parts of a batch of different size."""
     with Dataset(write_box(tmp_path_factory.mktemp("hall") / "hall.h5", train=6)) as dataset:
         data = TrainingSet(dataset.groups["train"])
-    member = SceneCoordinatesMember.make({}, seed=1)
-    member.load_pretrained(member.weights_name)
-    member.fit(data)
-    member.begin_stage({}, data)
+    model = SceneCoordinatesModel.make({}, seed=1)
+    model.load_pretrained(model.weights_name)
+    model.fit(data)
+    model.begin_stage({}, data)
     rng = np.random.default_rng(0)
-    parts = [member.batch(data, np.array(rows), rng, 1.0) for rows in ([0, 1, 2, 3], [4, 5])]
-    return member, parts
+    parts = [model.batch(data, np.array(rows), rng, 1.0) for rows in ([0, 1, 2, 3], [4, 5])]
+    return model, parts
 
 
-def gradient(member, parts, threads: int) -> tuple[float, list[torch.Tensor]]:
-    parameters = [p for group in member.parameter_groups() for p in group["params"]]
+def gradient(model, parts, threads: int) -> tuple[float, list[torch.Tensor]]:
+    parameters = [p for group in model.parameter_groups() for p in group["params"]]
     machine = choose("cpu", threads, "float32", makes_batches=True)
-    with gradients(member, parameters, len(parts), machine) as computing:
+    with gradients(model, parameters, len(parts), machine) as computing:
         loss, _ = computing.of(parts)
     return float(loss), [p.grad for p in parameters]
 
 
-def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(member_and_parts):
+def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(model_and_parts):
     """As backward computes it for each by itself; the loss too."""
-    member, parts = member_and_parts
-    loss, found = gradient(member, parts, 1)
-    parameters = [p for group in member.parameter_groups() for p in group["params"]]
+    model, parts = model_and_parts
+    loss, found = gradient(model, parts, 1)
+    parameters = [p for group in model.parameter_groups() for p in group["params"]]
     alone = []
     for part in parts:
         for parameter in parameters:
             parameter.grad = None
-        one, _ = member.loss(part)
+        one, _ = model.loss(part)
         one.backward()
         alone.append((float(one.detach()), [p.grad for p in parameters]))
     assert loss == pytest.approx((alone[0][0] + alone[1][0]) / 2, rel=1e-6)
@@ -69,12 +69,12 @@ def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(member_and_parts):
         torch.testing.assert_close(mean, (first + second) / 2)
 
 
-def test_threads_compute_the_gradient_of_one(member_and_parts, one_thread):
+def test_threads_compute_the_gradient_of_one(model_and_parts, one_thread):
     """Bit for bit, time after time, though the parts differ in size and in time."""
-    member, parts = member_and_parts
-    _, alone = gradient(member, parts, 1)
+    model, parts = model_and_parts
+    _, alone = gradient(model, parts, 1)
     for _ in range(5):
-        _, together = gradient(member, parts, 2)
+        _, together = gradient(model, parts, 2)
         assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
 
 
@@ -83,7 +83,7 @@ def test_a_training_in_parts_goes_on_to_the_same_end(field, in_parts, tmp_path, 
     """Stopped or not, with one thread or two."""
     train(RECIPE, files(tmp_path / "whole"), Data(field), ONE_THREAD, Follower())
     options = replace(ONE_THREAD, threads=threads)
-    with pytest.raises(Stopped):
+    with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path / "cut"), Data(field), options, Follower(11))
     train(RECIPE, files(tmp_path / "cut"), Data(field), options, Follower())
     whole, cut = (weights(tmp_path / name / "last.safetensors") for name in ("whole", "cut"))

@@ -13,8 +13,8 @@ from spn_model.evaluation.evaluate import EvaluateOptions, compare
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import load
 from spn_model.training.recipe import ALL, Recipe, Stage, read_recipe
-from spn_model.training.train import Data, Stopped, train
-from tests.worlds.training_world import ONE_THREAD, Follower, TinyMember, files, log
+from spn_model.training.train import Data, TrainingStopped, train
+from tests.worlds.training_world import ONE_THREAD, Follower, TinyModel, files, log
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
@@ -30,7 +30,7 @@ RECIPE = Recipe(
 def rows_seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, set[int]]]:
     """Sizes of training sets, with the rows that batches take of them."""
     seen: list[tuple[int, set[int]]] = []
-    made = TinyMember.batch
+    made = TinyModel.batch
 
     def batch(self, data, rows, generator, progress):
         if not seen or seen[-1][0] != len(data):
@@ -38,7 +38,7 @@ def rows_seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, set[int]]]:
         seen[-1][1].update(rows.tolist())
         return made(self, data, rows, generator, progress)
 
-    monkeypatch.setattr(TinyMember, "batch", batch)
+    monkeypatch.setattr(TinyModel, "batch", batch)
     return seen
 
 
@@ -63,7 +63,7 @@ def test_the_last_stage_learns_what_was_held_out(field, tmp_path, rows_seen):
 @pytest.mark.parametrize("steps", [4, 9, 15])
 def test_validation_frames_judge_until_they_are_learnt(field, tmp_path, steps):
     """Stopped in either stage or not: their errors are told as they were before, and the end is kept."""
-    with pytest.raises(Stopped):
+    with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(steps))
     facts = train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
     rows = log(tmp_path)

@@ -9,7 +9,7 @@ import torch
 
 from spn_model.training.muon import Muon, orthogonalized
 from spn_model.training.recipe import Recipe, Stage
-from spn_model.training.train import Data, Stopped, train
+from spn_model.training.train import Data, TrainingStopped, train
 from tests.worlds.training_world import ONE_THREAD, Follower, files, weights
 
 RECIPE = Recipe(
@@ -92,7 +92,7 @@ def test_a_training_goes_on_with_its_momentum(field, tmp_path):
     """It learns; stopped after 40 of 100 steps it ends bit for bit where it would have."""
     follower = Follower()
     train(RECIPE, files(tmp_path / "whole"), Data(field), ONE_THREAD, follower)
-    with pytest.raises(Stopped):
+    with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path / "again"), Data(field), ONE_THREAD, Follower(40))
     train(RECIPE, files(tmp_path / "again"), Data(field), ONE_THREAD, Follower())
     whole, again = (weights(tmp_path / of / "last.safetensors") for of in ("whole", "again"))

@@ -22,15 +22,15 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
 from spn_model.evaluation.validation import judge, spread_rows
+from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.checkpoint import load
-from spn_model.models.member import PoseEstimates
-from spn_model.onboard.view import View
+from spn_model.models.pose_model import PoseEstimates
 from spn_model.training.batches import generator_of_step, rows_of_step, torch_seed_of_step
 from spn_model.training.covariance_scale import measured_scale
 from spn_model.training.recipe import Recipe, Stage
-from spn_model.training.train import Data, Stopped, train
+from spn_model.training.train import Data, TrainingStopped, train
 from spn_model.training.training_loss import Diverged, Losses
 from spn_model.training.training_record import Record, judged_frames
 from spn_model.training.training_state import COLUMNS, Log, Position, read_state
@@ -38,7 +38,7 @@ from tests.worlds.training_world import (
     INFO,
     ONE_THREAD,
     Follower,
-    TinyMember,
+    TinyModel,
     files,
     frame,
     log,
@@ -80,7 +80,7 @@ def test_a_training_learns_where_the_camera_is(field, tmp_path):
     assert found.facts["kept"] == facts["kept"]
     with Dataset(field) as dataset:
         group = dataset.groups["validation"]
-        errors, _ = judge(found.member, group, np.arange(len(group)))
+        errors, _ = judge(found.model, group, np.arange(len(group)))
     assert errors.median_m == pytest.approx(facts["kept"]["validation"]["median_m"], rel=1e-5)
 
 
@@ -99,7 +99,7 @@ def test_two_trainings_of_one_seed_are_the_same(field, unbroken, tmp_path):
 @pytest.mark.parametrize("steps", [1, 7, 12, 30])
 def test_a_stopped_training_goes_on_to_the_same_end(field, unbroken, tmp_path, steps):
     """Stopped within, at the end of, and after the first stage: weights and errors are those of one piece."""
-    with pytest.raises(Stopped):
+    with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(steps))
     state = read_state(tmp_path / "state.safetensors")
     assert state is not None
@@ -211,7 +211,7 @@ def test_two_processes_make_the_network_of_one_with_batches_twice_as_large(field
     two, one = (load(tmp_path / name / "last.safetensors") for name in ("two", "one"))
     assert two.facts["images_shown"] == one.facts["images_shown"] == 240
     assert two.facts["processes"] == 2
-    state, other = two.member.network.state_dict(), one.member.network.state_dict()
+    state, other = two.model.network.state_dict(), one.model.network.state_dict()
     for name in state:
         if name != "variance":  # of a few validation frames: a ratio of small errors
             assert torch.allclose(state[name], other[name], rtol=1e-4, atol=1e-5), name
@@ -241,13 +241,13 @@ def test_a_budget_in_minutes_ends_a_training(field, tmp_path):
 
 def test_judging_does_not_count_as_training(field, tmp_path, monkeypatch):
     """However long it takes; both are told, each for itself."""
-    quick = TinyMember.estimate
+    quick = TinyModel.estimate
 
-    def slow(self: TinyMember, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+    def slow(self: TinyModel, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
         time.sleep(0.1)
         return quick(self, images, intrinsics)
 
-    monkeypatch.setattr(TinyMember, "estimate", slow)
+    monkeypatch.setattr(TinyModel, "estimate", slow)
     recipe = replace(RECIPE, stages=RECIPE.stages[1:])
     often = replace(ONE_THREAD, validations=8)
     facts = train(recipe, files(tmp_path), Data(field), often, Follower())
@@ -257,24 +257,24 @@ def test_judging_does_not_count_as_training(field, tmp_path, monkeypatch):
 
 def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
     """A network that has become much worse replaces nothing; one that is 2 % worse does."""
-    member = TinyMember.make({"dropout": 0.0}, 5)
+    model = TinyModel.make({"dropout": 0.0}, 5)
     with Dataset(field) as dataset:
         training = dataset.groups["train"]
-        member.fit(TrainingSet(training))
+        model.fit(TrainingSet(training))
         judged = judged_frames(dataset, training, 64, 4)
         record = Record(
-            *(files(tmp_path), Follower(), member, View.of(dataset), judged, Position(), {})
+            *(files(tmp_path), Follower(), model, view_of(dataset), judged, Position(), {})
         )
         with closing(record):
             kept = []
             for shift_m in (0.0, 30.0, 0.2):
                 with torch.no_grad():
-                    before = member.network.center.clone()
-                    member.network.center += shift_m
+                    before = model.network.center.clone()
+                    model.network.center += shift_m
                 record.position.steps += 1
                 record.validate("all", 0.5)
                 kept.append(load(tmp_path / "checkpoint.safetensors").facts["steps"])
-                member.network.center.copy_(before)
+                model.network.center.copy_(before)
     medians = [row["median_m"] for row in record.watch.rows if row["event"] == "validation"]
     assert medians[1] > 1.5 * medians[0]
     assert medians[0] < medians[2] < 1.05 * medians[0]
@@ -285,21 +285,21 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
     """Where a stage renders views, they fit these, not the validation frames; each stage has its own."""
     stages = []
 
-    def views(self: TinyMember, data: TrainingSet, count: int) -> UnseenViews:
+    def views(self: TinyModel, data: TrainingSet, count: int) -> UnseenViews:
         stages.append(len(data))
         shown = 12
         poses = data.poses[:shown]
         moved = Poses(poses.centers + 30.0, poses.quats_wxyz)
         return UnseenViews(moved, data.intrinsics[:shown], [data.image(k) for k in range(shown)], 1)
 
-    monkeypatch.setattr(TinyMember, "unseen_views", views)
+    monkeypatch.setattr(TinyModel, "unseen_views", views)
     field = write_field(tmp_path / "dataset.h5", validation=12)
     facts = train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
     judged = [row["stage"] for row in log(tmp_path) if row["event"] == "views"]
     assert judged == ["head", "all", "all", "all"]
     assert len(stages) == 2
     assert facts["latest"]["views"]["frames"] == 12
-    last = load(tmp_path / "last.safetensors").member
+    last = load(tmp_path / "last.safetensors").model
     with Dataset(field) as dataset:
         shown = views(last, TrainingSet(dataset.groups["train"]), 64)
         assert measured_scale(judge(last, shown, np.arange(12))[1], shown.poses) == pytest.approx(1)
@@ -384,8 +384,8 @@ def test_another_training_set_is_refused(tmp_path):
 def test_a_kind_of_network_hears_how_long_a_stage_is(field, tmp_path, monkeypatch):
     """The images that each stage draws."""
     heard = []
-    begin = TinyMember.begin_stage
-    monkeypatch.setattr(TinyMember, "begin_stage", lambda *of: (heard.append(of[3]), begin(*of)))
+    begin = TinyModel.begin_stage
+    monkeypatch.setattr(TinyModel, "begin_stage", lambda *of: (heard.append(of[3]), begin(*of)))
     train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
     assert heard == [60, 240]
 
@@ -411,7 +411,7 @@ def test_a_frozen_layer_stays_and_others_move(field, tmp_path):
     """After a stage that freezes the first convolution it is as drawn."""
     recipe = replace(RECIPE, stages=RECIPE.stages[:1])
     train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())
-    new = TinyMember.make({}, 5).network.state_dict()
+    new = TinyModel.make({}, 5).network.state_dict()
     trained = weights(tmp_path / "last.safetensors")
     assert torch.equal(new["convolution.weight"], trained["convolution.weight"])
     assert not torch.equal(new["out.weight"], trained["out.weight"])
@@ -419,7 +419,7 @@ def test_a_frozen_layer_stays_and_others_move(field, tmp_path):
 
 def test_a_state_of_another_training_is_refused(field, tmp_path):
     """A state of another network, and a damaged one, give one line."""
-    with pytest.raises(Stopped):
+    with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(3))
     wider = replace(RECIPE, options={"width": 9})
     with pytest.raises(FormatError, match="is of another network"):

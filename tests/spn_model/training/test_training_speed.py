@@ -31,11 +31,11 @@ def test_every_loop_takes_the_same_steps(benchmark, tmp_path, monkeypatch):
     seen: list[torch.Tensor] = []
     loss = benchmark.make("tiny", {}).__class__.loss
 
-    def watched(member, batch):
+    def watched(model, batch):
         seen.append(batch["images"].clone())
-        return loss(member, batch)
+        return loss(model, batch)
 
-    monkeypatch.setattr("tests.worlds.training_world.TinyMember.loss", watched)
+    monkeypatch.setattr("tests.worlds.training_world.TinyModel.loss", watched)
     machine = choose("cpu", 1, "float32", makes_batches=True)
     with prepared(machine):
         found = benchmark.measure(tmp_path, str(recipe), machine, 4, 1)

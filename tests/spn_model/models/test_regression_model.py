@@ -17,7 +17,7 @@ from spn_model.evaluation.calibration import calibrate
 from spn_model.evaluation.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.registry import make
-from spn_model.models.regression import RegressionMember
+from spn_model.models.regression import RegressionModel
 from spn_model.models.regression_examples import example
 from spn_model.networks.normalization import InsertedBatchNorm
 from spn_model.networks.pose_loss import beta_weighted, residuals
@@ -51,41 +51,41 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> TrainingSet:
 
 def made(
     network: str = "squeezeposenet", width: int = NARROW, **options: object
-) -> RegressionMember:
+) -> RegressionModel:
     """With published weights where they come with the package, else weights drawn by the seed."""
     values = {"network": network, "width": width, "network_options": options}
-    member = make("regression", values, seed=0)
-    assert isinstance(member, RegressionMember)
+    model = make("regression", values, seed=0)
+    assert isinstance(model, RegressionModel)
     if network == "squeezeposenet":
-        member.load_pretrained(member.weights_name)
-    return member
+        model.load_pretrained(model.weights_name)
+    return model
 
 
-def begun(data: TrainingSet, stage: dict[str, object], **options: object) -> RegressionMember:
-    member = made(**options)
-    member.fit(data)
-    member.begin_stage(stage, data)
-    return member
+def begun(data: TrainingSet, stage: dict[str, object], **options: object) -> RegressionModel:
+    model = made(**options)
+    model.fit(data)
+    model.begin_stage(stage, data)
+    return model
 
 
-def train(member: RegressionMember, data: TrainingSet, steps: int, rate: float) -> list[float]:
+def train(model: RegressionModel, data: TrainingSet, steps: int, rate: float) -> list[float]:
     """Steps on all images at once; the rate rises for 20 steps, and falls along a cosine. The losses."""
-    groups = [{**group, "lr": rate * group["rate"]} for group in member.parameter_groups()]
+    groups = [{**group, "lr": rate * group["rate"]} for group in model.parameter_groups()]
     optimizer = torch.optim.AdamW(groups, weight_decay=0, fused=True)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda k: min(1, (k + 1) / 20) * (1 + np.cos(np.pi * k / steps)) / 2
     )
     generator, rows = np.random.default_rng(0), np.arange(len(data))
-    member.network.train()
+    model.network.train()
     losses = []
     for step in range(steps):
-        loss, _ = member.loss(member.batch(data, rows, generator, step / steps))
+        loss, _ = model.loss(model.batch(data, rows, generator, step / steps))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
         losses.append(loss.item())
-    member.network.eval()
+    model.network.eval()
     return losses
 
 
@@ -93,31 +93,31 @@ def all_images(data: TrainingSet) -> np.ndarray:
     return np.stack([data.image(row) for row in range(len(data))])
 
 
-def worst(member: RegressionMember, data: TrainingSet) -> tuple[float, float]:
+def worst(model: RegressionModel, data: TrainingSet) -> tuple[float, float]:
     """Largest errors on the training images, in metres and degrees."""
-    found = member.estimate(all_images(data), data.intrinsics)
+    found = model.estimate(all_images(data), data.intrinsics)
     error_m, error_deg = pose_errors(found.poses, data.poses)
     return float(error_m.max()), float(error_deg.max())
 
 
-def trunk_state(member: RegressionMember) -> dict[str, torch.Tensor]:
-    state = member.network.regressor.features.state_dict()
+def trunk_state(model: RegressionModel) -> dict[str, torch.Tensor]:
+    state = model.network.regressor.features.state_dict()
     return {name: tensor.clone() for name, tensor in state.items()}
 
 
-def changed(member: RegressionMember, before: dict[str, torch.Tensor]) -> set[str]:
-    now = trunk_state(member)
+def changed(model: RegressionModel, before: dict[str, torch.Tensor]) -> set[str]:
+    now = trunk_state(model)
     return {name for name, tensor in before.items() if not torch.equal(tensor, now[name])}
 
 
 def test_it_learns_sixteen_images(data):
     """Augmentation and dropout off, learned weights: every one of 16 images to 0.1 m and 1 degree."""
-    member = begun(data, LEARNED)
-    start_m, start_deg = worst(member, data)
+    model = begun(data, LEARNED)
+    start_m, start_deg = worst(model, data)
     assert start_m > 4
     assert start_deg > 15
-    train(member, data, 140, 5e-4)
-    error_m, error_deg = worst(member, data)
+    train(model, data, 140, 5e-4)
+    error_m, error_deg = worst(model, data)
     assert error_m < 0.1
     assert error_deg < 1
 
@@ -129,9 +129,9 @@ def test_it_learns_sixteen_images(data):
 )
 def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
     """The paper's loss with its beta, and the reprojection error alone."""
-    member = begun(data, {**STILL, **stage})
-    train(member, data, steps, rate)
-    error_m, error_deg = worst(member, data)
+    model = begun(data, {**STILL, **stage})
+    train(model, data, steps, rate)
+    error_m, error_deg = worst(model, data)
     assert error_m < 0.1
     assert error_deg < 1
 
@@ -146,12 +146,12 @@ def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
 )
 def test_large_networks_learn_four_images(four, network, stages):
     """From weights drawn at random: every one of 4 images to 0.5 m and 3 degrees."""
-    member = made(network, width=64)
-    member.fit(four)
+    model = made(network, width=64)
+    model.fit(four)
     for stage, steps, rate in stages:
-        member.begin_stage(stage, four)
-        train(member, four, steps, rate)
-    error_m, error_deg = worst(member, four)
+        model.begin_stage(stage, four)
+        train(model, four, steps, rate)
+    error_m, error_deg = worst(model, four)
     assert error_m < 0.5
     assert error_deg < 3
 
@@ -170,16 +170,16 @@ def test_it_starts_at_the_mean_pose(data):
 
 def test_fitting_keeps_the_pretrained_features(data):
     """Features are the same before and after the normalisations are measured: they start as the identity."""
-    member = made()
-    images = member.normalised(torch.from_numpy(all_images(data)[:, ::2, ::2].copy()))
+    model = made()
+    images = model.normalised(torch.from_numpy(all_images(data)[:, ::2, ::2].copy()))
     with torch.no_grad():
-        layers = [m for m in member.network.modules() if isinstance(m, InsertedBatchNorm)]
+        layers = [m for m in model.network.modules() if isinstance(m, InsertedBatchNorm)]
         hooks = [layer.register_forward_hook(lambda layer, x, y: x[0]) for layer in layers]
-        without = member.network.regressor.trunk(images)[0]
+        without = model.network.regressor.trunk(images)[0]
         for hook in hooks:
             hook.remove()
-        member.fit(data)
-        after = member.network.regressor.trunk(images)[0]
+        model.fit(data)
+        after = model.network.regressor.trunk(images)[0]
     assert len(layers) == 25
     assert torch.allclose(without, after, rtol=1e-4, atol=1e-4)
     # A fresh normalisation in eval mode would be the identity too, but not what its statistics call for.
@@ -190,11 +190,11 @@ def test_fitting_keeps_the_pretrained_features(data):
 
 def test_another_data_set_moves_the_targets_alone(data, four):
     """A network that was fitted before keeps its normalisations and heads, and aims about the new centre."""
-    member = begun(data, LEARNED)
-    train(member, data, 2, 1e-3)
-    state = {k: v.clone() for k, v in member.network.state_dict().items()}
-    member.fit(four)
-    now = member.network.state_dict()
+    model = begun(data, LEARNED)
+    train(model, data, 2, 1e-3)
+    state = {k: v.clone() for k, v in model.network.state_dict().items()}
+    model.fit(four)
+    now = model.network.state_dict()
     moved = {name for name, tensor in state.items() if not torch.equal(tensor, now[name])}
     assert moved == {"targets.center", "targets.scale", "targets.hemisphere"}
 
@@ -203,22 +203,22 @@ def test_another_data_set_moves_the_targets_alone(data, four):
 def test_a_frozen_trunk_stays_as_it_is(data, batch_statistics):
     """Not a weight and not a statistic of it moves, while the added layers learn."""
     stage = {**STILL, "freeze_trunk": True, "batch_statistics": batch_statistics}
-    member = begun(data, stage)
-    before = trunk_state(member)
-    head = member.network.regressor.x.weight.clone()
-    losses = train(member, data, 10, 1e-4)
-    assert changed(member, before) == set()
-    assert not torch.equal(head, member.network.regressor.x.weight)
+    model = begun(data, stage)
+    before = trunk_state(model)
+    head = model.network.regressor.x.weight.clone()
+    losses = train(model, data, 10, 1e-4)
+    assert changed(model, before) == set()
+    assert not torch.equal(head, model.network.regressor.x.weight)
     assert losses[-1] < losses[0]
 
 
 @pytest.mark.parametrize("batch_statistics", [False, True])
 def test_stored_statistics_move_only_where_that_is_chosen(data, batch_statistics):
     """Training all layers changes every weight; running statistics only with batch_statistics."""
-    member = begun(data, {**STILL, "batch_statistics": batch_statistics})
-    before = trunk_state(member)
-    train(member, data, 2, 1e-2)
-    moved = changed(member, before)
+    model = begun(data, {**STILL, "batch_statistics": batch_statistics})
+    before = trunk_state(model)
+    train(model, data, 2, 1e-2)
+    moved = changed(model, before)
     assert {name for name in before if name.endswith(("weight", "bias"))} <= moved
     assert any("running" in name for name in moved) == batch_statistics
 
@@ -226,21 +226,21 @@ def test_stored_statistics_move_only_where_that_is_chosen(data, batch_statistics
 def test_dropout_can_be_off(data):
     """Off, the same batch has the same loss; on, it has not."""
     for dropout in (False, True):
-        member = begun(data, {"augmentation": False, "dropout": dropout})
-        nn.init.normal_(member.network.regressor.x.weight)
-        member.network.train()
-        batch = member.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
-        first, second = (member.loss(batch)[0].item() for _ in range(2))
+        model = begun(data, {"augmentation": False, "dropout": dropout})
+        nn.init.normal_(model.network.regressor.x.weight)
+        model.network.train()
+        batch = model.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
+        first, second = (model.loss(batch)[0].item() for _ in range(2))
         assert (first == second) == (not dropout)
 
 
 @pytest.mark.parametrize("width", [0, 160])
 def test_a_turned_camera_sees_what_its_label_says(data, width):
     """Rendered at its pose, an example looks as it does, wherever the real camera saw the place."""
-    member = begun(data, {"look": False, "tilt_deg": 15.0, "roll_deg": 20.0}, width=width)
+    model = begun(data, {"look": False, "tilt_deg": 15.0, "roll_deg": 20.0}, width=width)
     rows = np.array([2, 7])
-    batch = member.batch(data, rows, np.random.default_rng(1), 0.5)
-    poses = member.network.targets.decode(batch["x"].numpy(), batch["q"].numpy())
+    batch = model.batch(data, rows, np.random.default_rng(1), 0.5)
+    poses = model.network.targets.decode(batch["x"].numpy(), batch["q"].numpy())
     assert pose_errors(poses, data.poses[rows])[1].min() > 5
     assert poses.centers == pytest.approx(data.poses.centers[rows], abs=1e-5)
     for k in range(2):
@@ -257,10 +257,10 @@ def test_a_turned_camera_sees_what_its_label_says(data, width):
 
 def test_a_batch_is_a_function_of_its_arguments(data):
     """The same draws give the same batch, others another; the reprojection error is 0 at the true poses."""
-    member = begun(data, {"loss": "reprojection", "points": 50})
+    model = begun(data, {"loss": "reprojection", "points": 50})
     rows = np.array([3, 3, 8])
     one, same, other = (
-        member.batch(data, rows, np.random.default_rng(seed), 0.0) for seed in (5, 5, 6)
+        model.batch(data, rows, np.random.default_rng(seed), 0.0) for seed in (5, 5, 6)
     )
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["images"], other["images"])
@@ -269,10 +269,10 @@ def test_a_batch_is_a_function_of_its_arguments(data):
     assert one["points"].shape == (3, 50, 3)
     assert one["seen"].sum(dim=1).min() > 20
     # Every point lies inside the turned image, by the data set's own K.
-    poses = member.network.targets.decode(one["x"].numpy(), one["q"].numpy())
+    poses = model.network.targets.decode(one["x"].numpy(), one["q"].numpy())
     for k in range(3):
         xyz = (
-            one["points"][k].numpy()[one["seen"][k].numpy()] + member.network.targets.center.numpy()
+            one["points"][k].numpy()[one["seen"][k].numpy()] + model.network.targets.center.numpy()
         )
         pixels = CAMERA.project((xyz - poses.centers[k]) @ poses.rotations[k].T)
         assert ((pixels > -0.01) & (pixels < [320.01, 180.01])).all()
@@ -281,21 +281,21 @@ def test_a_batch_is_a_function_of_its_arguments(data):
 @pytest.mark.parametrize("network", ["squeezeposenet", "posenet"])
 def test_stored_features_are_those_of_their_images(data, network):
     """Features of the cache are what the trunk makes of the variant, with its own label."""
-    member = begun(data, CACHED, network=network)
+    model = begun(data, CACHED, network=network)
     rows = np.array([4, 0, 11])
-    batch = member.batch(data, rows, np.random.default_rng(0), 0.0)
+    batch = model.batch(data, rows, np.random.default_rng(0), 0.0)
     varied = [
-        example(data, int(row), NARROW, member._stage, np.random.default_rng((int(row), 0)))
+        example(data, int(row), NARROW, model._stage, np.random.default_rng((int(row), 0)))
         for row in rows
     ]
-    member.network.train()
+    model.network.train()
     with torch.no_grad():
         images = torch.from_numpy(np.stack([image for image, _ in varied]))
-        features = member.network.regressor.trunk(member.normalised(images))
+        features = model.network.regressor.trunk(model.normalised(images))
     assert len(features) == (3 if network == "posenet" else 1)
     for k, part in enumerate(features):
         assert torch.allclose(batch[f"features{k}"], part, rtol=1e-3, atol=1e-3)
-    x, q = member.network.targets.encode(Poses.concatenate(pose for _, pose in varied))
+    x, q = model.network.targets.encode(Poses.concatenate(pose for _, pose in varied))
     assert (batch["x"].numpy() == x).all()
     assert (batch["q"].numpy() == q).all()
     assert "images" not in batch
@@ -303,8 +303,8 @@ def test_stored_features_are_those_of_their_images(data, network):
 
 def test_variants_of_stored_features_differ(data):
     """With 3 variants of each image, draws of one row find 3 different labels, each with its features."""
-    member = begun(data, {**CACHED, "cached_features": 3})
-    batch = member.batch(data, np.full(40, 5), np.random.default_rng(0), 0.0)
+    model = begun(data, {**CACHED, "cached_features": 3})
+    batch = model.batch(data, np.full(40, 5), np.random.default_rng(0), 0.0)
     labels = {tuple(q) for q in batch["q"].tolist()}
     both = {(*q, *f) for q, f in zip(batch["q"].tolist(), batch["features0"].tolist(), strict=True)}
     assert len(labels) == len(both) == 3
@@ -312,14 +312,14 @@ def test_variants_of_stored_features_differ(data):
 
 def test_positions_count_in_metres(data):
     """The paper's loss of a batch is that of the estimates in metres, however large the inner unit is."""
-    member = begun(data, STILL)
+    model = begun(data, STILL)
     with torch.no_grad():
-        member.network.regressor.x.bias.copy_(torch.tensor([0.5, -1.0, 0.25]))
-    batch = member.batch(data, np.arange(16), np.random.default_rng(0), 0.0)
-    loss, figures = member.loss(batch)
-    found = member.estimate(all_images(data), data.intrinsics)
+        model.network.regressor.x.bias.copy_(torch.tensor([0.5, -1.0, 0.25]))
+    batch = model.batch(data, np.arange(16), np.random.default_rng(0), 0.0)
+    loss, figures = model.loss(batch)
+    found = model.estimate(all_images(data), data.intrinsics)
     apart = np.linalg.norm(found.poses.centers - data.poses.centers, axis=1)
-    q = member.network.regressor.q.bias.detach()
+    q = model.network.regressor.q.bias.detach()
     expected = apart.mean() + 500 * np.linalg.norm(batch["q"].numpy() - q.numpy(), axis=1).mean()
     assert (loss - figures["likelihood"]).item() == pytest.approx(expected, rel=1e-5)
     assert apart.min() > 1
@@ -327,16 +327,16 @@ def test_positions_count_in_metres(data):
 
 def test_stating_uncertainty_changes_no_pose(data):
     """Gradients of all layers but `uncertainty` are those of the paper's loss alone."""
-    member = begun(data, STILL)
-    network = member.network
+    model = begun(data, STILL)
+    network = model.network
     nn.init.normal_(network.regressor.x.weight, std=0.01)
     nn.init.normal_(network.uncertainty.weight, std=0.01)
-    batch = member.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
-    member.loss(batch)[0].backward()
+    batch = model.batch(data, np.arange(4), np.random.default_rng(0), 0.0)
+    model.loss(batch)[0].backward()
     assert network.uncertainty.weight.grad.abs().max() > 0
     found = {n: p.grad.clone() for n, p in network.regressor.named_parameters()}
     network.zero_grad()
-    x, q = network.outputs(network.regressor.trunk(member.normalised(batch["images"]))).estimates[0]
+    x, q = network.outputs(network.regressor.trunk(model.normalised(batch["images"]))).estimates[0]
     beta_weighted(x, q, batch["x"], batch["q"], 500.0).mean().backward()
     for name, parameter in network.regressor.named_parameters():
         assert torch.allclose(found[name], parameter.grad, rtol=1e-4, atol=1e-5), name
@@ -344,13 +344,13 @@ def test_stating_uncertainty_changes_no_pose(data):
 
 def test_stated_covariances_become_those_of_the_errors(data):
     """Poses held, `uncertainty` alone learns: squared distances of the errors become those they should be."""
-    member = begun(data, {**CACHED, "cached_features": 4})
-    for group in member.parameter_groups():
+    model = begun(data, {**CACHED, "cached_features": 4})
+    for group in model.parameter_groups():
         if group["name"] != "uncertainty":
             for parameter in group["params"]:
                 parameter.requires_grad_(False)
-    train(member, data, 150, 2e-2)
-    found = member.estimate(all_images(data), data.intrinsics)
+    train(model, data, 150, 2e-2)
+    found = model.estimate(all_images(data), data.intrinsics)
     errors = residuals(
         *(
             torch.from_numpy(a)
@@ -360,21 +360,21 @@ def test_stated_covariances_become_those_of_the_errors(data):
     ).numpy()
     ratio = calibrate(errors, found.covariance).ratio
     assert 0.2 < ratio < 3
-    member.set_covariance_scale(4.0)
-    member.set_covariance_scale(0.5)
-    again = member.estimate(all_images(data), data.intrinsics)
+    model.set_covariance_scale(4.0)
+    model.set_covariance_scale(0.5)
+    again = model.estimate(all_images(data), data.intrinsics)
     assert again.covariance == pytest.approx(2 * found.covariance, rel=1e-4)
     assert (again.poses.centers == found.poses.centers).all()
 
 
 def test_its_state_is_the_whole_member(data):
     """Made anew from its options and given its state, it estimates the same, one image or many at a time."""
-    member = begun(data, LEARNED)
-    train(member, data, 3, 1e-3)
-    member.set_covariance_scale(3.0)
-    anew = make("regression", member.options, seed=9)
-    anew.network.load_state_dict(member.network.state_dict())
-    found = member.estimate(all_images(data), data.intrinsics)
+    model = begun(data, LEARNED)
+    train(model, data, 3, 1e-3)
+    model.set_covariance_scale(3.0)
+    anew = make("regression", model.options, seed=9)
+    anew.network.load_state_dict(model.network.state_dict())
+    found = model.estimate(all_images(data), data.intrinsics)
     for row in (0, 9):
         one = anew.estimate(data.image(row)[None], data.intrinsics[row : row + 1])
         assert one.poses.centers[0] == pytest.approx(found.poses.centers[row], abs=1e-4)
@@ -386,10 +386,10 @@ def test_its_state_is_the_whole_member(data):
 
 def test_an_answer_that_is_no_pose_is_said_to_be_none(data):
     """NaN and a reason, not a pose."""
-    member = begun(data, STILL)
+    model = begun(data, STILL)
     with torch.no_grad():
-        member.network.regressor.x.bias[1] = torch.nan
-    found = member.estimate(all_images(data)[:2], data.intrinsics[:2])
+        model.network.regressor.x.bias[1] = torch.nan
+    found = model.estimate(all_images(data)[:2], data.intrinsics[:2])
     assert np.isnan(found.poses.centers).all()
     assert np.isnan(found.covariance).all()
     assert found.reasons.tolist() == ["the network's answer is no pose"] * 2
@@ -397,16 +397,16 @@ def test_an_answer_that_is_no_pose_is_said_to_be_none(data):
 
 def test_dropout_tells_a_covariance_too(data):
     """Kendall and Cipolla's sampling gives a full covariance, and a mean near the estimate."""
-    member = begun(data, LEARNED)
-    train(member, data, 20, 1e-3)
+    model = begun(data, LEARNED)
+    train(model, data, 20, 1e-3)
     images, matrices = all_images(data)[:2], data.intrinsics[:2]
-    plain = member.estimate(images, matrices)
-    sampled = dropout_estimates(member, images, matrices, 12)
+    plain = model.estimate(images, matrices)
+    sampled = dropout_estimates(model, images, matrices, 12)
     assert (np.linalg.eigvalsh(sampled.covariance) > 0).all()
     spread = np.sqrt(np.einsum("nii->n", sampled.covariance[:, :3, :3]))
     apart = pose_errors(sampled.poses, plain.poses)[0]
     assert (apart < 2 * spread).all()
-    assert not any(module.training for module in member.network.modules())
+    assert not any(module.training for module in model.network.modules())
 
 
 @pytest.mark.parametrize(
@@ -424,10 +424,10 @@ def test_dropout_tells_a_covariance_too(data):
 )
 def test_wrong_stages_are_refused(data, stage, said):
     """Names, values and combinations of a recipe's stage that cannot be, with what is wrong."""
-    member = made("posenet", width=64)
-    member.fit(data)
+    model = made("posenet", width=64)
+    model.fit(data)
     with pytest.raises(InputError, match=said):
-        member.begin_stage(stage, data)
+        model.begin_stage(stage, data)
 
 
 @pytest.mark.parametrize(
@@ -451,14 +451,14 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, data):
     with Dataset(write_box(tmp_path / "dataset.h5", train=2, points=0)) as dataset:
         bare = TrainingSet(dataset.groups["train"])
     bare.has_points = False
-    member = made()
-    member.fit(bare)
+    model = made()
+    model.fit(bare)
     with pytest.raises(InputError, match="needs map points"):
-        member.begin_stage({"loss": "reprojection"}, bare)
+        model.begin_stage({"loss": "reprojection"}, bare)
     bare.intrinsics = np.full((2, 3, 3), np.nan)
     with pytest.raises(InputError, match="set tilt_deg and roll_deg to 0"):
-        member.begin_stage({}, bare)
-    member.begin_stage({"tilt_deg": 0, "roll_deg": 0}, bare)
+        model.begin_stage({}, bare)
+    model.begin_stage({"tilt_deg": 0, "roll_deg": 0}, bare)
     with pytest.raises(
         InputError, match="images of 30 x 17 are too small: squeezeposenet needs 21"
     ):
@@ -468,7 +468,7 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, data):
 def test_input_is_sized_alike_in_training_and_estimates(data):
     """A width gives images in proportion, smaller or larger; 0 leaves them as they are."""
     for width, size in ((60, (34, 60)), (0, (180, 320)), (400, (225, 400))):
-        member = made(width=width)
-        member.begin_stage(STILL, data)
-        batch = member.batch(data, np.array([1]), np.random.default_rng(0), 0.0)
+        model = made(width=width)
+        model.begin_stage(STILL, data)
+        batch = model.batch(data, np.array([1]), np.random.default_rng(0), 0.0)
         assert batch["images"].shape[1:3] == size

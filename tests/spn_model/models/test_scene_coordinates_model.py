@@ -15,9 +15,9 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.member import PoseEstimates
-from spn_model.models.scene_coordinates import SceneCoordinatesMember
-from spn_model.models.scene_examples import StageOptions
+from spn_model.models.pose_model import PoseEstimates
+from spn_model.models.scene_coordinates import SceneCoordinatesModel
+from spn_model.models.scene_examples import SceneStageOptions
 from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX
 from spn_model.onboard.decoding import decode
 from spn_model.training.covariance_scale import measured_scale
@@ -54,12 +54,12 @@ def data(hall: Path) -> TrainingSet:
 
 def fitted(
     data: TrainingSet, stage: dict[str, object], *, shrink: int = 1
-) -> SceneCoordinatesMember:
-    member = SceneCoordinatesMember.make({"shrink": shrink}, seed=0)
-    member.load_pretrained(member.weights_name)
-    member.fit(data)
-    member.begin_stage(stage, data)
-    return member
+) -> SceneCoordinatesModel:
+    model = SceneCoordinatesModel.make({"shrink": shrink}, seed=0)
+    model.load_pretrained(model.weights_name)
+    model.fit(data)
+    model.begin_stage(stage, data)
+    return model
 
 
 def test_a_batch_depends_on_its_arguments_alone(data):
@@ -116,14 +116,14 @@ def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
     the image's edges, where the training image ends, is left out of the comparison.
     """
     zoom = 0.8
-    member = fitted(
+    model = fitted(
         data,
         {"zoom_min": zoom, "zoom_max": zoom, "ramp_share": 0, "look": False} | stage,
         shrink=shrink,
     )
     zoom /= shrink
     rows = np.arange(6)
-    batch = member.batch(data, rows, np.random.default_rng(0), 0.5)
+    batch = model.batch(data, rows, np.random.default_rng(0), 0.5)
     height, width = batch["images"].shape[1:3]
     lens = Camera("SIMPLE_PINHOLE", width, height, np.array([230.0 * zoom, width / 2, height / 2]))
     moved = []
@@ -154,33 +154,33 @@ def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
 
 def test_far_points_are_no_targets(data):
     """A point at the end of the world has no cell, one of the hall keeps its own."""
-    member = fitted(data, STILL)
-    everywhere = member.batch(data, np.arange(6), np.random.default_rng(0), 0.5)["known"]
-    member.network.spread.mul_(0.25)
-    member.begin_stage(STILL, data)
-    near = member.batch(data, np.arange(6), np.random.default_rng(0), 0.5)
+    model = fitted(data, STILL)
+    everywhere = model.batch(data, np.arange(6), np.random.default_rng(0), 0.5)["known"]
+    model.network.spread.mul_(0.25)
+    model.begin_stage(STILL, data)
+    near = model.batch(data, np.arange(6), np.random.default_rng(0), 0.5)
     assert 0 < near["known"].sum() < 0.9 * everywhere.sum()
-    off = (near["targets"] - member.network.center[:, None, None]).norm(dim=1)[near["known"]]
-    assert float(off.max()) < 4 * float(member.network.spread)
+    off = (near["targets"] - model.network.center[:, None, None]).norm(dim=1)[near["known"]]
+    assert float(off.max()) < 4 * float(model.network.spread)
 
 
 def test_a_batch_without_targets_teaches_nothing(data):
     """Its loss is 0 and so are all gradients, rather than not a number."""
-    member = fitted(data, STILL)
-    batch = member.batch(data, np.arange(2), np.random.default_rng(0), 0.5)
-    loss, figures = member.loss(batch | {"known": torch.zeros_like(batch["known"])})
+    model = fitted(data, STILL)
+    batch = model.batch(data, np.arange(2), np.random.default_rng(0), 0.5)
+    loss, figures = model.loss(batch | {"known": torch.zeros_like(batch["known"])})
     loss.backward()
     assert float(loss.detach()) == 0
     assert figures == {}
-    assert all(float(p.grad.abs().max()) == 0 for p in member.parameter_groups()[0]["params"])
+    assert all(float(p.grad.abs().max()) == 0 for p in model.parameter_groups()[0]["params"])
 
 
 def test_frozen_layers_are_in_no_group(data):
     """SqueezeNet's first layers stay as published, its others learn at their own rate."""
-    member = fitted(data, {"freeze_layers": 13})
-    assert [group["name"] for group in member.parameter_groups()] == ["added"]
-    member.begin_stage({"freeze_layers": 5, "features_rate": 0.1}, data)
-    groups = {group["name"]: group for group in member.parameter_groups()}
+    model = fitted(data, {"freeze_layers": 13})
+    assert [group["name"] for group in model.parameter_groups()] == ["added"]
+    model.begin_stage({"freeze_layers": 5, "features_rate": 0.1}, data)
+    groups = {group["name"]: group for group in model.parameter_groups()}
     assert groups["pretrained"]["rate"] == 0.1
     assert len(groups["pretrained"]["params"]) == 36
     assert len(groups["added"]["params"]) == 24
@@ -188,11 +188,11 @@ def test_frozen_layers_are_in_no_group(data):
 
 def test_published_weights_are_loaded(data):
     """Shipped features replace what the seed drew; the head stays as drawn, and differs by seed."""
-    member, other = (SceneCoordinatesMember.make({}, seed) for seed in (0, 1))
-    head, features = member.network.fine.weight.clone(), member.network.features[0].weight.clone()
-    member.load_pretrained("squeezenet1_1-features")
-    assert not torch.equal(member.network.features[0].weight, features)
-    assert torch.equal(member.network.fine.weight, head)
+    model, other = (SceneCoordinatesModel.make({}, seed) for seed in (0, 1))
+    head, features = model.network.fine.weight.clone(), model.network.features[0].weight.clone()
+    model.load_pretrained("squeezenet1_1-features")
+    assert not torch.equal(model.network.features[0].weight, features)
+    assert torch.equal(model.network.fine.weight, head)
     assert not torch.equal(other.network.fine.weight, head)
 
 
@@ -211,19 +211,19 @@ def test_published_weights_are_loaded(data):
 def test_stages_that_make_no_sense_are_refused(data, stage, message):
     """An option that is not known, of another type or out of bounds is told by name."""
     with pytest.raises(InputError, match=message):
-        SceneCoordinatesMember.make({}).begin_stage(stage, data)
+        SceneCoordinatesModel.make({}).begin_stage(stage, data)
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
     """Where each cell shows what the image shows at its stated pixel, the pose is exact."""
-    member = fitted(data, STILL, shrink=shrink)
+    model = fitted(data, STILL, shrink=shrink)
     images = torch.zeros(1, 3, 180, 320)
-    rows, columns = member.network(images)[1].shape[2:]
-    first, stride = member.network.first_cell_px, member.network.stride_px
+    rows, columns = model.network(images)[1].shape[2:]
+    first, stride = model.network.first_cell_px, model.network.stride_px
     # An image of its own pixels' places: cell 0 lies on pixel 7 of the reduced one, cell 1 on pixel 15.
     places = (torch.arange(320) + 0.5).expand(1, 3, 180, 320)
-    seen = member.network.reduced(places)[0, 0, 0]
+    seen = model.network.reduced(places)[0, 0, 0]
     assert [float(seen[7]), float(seen[15])] == [first, first + stride]
     # A camera of which each pixel is a cell.
     near = Camera(
@@ -233,7 +233,7 @@ def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
         np.array([230, 230, 160 - first + stride / 2, 90 - first + stride / 2]) / stride,
     )
     _, shown = seen_by(data.poses[:1], near)
-    found = member.decode(
+    found = model.decode(
         shown.transpose(2, 0, 1).astype(np.float32), np.full((rows, columns), -5.0), CAMERA.matrix
     )
     error_m, error_deg = pose_errors(found.poses, data.poses[:1])
@@ -243,9 +243,9 @@ def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
 
 def test_images_that_are_too_small_once_reduced_are_refused(data):
     """The message tells the size, and what to do."""
-    member = fitted(data, STILL, shrink=2)
+    model = fitted(data, STILL, shrink=2)
     with pytest.raises(InputError, match=r"100 x 180, reduced by 2, .* or shrink = 1"):
-        member.estimate(np.zeros((1, 180, 100, 3), np.uint8), CAMERA.matrix[None])
+        model.estimate(np.zeros((1, 180, 100, 3), np.uint8), CAMERA.matrix[None])
 
 
 def test_the_page_tells_all_options_and_their_defaults():
@@ -256,7 +256,7 @@ def test_the_page_tells_all_options_and_their_defaults():
         cells = [re.findall("`([^`]*)`", cell) for cell in line.split("|")]
         if len(cells) == 5 and cells[1]:
             told |= dict(zip(cells[1], cells[2], strict=True))
-    defaults = {f.name: f.default for f in fields(StageOptions)}
+    defaults = {f.name: f.default for f in fields(SceneStageOptions)}
     assert told.keys() == defaults.keys()
     for name, default in defaults.items():
         expected = str(default).lower() if isinstance(default, bool) else f"{default:g}"
@@ -265,12 +265,12 @@ def test_the_page_tells_all_options_and_their_defaults():
 
 def test_options_of_decoding_make_the_member():
     """What `options` gives makes the member anew; an unknown one is refused."""
-    member = SceneCoordinatesMember.make({"cells": 300, "shrink": 1})
-    assert SceneCoordinatesMember.make(member.options).network.shrink == 1
-    assert SceneCoordinatesMember.make(member.options).decoding == member.decoding
-    assert member.decoding.cells == 300
+    model = SceneCoordinatesModel.make({"cells": 300, "shrink": 1})
+    assert SceneCoordinatesModel.make(model.options).network.shrink == 1
+    assert SceneCoordinatesModel.make(model.options).decoding == model.decoding
+    assert model.decoding.cells == 300
     with pytest.raises(InputError, match="'cell' is not known"):
-        SceneCoordinatesMember.make({"cell": 300})
+        SceneCoordinatesModel.make({"cell": 300})
 
 
 def test_images_without_points_cannot_be_learnt_from(tmp_path):
@@ -278,15 +278,15 @@ def test_images_without_points_cannot_be_learnt_from(tmp_path):
     with Dataset(write_box(tmp_path / "few.h5", train=2, points=20)) as dataset:
         few = TrainingSet(dataset.groups["train"])
     with pytest.raises(InputError, match=r"see 40 map points.*train another network"):
-        SceneCoordinatesMember.make({}).fit(few)
+        SceneCoordinatesModel.make({}).fit(few)
 
 
 def test_an_image_of_nothing_has_no_pose(data):
     """Neither a grey image nor an unknown camera makes a pose: NaN, each with its reason."""
-    member = fitted(data, STILL)
+    model = fitted(data, STILL)
     grey = np.full((2, 180, 320, 3), 128, np.uint8)
     intrinsics = np.stack([CAMERA.matrix, np.full((3, 3), np.nan)])
-    found = member.estimate(grey, intrinsics)
+    found = model.estimate(grey, intrinsics)
     assert np.isnan(found.poses.centers).all()
     assert np.isnan(found.covariance).all()
     assert "0 cells are sure of what they show" in found.reasons[0]
@@ -319,16 +319,16 @@ def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
 
 def test_the_scale_of_covariances_is_part_of_the_state(data):
     """Setting it twice multiplies; covariances of decoded poses grow by it; a state carries it along."""
-    member = fitted(data, STILL)
+    model = fitted(data, STILL)
     _, shown = seen_by(data.poses[:1])
     coordinates = shown[7::8, 7::8].transpose(2, 0, 1).astype(np.float32)
     coordinates += np.random.default_rng(0).normal(0, 0.05, coordinates.shape).astype(np.float32)
     log_scale = np.full(coordinates.shape[1:], -3.0, np.float32)
-    before = member.decode(coordinates, log_scale, CAMERA.matrix)
-    member.set_covariance_scale(3.0)
-    member.set_covariance_scale(2.0)
-    other = SceneCoordinatesMember.make({"shrink": 1})
-    other.network.load_state_dict(member.network.state_dict())
+    before = model.decode(coordinates, log_scale, CAMERA.matrix)
+    model.set_covariance_scale(3.0)
+    model.set_covariance_scale(2.0)
+    other = SceneCoordinatesModel.make({"shrink": 1})
+    other.network.load_state_dict(model.network.state_dict())
     after = other.decode(coordinates, log_scale, CAMERA.matrix)
     assert other.covariance_scale == 6
     assert after.covariance == pytest.approx(6 * before.covariance)
@@ -344,9 +344,9 @@ def test_bfloat16_is_for_processors_that_have_it():
 @pytest.mark.slow
 def test_it_learns_sixteen_images_by_heart(data):
     """Shown 16 images without augmentation it finds them to 0.1 m and 1 degree."""
-    member = fitted(data, STILL)
-    member.bfloat16 = bfloat16_is_fast("cpu")
-    groups = [{**group, "lr": 0.0} for group in member.parameter_groups()]
+    model = fitted(data, STILL)
+    model.bfloat16 = bfloat16_is_fast("cpu")
+    groups = [{**group, "lr": 0.0} for group in model.parameter_groups()]
     optimizer = torch.optim.AdamW(groups, weight_decay=0)
     generator = np.random.default_rng(0)
     steps = 250
@@ -354,15 +354,15 @@ def test_it_learns_sixteen_images_by_heart(data):
         rate = 2e-3 * min(1, (step + 1) / 20) * (1 + np.cos(np.pi * step / steps)) / 2
         for group in optimizer.param_groups:
             group["lr"] = rate * group["rate"]
-        loss, _ = member.loss(
-            member.batch(data, generator.permutation(16)[:4], generator, step / steps)
+        loss, _ = model.loss(
+            model.batch(data, generator.permutation(16)[:4], generator, step / steps)
         )
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(member.network.parameters(), 5.0)
+        torch.nn.utils.clip_grad_norm_(model.network.parameters(), 5.0)
         optimizer.step()
     images = np.stack([data.image(k) for k in range(16)])
-    found = member.estimate(images, data.intrinsics)
+    found = model.estimate(images, data.intrinsics)
     error_m, error_deg = pose_errors(found.poses, data.poses)
     assert np.median(error_m) < 0.1
     assert np.median(error_deg) < 1

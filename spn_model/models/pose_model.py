@@ -38,7 +38,7 @@ class PoseEstimates:
         )
 
 
-class Member(ABC):
+class PoseModel(ABC):
     """A network with all that makes a pose of its output: targets, loss, augmentation, decoding.
 
     kind : as recipes and checkpoints have it. network : everything learnt or measured on training images is

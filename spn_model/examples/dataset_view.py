@@ -1,0 +1,26 @@
+"""The view that a network learns from a data set."""
+
+from __future__ import annotations
+
+from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
+from spn_data.storage.record import content_fingerprint
+from spn_model.onboard.view import View
+
+
+def view_of(dataset: Dataset) -> View:
+    """Return the camera, image size and world of a data set. Raises ValueError without training images."""
+    sizes = {g.image_size for g in dataset.groups.values() if g.role is Role.TRAIN} - {None}
+    if len(sizes) != 1:
+        raise ValueError(f"training images are of {len(sizes)} sizes")
+    info, size = dataset.info, sizes.pop()
+    assert size is not None
+    return View(
+        camera=info.camera,
+        size=size,
+        units=info.units,
+        origin=info.origin,
+        up_is_known=info.up_is_known,
+        dataset=content_fingerprint(dataset.path),
+        made_from=dict(info.fingerprints),
+    )
