@@ -12,6 +12,10 @@ SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563
 ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
 
+# A sphere is enough for distances within one flight.
+MEAN_RADIUS_M = 6_371_000.0
+METRES_PER_DEGREE = 111_195.0  # of latitude on that sphere, rounded
+
 
 class HeightReference(StrEnum):
     """What a height is measured from."""
@@ -20,6 +24,31 @@ class HeightReference(StrEnum):
     AMSL = "amsl"  # mean sea level (a geoid model)
     TAKEOFF = "takeoff"  # the point of take-off
     UNKNOWN = "unknown"  # the source does not say
+
+
+def metres_from_first_fix(lat_lon_deg: np.ndarray) -> np.ndarray:
+    """Return approximate east and north offsets from the first known position.
+
+    Equirectangular projection on a sphere: accurate enough for distances within one flight, not for
+    georegistration (use `GeoOrigin` there).
+
+    Parameters
+    ----------
+    lat_lon_deg : ndarray, shape (N, 2)
+        WGS84 latitude and longitude in degrees; NaN if unknown.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Metres east and north; NaN in rows without a position.
+    """
+    known = np.isfinite(lat_lon_deg).all(axis=1)
+    if not known.any():
+        return np.full((len(lat_lon_deg), 2), np.nan)
+    lat, lon = np.deg2rad(lat_lon_deg).T
+    lat_0, lon_0 = lat[known][0], lon[known][0]
+    east, north = MEAN_RADIUS_M * (lon - lon_0) * np.cos(lat_0), MEAN_RADIUS_M * (lat - lat_0)
+    return np.column_stack([east, north])
 
 
 def ecef_from_wgs84(lat_lon_alt: np.ndarray) -> np.ndarray:

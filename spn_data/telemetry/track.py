@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.geometry.geodesy import HeightReference
+from spn_data.geometry.geodesy import METRES_PER_DEGREE, HeightReference
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,6 @@ class Telemetry:
         return replace(self, time_s=time_s, gimbal_deg=gimbal, lat_lon_deg=lat_lon, **tables)
 
 
-METRES_PER_DEGREE = 111_195.0  # of latitude, on a sphere of 6371 km
 _COLUMNS = (
     "time_s",
     "lat_lon_deg",
