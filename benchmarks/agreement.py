@@ -21,7 +21,7 @@ from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegistration.result import GeoFit
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 
 
 def compare(area: Area, other: Area) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, load_native, scene_of
 from spn_data.errors import GeometryError, SpnError, StageError
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
-from spn_data.storage.record import versions
+from spn_data.storage.stage_record import versions
 
 VERSION = 1  # of the JSON
 STAGES = ("features", "pairs", "matching", "mapping", "refinement")

@@ -25,7 +25,7 @@ from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import Labels
 from spn_data.simulate.truth import read_truth
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 
 
 def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:

@@ -16,7 +16,7 @@ from spn_data.area.area import STAGES
 from spn_data.capture.selection import SelectionOptions
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.diagnosis import FrameRegistration
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])

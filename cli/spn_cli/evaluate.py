@@ -77,7 +77,7 @@ def run(
     from spn_cli import page, show_networks
     from spn_data.area import area as names_of
     from spn_data.errors import InputError, StageError
-    from spn_data.storage.record import content_fingerprint
+    from spn_data.storage.fingerprints import content_fingerprint
     from spn_model.evaluation.comparison_files import network_facts, of_network, write_comparison
     from spn_model.evaluation.evaluate import EvaluateOptions, compare
     from spn_model.models.checkpoint import load

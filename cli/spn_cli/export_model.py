@@ -59,7 +59,7 @@ def run(
 ) -> None:
     from spn_data.area import area as names_of
     from spn_data.errors import StageError
-    from spn_data.storage.record import content_fingerprint
+    from spn_data.storage.fingerprints import content_fingerprint
     from spn_model.export.bundle_checks import BundleOptions
     from spn_model.export.bundle_export import export as work
     from spn_model.export.bundle_export import is_made_of

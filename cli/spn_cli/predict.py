@@ -106,7 +106,7 @@ def run(
     from spn_data.area.area import CHECKPOINT
     from spn_data.errors import StageError
     from spn_data.geometry.camera_file import camera_to_json, read_camera
-    from spn_data.storage.record import content_fingerprint
+    from spn_data.storage.fingerprints import content_fingerprint
     from spn_model.models.checkpoint import load
     from spn_model.prediction.flown import FrameFilter, find_flights
     from spn_model.prediction.predict import PredictOptions, check_target

@@ -24,7 +24,7 @@ from spn_data.area.area import (
 )
 from spn_data.errors import StageError
 from spn_data.pipeline.frames_stage import Plan
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
 

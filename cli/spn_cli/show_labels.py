@@ -6,7 +6,7 @@ from typing import Any
 
 from spn_cli import console
 from spn_data.area.area import EVALUATION, SPLIT, TRACKED
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 
 def evaluation(record: StageRecord, unit: str) -> None:

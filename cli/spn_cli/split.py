@@ -12,7 +12,7 @@ from spn_cli.audit import show_findings
 
 if TYPE_CHECKING:
     from spn_data.pipeline.split_stage import SplitStageOptions
-    from spn_data.storage.record import StageRecord
+    from spn_data.storage.stage_record import StageRecord
 
 _SHARE = options.Finite(0, 0.9, min_open=True)
 _SECONDS = options.Finite(0, 3600)

@@ -20,7 +20,7 @@ from spn_data.storage.files import LOCK, locked
 
 if TYPE_CHECKING:
     from spn_data.area.area import Area
-    from spn_data.storage.record import StageRecord
+    from spn_data.storage.stage_record import StageRecord
 
 
 @click.command()
@@ -101,7 +101,8 @@ def run(
     from spn_data.area import area as names
     from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
-    from spn_data.storage.record import StageRecord, content_fingerprint, versions
+    from spn_data.storage.fingerprints import content_fingerprint
+    from spn_data.storage.stage_record import StageRecord, versions
     from spn_model.training.recipe import read_recipe
     from spn_model.training.train import Data, TrainingStopped, TrainOptions
     from spn_model.training.train import train as train_network
@@ -206,7 +207,8 @@ def _standing(
     Raises StageError where another training would be lost and `overwrite` is false.
     """
     from spn_data.errors import FormatError, StageError
-    from spn_data.storage.record import StageRecord, difference, read_json
+    from spn_data.storage.json_files import read_json
+    from spn_data.storage.stage_record import StageRecord, difference
 
     if not path.exists():
         if files.checkpoint.exists():
@@ -241,8 +243,7 @@ def _standing(
 
 
 def _write(path: Path, config: dict[str, Any]) -> None:
-    from spn_data.storage.record import write_json
-    from spn_model.models.checkpoint import finite
+    from spn_data.storage.json_files import finite, write_json
 
     write_json(path, finite(config))
 

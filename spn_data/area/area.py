@@ -18,15 +18,13 @@ import tomli_w
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError, InUseError, StageError
 from spn_data.storage.files import LOCK, locked, write_whole
-from spn_data.storage.record import (
-    VERSION,
+from spn_data.storage.json_files import VERSION, check_version, write_json
+from spn_data.storage.stage_record import (
     StageRecord,
-    check_version,
     current_stage,
     difference,
     read_record,
     versions,
-    write_json,
 )
 
 FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"

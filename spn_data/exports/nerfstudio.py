@@ -1,8 +1,8 @@
-"""transforms.json of nerfstudio.
+"""Export as `transforms.json` of nerfstudio.
 
-World z is up. Cameras have OpenGL's axes: x right, y up, z backwards; `transform_matrix` leads from them to
-the world. Intrinsics are OpenCV's model in pixels, with COLMAP's half-pixel, as nerfstudio's own converter
-writes them. https://docs.nerf.studio/quickstart/data_conventions.html
+World z is up. Cameras have OpenGL's axes: x right, y up, z backwards; `transform_matrix` is world from
+camera. Intrinsics are those of OpenCV's model in pixels, with COLMAP's half-pixel offset, as written by
+nerfstudio's own converter. https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
 from __future__ import annotations
@@ -14,16 +14,26 @@ import numpy as np
 
 from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.geometry.camera import Camera
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 
-FOLDER_OF_IMAGES = "images"
+IMAGE_FOLDER = "images"
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
 def write_nerfstudio(folder: Path, frames: ExportedFrames) -> None:
-    """Intrinsics stand once where all frames share them, else in each frame.
+    """Write `transforms.json`.
 
-    Evaluation frames are nerfstudio's validation and test images.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the export.
+    frames : ExportedFrames
+        Frames to export.
+
+    Notes
+    -----
+    Intrinsics are written once if all frames share them, otherwise with each frame. Evaluation frames
+    become nerfstudio's validation and test images.
     """
     labels = frames.labels
     content: dict[str, Any] = {"camera_model": "OPENCV", "units": frames.units}
@@ -32,7 +42,7 @@ def write_nerfstudio(folder: Path, frames: ExportedFrames) -> None:
     keys = sorted(set(labels.cameras.tolist()))
     if len(keys) == 1:
         content |= _intrinsics(frames.cameras[keys[0]])
-    paths = [f"{FOLDER_OF_IMAGES}/{name}" for name in labels.names.tolist()]
+    paths = [f"{IMAGE_FOLDER}/{name}" for name in labels.names.tolist()]
     content["frames"] = []
     for row, path in enumerate(paths):
         matrix = np.eye(4)
@@ -45,7 +55,7 @@ def write_nerfstudio(folder: Path, frames: ExportedFrames) -> None:
     if frames.is_evaluation.any() and not frames.is_evaluation.all():
         held_out = [p for p, is_out in zip(paths, frames.is_evaluation, strict=True) if is_out]
         content["train_filenames"] = [p for p in paths if p not in set(held_out)]
-        # nerfstudio refuses a list of lists in which one is missing.
+        # nerfstudio requires all three lists if any is given.
         content["val_filenames"] = content["test_filenames"] = held_out
     write_json(folder / "transforms.json", content)
 

@@ -13,6 +13,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
+from spn_data.storage.json_files import finite_or_none
 
 VERSION = 1
 
@@ -164,7 +165,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.integer | int):
         return int(value)
     if isinstance(value, np.floating | float):
-        return float(value) if math.isfinite(value) else None
+        return finite_or_none(value)
     return str(value)
 
 

@@ -20,7 +20,7 @@ from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelObservations, Labels, read_labels, read_seen_points
 from spn_data.labels.map_points import MapPoints, covered_share
 from spn_data.reconstruction.registration_file import read_reasons
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 from spn_data.uncertainty.map_covariance import MapCovariance
 
 POSES, SEEN, CAMERA, REGISTRATION = (

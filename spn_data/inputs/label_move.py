@@ -15,7 +15,7 @@ from spn_data.inputs.area_labels import (
     similarity_to_json,
 )
 from spn_data.labels.labels import read_labels, write_labels
-from spn_data.storage.record import read_json, write_json
+from spn_data.storage.json_files import read_json, write_json
 
 
 def move_labels(area: Area) -> tuple[str, ...]:

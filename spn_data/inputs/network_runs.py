@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,8 @@ from spn_data.area.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPL
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import finite_or_none
 
 _VERSION = 1  # of metrics.json
 _MAX_BYTES = 20_000_000
@@ -187,7 +187,7 @@ def _number(value: Any) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{type(value).__name__} where a number belongs")
-    return float(value) if math.isfinite(value) else None
+    return finite_or_none(value)
 
 
 def _known(value: Any) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from spn_data.capture.sources import Source
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
 
 
 def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from spn_data.area.area import EVALUATION, FRAMES, Area
 from spn_data.capture.sources import VIDEO_SUFFIXES, discover
 from spn_data.errors import InputError, StageError
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
 
 
 def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[Path, ...]:

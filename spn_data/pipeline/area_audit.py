@@ -42,7 +42,7 @@ from spn_data.split.audit_files import (
 )
 from spn_data.split.groups import TRAIN, Split
 from spn_data.split.split_file import read_split
-from spn_data.storage.record import VERSION, read_json, write_json
+from spn_data.storage.json_files import VERSION, read_json, write_json
 
 SPLIT_FILE, DATASET, AUDIT, CAMBRIDGE = "split.json", "dataset.h5", "audit.json", "cambridge"
 

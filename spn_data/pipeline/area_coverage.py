@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -31,7 +30,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
 from spn_data.pipeline.geo_stage import recorded_options
-from spn_data.storage.record import VERSION, read_json, write_json
+from spn_data.storage.json_files import VERSION, finite, read_json, write_json
 from spn_data.work.timing import Progress
 
 EVALUATED, PLANNED = "coverage", "coverage-waypoints"  # folders in the area
@@ -279,7 +278,7 @@ def _write(area: Area, found: AreaCoverage, options: CoverageStageOptions, waypo
         "fly_again": None if found.fly_again is None else _stops(found.stops),
         "notes": list(found.notes),
     }
-    write_json(path / _FILE, _without_nan(value))
+    write_json(path / _FILE, finite(value))
     area.put_in_place(name, path)
 
 
@@ -290,12 +289,3 @@ def _stops(columns: Mapping[str, list[str]]) -> list[dict[str, float]]:
     return [
         {name: convert[name](cell) for name, cell in zip(columns, row, strict=True)} for row in rows
     ]
-
-
-def _without_nan(value: Any) -> Any:
-    """Plain values for JSON, NaN as null."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value

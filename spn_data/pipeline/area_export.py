@@ -14,21 +14,21 @@ import numpy as np
 
 from spn_data.area.area import Area
 from spn_data.errors import StageError
-from spn_data.exports.colmap_export import FOLDER_OF_IMAGES as COLMAP_IMAGES
+from spn_data.exports.colmap_export import IMAGE_FOLDER as COLMAP_IMAGES
 from spn_data.exports.colmap_export import write_colmap
 from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.exports.geojson import write_geojson
-from spn_data.exports.kapture import FOLDER_OF_IMAGES as KAPTURE_IMAGES
+from spn_data.exports.kapture import IMAGE_FOLDER as KAPTURE_IMAGES
 from spn_data.exports.kapture import write_kapture
 from spn_data.exports.kml import write_kml
-from spn_data.exports.nerfstudio import FOLDER_OF_IMAGES as NERFSTUDIO_IMAGES
+from spn_data.exports.nerfstudio import IMAGE_FOLDER as NERFSTUDIO_IMAGES
 from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
 from spn_data.inputs.area_labels import LabelledArea, map_folder, read_labelled_area, together
 from spn_data.inputs.frame_images import image_path
 from spn_data.storage.files import exchange
-from spn_data.storage.record import VERSION, write_json
+from spn_data.storage.json_files import VERSION, write_json
 
 RECORD = "export.json"
 

@@ -27,7 +27,8 @@ from spn_data.report.html import render
 from spn_data.report.verdict import AreaVerdict, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_whole
-from spn_data.storage.record import read_json, versions
+from spn_data.storage.json_files import read_json
+from spn_data.storage.stage_record import versions
 
 FILE = "report.html"
 

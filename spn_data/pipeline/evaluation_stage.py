@@ -34,7 +34,8 @@ from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.register import Registered, labels_of, register_sequence
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
+from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch

@@ -27,10 +27,13 @@ from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sou
 from spn_data.capture.video import probe
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
+from spn_data.geometry.geodesy import metres_from_first_fix
 from spn_data.inputs.flight_telemetry import check_telemetry, telemetry_of, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.source_fingerprints import fingerprints
-from spn_data.storage.record import StageRecord, content_fingerprint, read_json, write_json
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import read_json, write_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.work.timing import Progress, Stopwatch
@@ -286,14 +289,8 @@ def _choose(
 
 
 def _positions(rows: Telemetry) -> np.ndarray:
-    """(N, 3) metres east and north of the first fix and above take-off, good for distances; NaN: unknown."""
-    if not rows.has_fix.any():
-        return np.full((len(rows), 3), np.nan)
-    lat, lon = np.deg2rad(rows.lat_lon_deg).T
-    lat_0, lon_0 = lat[rows.has_fix][0], lon[rows.has_fix][0]
-    radius_m = 6_371_000.0
-    east, north = radius_m * (lon - lon_0) * np.cos(lat_0), radius_m * (lat - lat_0)
-    return np.column_stack([east, north, rows.rel_alt_m])
+    """Return (N, 3) metres east and north of the first fix and above take-off; NaN if unknown."""
+    return np.column_stack([metres_from_first_fix(rows.lat_lon_deg), rows.rel_alt_m])
 
 
 def _check_some_fit(candidates: list[Candidates]) -> None:

@@ -19,7 +19,8 @@ from spn_data.georegistration.observe import align_telemetry
 from spn_data.georegistration.offset import TimeOffset, estimate_time_offset
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.label_move import move_labels
-from spn_data.storage.record import StageRecord, write_json
+from spn_data.storage.json_files import finite_or_none, write_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.timing import Progress, Stopwatch
@@ -184,4 +185,4 @@ def _counts(result: GeoFit) -> dict[str, Any]:
 
 def _rounded(value: float, digits: int = 4) -> float | None:
     """A figure for stage.json; None where there is none."""
-    return round(float(value), digits) if np.isfinite(value) else None
+    return finite_or_none(round(float(value), digits))

@@ -29,7 +29,7 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
 
 LISTS = {

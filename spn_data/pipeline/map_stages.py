@@ -19,7 +19,8 @@ from spn_data.pipeline.geo_stage import (
 from spn_data.pipeline.model_stage import build_model
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.reconstruct import estimate_model_cost
-from spn_data.storage.record import StageRecord, read_json
+from spn_data.storage.json_files import read_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
 

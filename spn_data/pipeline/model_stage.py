@@ -24,7 +24,8 @@ from spn_data.reconstruction.diagnosis import missing_passages
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
-from spn_data.storage.record import StageRecord, read_json
+from spn_data.storage.json_files import read_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
 
 DATABASE = "database.db"

@@ -36,7 +36,7 @@ from spn_data.split.audit import AuditFinding, AuditVerdict
 from spn_data.split.groups import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.split.holdout import make_split
 from spn_data.split.split_file import write_split
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
 
 

@@ -35,7 +35,8 @@ from spn_data.registration.frame_covariance import (
     PointObservations,
     frame_covariances,
 )
-from spn_data.storage.record import VERSION, StageRecord, read_json, write_json
+from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.stage_record import StageRecord
 from spn_data.tracking.label_video import track_frames
 from spn_data.tracking.tracked_frames import TrackingOptions
 from spn_data.uncertainty.map_covariance import MapCovariance

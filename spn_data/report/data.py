@@ -17,7 +17,7 @@ from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.split import audit
 from spn_data.split.groups import Split
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 REGISTERED, FAILED = LabelStatus.REGISTERED.value, LabelStatus.FAILED.value
 STRATA = tuple(stratum.value for stratum in Stratum)

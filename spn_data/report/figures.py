@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.report.data import FrameTable, ReportData
 from spn_data.split.groups import OPTIMISTIC, TRAIN
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 
 def key_figures(data: ReportData) -> str:

@@ -16,7 +16,7 @@ from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
 from spn_data.split import audit
 from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import statements
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 _REASONS_SHOWN = 6  # of one sequence
 _PLACES_SHOWN = 8  # to fly again, before the list is folded

@@ -19,7 +19,8 @@ from spn_data.split.groups import (
     Split,
     SplitOptions,
 )
-from spn_data.storage.record import VERSION, current_options, read_json, write_json
+from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.stage_record import current_options
 
 _NOT_FREE = (
     "Validation frames were bundle-adjusted jointly with the training frames: poses and points of both "

@@ -14,7 +14,7 @@ from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
 from spn_model.evaluation.baselines import GEM, VLAD, better, guess_mean, oracle, posed
 from spn_model.evaluation.dropout import dropout_estimates, has_dropout

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.storage.files import write_csv
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import finite, write_json
 from spn_model.evaluation.baselines import PAPER_SOURCE, PAPER_TABLE_1
 from spn_model.evaluation.metrics import Evaluation, Summary
 
@@ -54,7 +54,7 @@ def write_metrics(
         "paper": {"source": PAPER_SOURCE, "table_1": [asdict(row) for row in PAPER_TABLE_1]},
         "facts": dict(facts),
     }
-    write_json(path, _plain(document))
+    write_json(path, finite(document))
 
 
 def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
@@ -142,14 +142,3 @@ def _text(value: float, digits: int, sign: str = "") -> str:
 
 def _cells(values: np.ndarray, digits: int) -> list[str]:
     return [f"{value + 0.0:.{digits}f}" if np.isfinite(value) else "" for value in values]
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: NaN and infinity are null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_data.storage.record import content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
 from spn_model.onboard.view import View
 
 

@@ -18,7 +18,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 from spn_model.evaluation.validation import spread_rows
 from spn_model.export.bundle_checks import judged_groups
 from spn_model.onboard.bundle import GRAPHS, read_bundle

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -17,7 +16,8 @@ from spn_data.errors import InputError, SpnError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.files import exchange, write_whole
-from spn_data.storage.record import content_fingerprint, write_json
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import finite, write_json
 from spn_data.work.timing import Progress
 from spn_model.evaluation.evaluate import check_world
 from spn_model.evaluation.validation import spread_rows
@@ -108,7 +108,7 @@ def export(
             )
             document["measured"] = {
                 "parity": asdict(parity),
-                "errors": [_plain(asdict(one)) for one in errors],
+                "errors": [finite(asdict(one)) for one in errors],
                 "options": asdict(options),
             }
             write_json(partial / DOCUMENT, document)
@@ -206,11 +206,4 @@ def _graphs(folder: Path) -> dict[str, dict[str, Any]]:
     return {
         precision: {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
         for precision, path in paths.items()
-    }
-
-
-def _plain(value: Mapping[str, Any]) -> dict[str, Any]:
-    """As JSON has it: infinity is null."""
-    return {
-        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in value.items()
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import writing_whole
+from spn_data.storage.json_files import finite
 from spn_model.models.pose_model import PoseModel
 from spn_model.models.registry import make
 from spn_model.onboard.view import View
@@ -137,14 +137,3 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, An
 def _kind_of(tensor: Tensor) -> str:
     shape = " x ".join(map(str, tensor.shape)) or "a single value"
     return f"{shape} of {str(tensor.dtype).removeprefix('torch.')}"
-
-
-def finite(value: Any) -> Any:
-    """Plain values with null for numbers that are not finite."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return value

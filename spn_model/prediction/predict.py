@@ -14,11 +14,11 @@ import numpy as np
 
 from spn_data.errors import StageError
 from spn_data.storage.files import exchange, write_whole
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.prediction.flown import Flight, FlownFrame, FrameFilter, Views, frames
-from spn_model.prediction.predicted_files import PoseTable, Rows, write_tum, write_wgs84
+from spn_model.prediction.predicted_files import PoseTable, Rows, tum_texts, write_wgs84
 
 VERSION = 1
 RECORD, POSES, WGS84, TUM = "predict.json", "poses.csv", "wgs84.csv", "tum"
@@ -107,7 +107,7 @@ def predict(
         if "tum" in options.formats:
             world = _world(network)
             (partial / TUM).mkdir()
-            for name, text in write_tum(done, world):
+            for name, text in tum_texts(done, world):
                 write_whole(partial / TUM / f"{name}.txt", text)
         if "wgs84" in options.formats and origin is not None:
             write_wgs84(partial / WGS84, done, origin)

@@ -23,7 +23,7 @@ from spn_cli.data import main
 
 from spn_data.area.area import FRAMES, MODEL, Area
 from spn_data.errors import StageError
-from spn_data.storage.record import VERSION
+from spn_data.storage.json_files import VERSION
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

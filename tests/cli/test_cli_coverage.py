@@ -29,7 +29,7 @@ from spn_data.inputs.area_labels import (
 )
 from spn_data.labels.labels import LabelObservations, Labels, write_labels, write_seen_points
 from spn_data.pipeline.area_coverage import PLANNED, read_coverage, stale_because
-from spn_data.storage.record import read_json, write_json
+from spn_data.storage.json_files import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 

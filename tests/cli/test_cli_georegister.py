@@ -20,7 +20,8 @@ from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
 from spn_data.pipeline.geo_stage import GeoStageOptions, recorded_options
-from spn_data.storage.record import StageRecord, read_json
+from spn_data.storage.json_files import read_json
+from spn_data.storage.stage_record import StageRecord
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

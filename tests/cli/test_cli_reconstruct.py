@@ -21,7 +21,7 @@ from spn_data.area.area import FRAMES, GEO, MODEL, Area
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 

@@ -25,7 +25,7 @@ from spn_data.inputs.area_labels import read_labelled_area
 from spn_data.pipeline.split_stage import SplitStageOptions
 from spn_data.split.groups import LEFT_OUT, TRAIN, SplitOptions
 from spn_data.split.split_file import read_split
-from spn_data.storage.record import read_json, write_json
+from spn_data.storage.json_files import read_json, write_json
 
 DOC = Path(__file__).resolve().parents[2] / "docs" / "split.md"
 

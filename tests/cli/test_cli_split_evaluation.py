@@ -20,7 +20,7 @@ from spn_data.dataset.nvm import read_nvm
 from spn_data.inputs.area_labels import read_labelled_area
 from spn_data.labels.labels import LabelStatus, read_labels, write_labels
 from spn_data.split.split_file import read_split
-from spn_data.storage.record import read_json, write_json
+from spn_data.storage.json_files import read_json, write_json
 
 pytestmark = pytest.mark.slow
 

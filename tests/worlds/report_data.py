@@ -15,7 +15,7 @@ from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.split import audit
 from spn_data.split.groups import Split, SplitOptions
-from spn_data.storage.record import StageRecord
+from spn_data.storage.stage_record import StageRecord
 
 
 def flight(

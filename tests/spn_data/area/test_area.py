@@ -9,7 +9,9 @@ import pytest
 
 from spn_data.area.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
 from spn_data.errors import FormatError, StageError
-from spn_data.storage.record import VERSION, StageRecord, content_fingerprint
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import VERSION
+from spn_data.storage.stage_record import StageRecord
 
 
 def make(

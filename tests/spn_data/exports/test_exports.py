@@ -54,7 +54,7 @@ from spn_data.labels.labels import (
 )
 from spn_data.labels.map_points import MapPoints
 from spn_data.pipeline.area_export import Format
-from spn_data.storage.record import VERSION, write_json
+from spn_data.storage.json_files import VERSION, write_json
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -471,7 +471,7 @@ def test_without_a_place_everything_says_that_it_is_no_metres(
     for name in ("geojson", "kml"):
         done = run(name, tmp_path / name, area_without_place)
         assert done.exit_code == 1
-        assert "needs a place in the world, and the area has none; run spn-data" in done.output
+        assert "needs a georegistered map; run spn-data georegister first" in done.output
         assert not (tmp_path / name).exists()
 
 

@@ -34,7 +34,7 @@ from spn_data.labels.map_hash import map_hash
 from spn_data.pipeline.frames_stage import FramesOptions, plan
 from spn_data.registration.register_options import CheckOptions
 from spn_data.simulate.truth import read_truth
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 
 DOC = Path(__file__).resolve().parents[3] / "docs" / "registration.md"
 FAST = ("--rate", "1", "--threads", "1")

@@ -14,7 +14,7 @@ from spn_data.labels.labels import Labels
 from spn_data.split.groups import LEFT_OUT, TEST, TRAIN, VALIDATION, Policy, Split, SplitOptions
 from spn_data.split.holdout import make_split
 from spn_data.split.split_file import read_split, write_split
-from spn_data.storage.record import read_json
+from spn_data.storage.json_files import read_json
 
 
 def flight(

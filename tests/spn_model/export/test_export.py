@@ -19,7 +19,7 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 from spn_model.examples.dataset_view import view_of
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export

@@ -29,7 +29,7 @@ from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export
 from spn_model.onboard import lines

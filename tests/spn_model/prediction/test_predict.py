@@ -25,7 +25,7 @@ from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
-from spn_data.storage.record import write_json
+from spn_data.storage.json_files import write_json
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.prediction.flown import FrameFilter, Views, find_flights, frames
 from spn_model.prediction.predict import Predicted, PredictionStopped, PredictOptions, predict

@@ -1,4 +1,4 @@
-"""What a stage was made of, and our JSON files: each written whole, each with a version."""
+"""stage.json: the options and inputs that a stage was made from, what it holds and what it cost."""
 
 from __future__ import annotations
 
@@ -12,21 +12,37 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import FormatError
-from spn_data.storage.files import write_whole
+from spn_data.storage.json_files import read_json
 
-VERSION = 1  # of the area's layout and of stage.json
-# Names that version 0.1 used in stage.json and split.json, and what they are called now.
+# Names that version 0.1 used in stage.json and split.json, and the current ones.
 _RENAMED_GROUPS = {"4-dense": "4-tracked"}
 _RENAMED_OPTIONS = {"dense": "tracked"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageRecord:
-    """What a stage was made of, with what, and what it cost; stage.json.
+    """The record of one stage, stored as stage.json.
 
-    options : of the stage; inputs : content fingerprint by file name; upstream : fingerprint of each
-    stage it was made from; counts : what it holds; seconds, cpu_seconds : by step, child processes
-    included; notes : what the user should know.
+    Attributes
+    ----------
+    stage : str
+        Name of the stage, e.g. `2-model` or `4-eval/<sequence>`.
+    options : dict
+        Options of the stage.
+    inputs : dict
+        Content fingerprint of each input file, by file name.
+    upstream : dict
+        Fingerprint of each stage that this one was made from, by stage name.
+    counts : dict
+        What the stage holds.
+    seconds, cpu_seconds : dict
+        Wall and CPU time of each step, child processes included.
+    notes : tuple of str
+        Notes for the user.
+    versions : dict
+        Versions of the software that made the stage.
+    finished : str
+        Time at which the stage was finished (ISO 8601, UTC).
     """
 
     stage: str
@@ -42,7 +58,7 @@ class StageRecord:
 
     @property
     def made_of(self) -> dict[str, Any]:
-        """What decides whether a stage would come out the same."""
+        """Options, inputs and upstream stages under current names; if equal, the result would be equal."""
         upstream = {current_stage(name): value for name, value in self.upstream.items()}
         made_of = {
             "options": current_options(self.options),
@@ -52,20 +68,30 @@ class StageRecord:
         return dict(json.loads(json.dumps(made_of)))
 
     def fingerprint(self) -> str:
-        """Changes whenever the stage is made anew from something else."""
+        """Return a hash that changes whenever the stage is redone from other options, inputs or stages."""
         made_of = {"options": self.options, "inputs": self.inputs, "upstream": self.upstream}
         content = json.dumps({"of": made_of, "counts": self.counts}, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
+def read_record(path: Path) -> StageRecord:
+    """Read a stage.json; raise FormatError if it is missing, damaged, or of a newer version."""
+    table = read_json(path)
+    del table["version"]
+    try:
+        return StageRecord(**{**table, "notes": tuple(table["notes"])})
+    except (TypeError, KeyError) as error:
+        raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
+
+
 def current_stage(name: str) -> str:
-    """Return the name that a stage has in this version, given the one that its record has."""
+    """Return the current name of a stage, given its name in a record of any version."""
     group, slash, rest = name.partition("/")
     return _RENAMED_GROUPS.get(group, group) + slash + rest
 
 
 def current_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return recorded options under the names that they have in this version, nested groups too."""
+    """Return recorded options under their current names, including those in nested groups."""
     return {
         _RENAMED_OPTIONS.get(name, name): current_options(value)
         if isinstance(value, Mapping)
@@ -74,33 +100,8 @@ def current_options(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def content_fingerprint(path: Path) -> str:
-    """Of a file's size and of its first, middle and last megabyte: quick also for hours of video."""
-    size = path.stat().st_size
-    digest = hashlib.sha256(str(size).encode())
-    with path.open("rb") as handle:
-        for start in (0, max(0, size // 2 - 2**19), max(0, size - 2**20)):
-            handle.seek(start)
-            digest.update(handle.read(2**20))
-    return digest.hexdigest()[:16]
-
-
-def write_json(path: Path, value: Any) -> None:
-    write_whole(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
-
-
-def read_json(path: Path) -> Any:
-    """Raises FormatError where the file is missing, damaged, or of a newer version."""
-    try:
-        value = json.loads(path.read_text())
-        check_version(path, value["version"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: cannot be read ({error!r})") from error
-    return value
-
-
 def versions() -> dict[str, str]:
-    """Of what computed something."""
+    """Return the versions of Python, this package and the libraries that decide results."""
     found = {"python": platform.python_version()}
     for package in ("squeezeposenet-toolkit", "pycolmap", "opencv-python-headless", "numpy", "av"):
         try:
@@ -110,25 +111,12 @@ def versions() -> dict[str, str]:
     return found
 
 
-def read_record(path: Path) -> StageRecord:
-    table = read_json(path)
-    del table["version"]
-    try:
-        return StageRecord(**{**table, "notes": tuple(table["notes"])})
-    except (TypeError, KeyError) as error:
-        raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
-
-
-def check_version(path: Path, found: int) -> None:
-    if found > VERSION:
-        raise FormatError(
-            f"{path}: made by a newer version of this program (format {found}, this reads {VERSION}); "
-            "update the program"
-        )
-
-
 def difference(found: StageRecord, wanted: StageRecord) -> str:
-    """In words, what two records are made of that differs."""
+    """Describe the first difference between an existing record and the one wanted now.
+
+    The result completes a sentence whose subject is the existing stage, e.g.
+    "was made with seed = 0, now 1".
+    """
     for name, before, now in _changed_options(
         current_options(found.options), current_options(wanted.options)
     ):
@@ -154,7 +142,7 @@ def difference(found: StageRecord, wanted: StageRecord) -> str:
 def _changed_options(
     found: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
-    """(name, value before, value now) of each option that differs, those in groups as `group.name`."""
+    """Yield (name, value before, value now) of each changed option, nested ones as `group.name`."""
     for name in dict.fromkeys((*wanted, *found)):
         before, now = found.get(name), wanted.get(name)
         if isinstance(before, Mapping) and isinstance(now, Mapping):
