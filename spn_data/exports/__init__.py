@@ -1,0 +1,1 @@
+"""Exports of camera poses to the file formats of other tools."""

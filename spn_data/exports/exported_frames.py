@@ -1,4 +1,4 @@
-"""What every export is made of: frames with poses, and how to say what their lengths mean."""
+"""Input shared by all exports: frames with poses, and a description of their world frame."""
 
 from __future__ import annotations
 
@@ -18,9 +18,22 @@ from spn_data.labels.map_points import MapPoints
 class ExportedFrames:
     """N frames, all with a pose, sorted by sequence and time.
 
-    units : "m" (East-North-Up about `origin`) or "model" (a model's own unit; origin is None).
-    is_evaluation : (N,) bool, of an evaluation sequence, which is no part of the map.
-    seen : map points that the frames see; points : of the map; cameras : by the labels' keys.
+    Attributes
+    ----------
+    units : str
+        "m" (East-North-Up about `origin`) or "model" (the model's own unit; `origin` is None).
+    origin : GeoOrigin or None
+        Origin of the world frame; None if the map is not georegistered.
+    labels : Labels
+        Poses and names of the frames.
+    is_evaluation : ndarray of bool, shape (N,)
+        Whether the frame belongs to an evaluation sequence, which is not part of the map.
+    seen : LabelObservations
+        Observations of map points in the frames.
+    points : MapPoints
+        Points of the map.
+    cameras : dict of str to Camera
+        Cameras by the keys used in `labels`.
     """
 
     units: str
@@ -35,16 +48,17 @@ class ExportedFrames:
         return len(self.labels)
 
     def camera_of(self, row: int) -> Camera:
+        """Return the camera of a frame."""
         return self.cameras[str(self.labels.cameras[row])]
 
     def sequences(self) -> Iterator[tuple[str, np.ndarray]]:
-        """(name, rows (K,) in the order of time) of each sequence."""
+        """Yield the name of each sequence with its rows (K,) in temporal order."""
         for name in sorted(set(self.labels.sequences.tolist())):
             yield name, np.flatnonzero(self.labels.sequences == name)
 
     @property
     def world(self) -> str:
-        """The world frame in one line, for the head of a file."""
+        """One-line description of the world frame for file headers."""
         if self.origin is None:
             return "units: model (COLMAP's own origin, axes and unit; not metres)"
         o = self.origin
@@ -54,19 +68,35 @@ class ExportedFrames:
         )
 
     def required_origin(self, what: str) -> GeoOrigin:
-        """Raises StageError where the area has no place in the world."""
+        """Return the origin of the world frame; `what` is the format that needs it.
+
+        Raises
+        ------
+        StageError
+            If the map is not georegistered.
+        """
         if self.origin is None:
             raise StageError(
-                f"{what} needs a place in the world, and the area has none; "
-                "run spn-data georegister, or export tum, nerfstudio, kapture, colmap or nvm"
+                f"{what} needs a georegistered map; run spn-data georegister first, "
+                "or export tum, nerfstudio, kapture, colmap or nvm"
             )
         return self.origin
 
 
 def timestamps_us(time_s: np.ndarray) -> list[int]:
-    """Ascending whole microseconds of ascending times (N,), no two the same.
+    """Convert ascending times to strictly ascending whole microseconds.
 
-    Photos of one second, or without times, follow each other by a microsecond: their order is kept.
+    Photos with the same second, or without times, are spaced one microsecond apart, which keeps their order.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (N,)
+        Ascending times in seconds.
+
+    Returns
+    -------
+    list of int
+        N timestamps in microseconds, no two equal.
     """
     stamps: list[int] = []
     for second in time_s.tolist():

@@ -1,4 +1,4 @@
-"""Positions on the globe with headings, for GeoJSON and KML."""
+"""WGS84 positions and headings of cameras, for GeoJSON and KML."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from spn_data.geometry.pose import angles_from_rotations
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """lat_lon_deg : (N, 2) WGS84; height_m : (N,) above `reference`; heading_pitch_roll_deg : (N, 3)."""
+class GeographicPoses:
+    """Camera poses of N frames on the globe.
+
+    lat_lon_deg : (N, 2), WGS84. height_m : (N,), above `reference`. heading_pitch_roll_deg : (N, 3).
+    """
 
     lat_lon_deg: np.ndarray
     height_m: np.ndarray
@@ -21,11 +24,14 @@ class Places:
     heading_pitch_roll_deg: np.ndarray
 
 
-def places_of(frames: ExportedFrames, what: str) -> Places:
-    """Raises StageError where the area has no place in the world."""
+def geographic_poses(frames: ExportedFrames, what: str) -> GeographicPoses:
+    """Convert the poses of frames to WGS84; raise StageError if the map is not georegistered.
+
+    what : name of the format that needs them, for the error message.
+    """
     origin = frames.required_origin(what)
     lat_lon_height = origin.wgs84_from_enu(frames.labels.poses.centers)
-    return Places(
+    return GeographicPoses(
         lat_lon_height[:, :2],
         lat_lon_height[:, 2],
         origin.height_reference,

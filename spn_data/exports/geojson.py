@@ -1,4 +1,4 @@
-"""Camera positions as GeoJSON (RFC 7946): one point a frame, with the camera's angles."""
+"""Camera positions as GeoJSON (RFC 7946): one point per frame, with the camera's angles."""
 
 from __future__ import annotations
 
@@ -7,24 +7,38 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.exports.exported_frames import ExportedFrames
-from spn_data.exports.geographic import places_of
+from spn_data.exports.geographic import geographic_poses
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
 
 def write_geojson(folder: Path, frames: ExportedFrames) -> None:
-    """frames.geojson. Raises StageError where the area has no place in the world.
+    """Write `frames.geojson`.
 
-    GeoJSON's third coordinate counts from the ellipsoid: it stands only where the heights do too. The
-    property `height_m` with its `height_reference` always stands.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the export.
+    frames : ExportedFrames
+        Frames to export.
+
+    Raises
+    ------
+    StageError
+        If the map is not georegistered.
+
+    Notes
+    -----
+    GeoJSON's third coordinate is a height above the ellipsoid, so it is written only if the heights refer
+    to the ellipsoid. The properties `height_m` and `height_reference` are always written.
     """
-    places = places_of(frames, "GeoJSON")
+    places = geographic_poses(frames, "GeoJSON")
     above_ellipsoid = places.reference == HeightReference.ELLIPSOID
     features: list[dict[str, Any]] = []
     for row, name in enumerate(frames.labels.names.tolist()):
         latitude, longitude = places.lat_lon_deg[row].tolist()
         height_m = round(float(places.height_m[row]), 4)
-        # Ten decimals are a hundredth of a millimetre.
+        # Ten decimals of a degree resolve a hundredth of a millimetre.
         coordinates = [round(longitude, 10), round(latitude, 10)]
         heading, pitch, roll = (round(a, 4) for a in places.heading_pitch_roll_deg[row].tolist())
         features.append(
@@ -49,4 +63,4 @@ def write_geojson(folder: Path, frames: ExportedFrames) -> None:
         )
     collection = {"type": "FeatureCollection", "features": features}
     text = json.dumps(collection, indent=1, allow_nan=False)
-    write_whole(folder / "frames.geojson", text + "\n")
+    write_atomically(folder / "frames.geojson", text + "\n")

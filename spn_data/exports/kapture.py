@@ -1,6 +1,6 @@
-"""A data set in the format of kapture 1.1: sensors, their trajectories, and the images they took.
+"""Export as a kapture 1.1 dataset: sensors, their trajectories, and the images they recorded.
 
-Poses lead from world to sensor: `qw qx qy qz` and the translation t = -R centre. Cameras have COLMAP's models
+Poses are sensor from world: `qw qx qy qz` and the translation t = -R centre. Cameras use COLMAP's models
 and parameters. https://github.com/naver/kapture/blob/main/kapture_format.adoc
 """
 
@@ -11,18 +11,27 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
-FOLDER_OF_IMAGES = "sensors/records_data"
+IMAGE_FOLDER = "sensors/records_data"
 _VERSION = "# kapture format: 1.1"
 
 
 def write_kapture(folder: Path, frames: ExportedFrames) -> None:
-    """sensors/sensors.txt, trajectories.txt and records_camera.txt.
+    """Write `sensors.txt`, `trajectories.txt` and `records_camera.txt` to the folder `sensors`.
 
-    A sequence is a sensor (one for each of its cameras), since sequences of one camera share timestamps:
-    microseconds since the sequence's first frame (`timestamps_us`).
-    No rigs: no camera is fixed to another.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the export.
+    frames : ExportedFrames
+        Frames to export.
+
+    Notes
+    -----
+    Each camera of each sequence is a sensor of its own, because sequences of one camera share timestamps:
+    microseconds since the sequence's first frame (`timestamps_us`). There are no rigs, since no camera is
+    fixed to another.
     """
     labels = frames.labels
     sensors: dict[str, str] = {}
@@ -43,7 +52,7 @@ def write_kapture(folder: Path, frames: ExportedFrames) -> None:
                 pose = ", ".join(repr(float(value)) for value in numbers[k])
                 trajectories.append(f"{stamp}, {sensor}, {pose}")
                 records.append(f"{stamp}, {sensor}, {labels.names[mine[k]]}")
-    told = f"# {frames.world}"
+    world_comment = f"# {frames.world}"
     tables = {
         "sensors": (
             "# sensor_id, name, sensor_type, [sensor_params]+",
@@ -52,7 +61,7 @@ def write_kapture(folder: Path, frames: ExportedFrames) -> None:
         "trajectories": ("# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz", trajectories),
         "records_camera": ("# timestamp, device_id, image_path", records),
     }
-    (folder / FOLDER_OF_IMAGES).mkdir(parents=True)
+    (folder / IMAGE_FOLDER).mkdir(parents=True)
     for name, (head, rows_of_table) in tables.items():
-        text = "\n".join([_VERSION, told, head, *rows_of_table]) + "\n"
-        write_whole(folder / "sensors" / f"{name}.txt", text)
+        text = "\n".join([_VERSION, world_comment, head, *rows_of_table]) + "\n"
+        write_atomically(folder / "sensors" / f"{name}.txt", text)

@@ -1,4 +1,4 @@
-"""Camera positions as KML 2.2, for Google Earth: a folder a sequence, with its path and its frames."""
+"""Camera positions as KML 2.2 for Google Earth: one folder per sequence, with its path and its frames."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ from html import escape
 from pathlib import Path
 
 from spn_data.exports.exported_frames import ExportedFrames
-from spn_data.exports.geographic import Places, places_of
+from spn_data.exports.geographic import GeographicPoses, geographic_poses
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
-# KML's absolute altitudes count from mean sea level, and it knows no ellipsoid.
+# KML's absolute altitudes refer to mean sea level; it has no ellipsoidal heights.
 _MODES = {
     HeightReference.AMSL: ("absolute", "drawn at that height"),
     HeightReference.TAKEOFF: (
         "relativeToGround",
-        "drawn above the ground below each, which is right where it is level with the take-off point",
+        "drawn above the local ground, which is correct only if it is level with the take-off point",
     ),
     HeightReference.ELLIPSOID: (
         "clampToGround",
-        "drawn on the ground, since KML's altitudes count from mean sea level",
+        "drawn on the ground, because KML's altitudes refer to mean sea level",
     ),
     HeightReference.UNKNOWN: ("clampToGround", "drawn on the ground"),
 }
 
 
 def write_kml(folder: Path, frames: ExportedFrames) -> None:
-    """frames.kml. Raises StageError where the area has no place in the world."""
-    text = "\n".join(_text(frames, places_of(frames, "KML")))
-    write_whole(folder / "frames.kml", text + "\n")
+    """Write `frames.kml`; raise StageError if the map is not georegistered."""
+    text = "\n".join(_text(frames, geographic_poses(frames, "KML")))
+    write_atomically(folder / "frames.kml", text + "\n")
 
 
-def _text(frames: ExportedFrames, places: Places) -> Iterator[str]:
+def _text(frames: ExportedFrames, places: GeographicPoses) -> Iterator[str]:
     mode, drawn = _MODES[places.reference]
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     yield '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
@@ -58,7 +58,7 @@ def _text(frames: ExportedFrames, places: Places) -> Iterator[str]:
     yield "</Document></kml>"
 
 
-def _placemark(frames: ExportedFrames, places: Places, row: int, mode: str) -> str:
+def _placemark(frames: ExportedFrames, places: GeographicPoses, row: int, mode: str) -> str:
     heading, pitch, roll = places.heading_pitch_roll_deg[row]
     values = {
         "time_s": f"{frames.labels.time_s[row]:.6f}",
@@ -71,10 +71,10 @@ def _placemark(frames: ExportedFrames, places: Places, row: int, mode: str) -> s
     data = "".join(
         f'<Data name="{name}"><value>{value}</value></Data>' for name, value in values.items()
     )
-    tilt = pitch + 90  # from straight down
+    tilt = pitch + 90  # KML's tilt is zero looking straight down
     return (
         f"<Placemark><name>{escape(str(frames.labels.names[row]))}</name>"
-        f"<Camera>{_place(places, row)}<heading>{heading:.4f}</heading><tilt>{tilt:.4f}</tilt>"
+        f"<Camera>{_location(places, row)}<heading>{heading:.4f}</heading><tilt>{tilt:.4f}</tilt>"
         f"<altitudeMode>{mode}</altitudeMode></Camera>"
         f"<ExtendedData>{data}</ExtendedData>"
         f"<Point><altitudeMode>{mode}</altitudeMode><coordinates>{_coordinates(places, row)}"
@@ -82,7 +82,7 @@ def _placemark(frames: ExportedFrames, places: Places, row: int, mode: str) -> s
     )
 
 
-def _place(places: Places, row: int) -> str:
+def _location(places: GeographicPoses, row: int) -> str:
     latitude, longitude = places.lat_lon_deg[row]
     return (
         f"<longitude>{longitude:.10f}</longitude><latitude>{latitude:.10f}</latitude>"
@@ -90,7 +90,7 @@ def _place(places: Places, row: int) -> str:
     )
 
 
-def _coordinates(places: Places, row: int) -> str:
-    """Longitude, latitude, height; ten decimals of a degree are a hundredth of a millimetre."""
+def _coordinates(places: GeographicPoses, row: int) -> str:
+    """Format longitude, latitude and height; ten decimals of a degree resolve 0.01 mm."""
     latitude, longitude = places.lat_lon_deg[row]
     return f"{longitude:.10f},{latitude:.10f},{places.height_m[row]:.4f}"

@@ -1,4 +1,4 @@
-"""The frames as a model of VisualSFM, as if their images were undistorted and centred."""
+"""Export as a VisualSFM model, as if the images were undistorted and centred on the principal point."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spn_data.exports.exported_frames import ExportedFrames
 
 
 def write_nvm_export(folder: Path, frames: ExportedFrames) -> None:
-    """reconstruction.nvm: each camera without distortion, its focal length the mean of both."""
+    """Write `reconstruction.nvm`: cameras without distortion, with the mean of both focal lengths."""
     labels, seen = frames.labels, frames.seen
     focal_px = np.array([np.mean(frames.camera_of(row).focal_px) for row in range(len(frames))])
     offsets = np.empty((len(seen.pixels), 2))

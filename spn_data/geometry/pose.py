@@ -57,6 +57,11 @@ def canonical_quats(quats_wxyz: np.ndarray) -> np.ndarray:
     return quats * sign
 
 
+def conjugate_quats(quats_wxyz: np.ndarray) -> np.ndarray:
+    """Return the conjugates (N, 4) of unit quaternions (N, 4), scalar first: the inverse rotations."""
+    return np.asarray(quats_wxyz, dtype=np.float64) * [1, -1, -1, -1]
+
+
 def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
     """Rotation vectors (N, 3) in radians, of length at most pi, from rotation matrices (N, 3, 3)."""
     quats = quats_from_rotations(rotations)
@@ -166,6 +171,27 @@ class Poses:
         """COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""
         translations = -np.einsum("nij,nj->ni", self.rotations, self.centers)
         return np.roll(self.quats_wxyz, -1, axis=-1), translations
+
+    def to_camera(self, points: np.ndarray, index: int | np.ndarray = 0) -> np.ndarray:
+        """Transform world points (M, 3) into camera frames.
+
+        Parameters
+        ----------
+        points : ndarray, shape (M, 3)
+            In the world frame.
+        index : int or ndarray, shape (M,), optional
+            The pose to use for all points, or one for each point.
+
+        Returns
+        -------
+        ndarray, shape (M, 3)
+            In camera axes: x right, y down, z forward; in the world's unit.
+        """
+        rotations = rotations_from_quats(self.quats_wxyz[index])
+        offsets = points - self.centers[index]
+        if rotations.ndim == 2:
+            return np.asarray(offsets @ rotations.T)
+        return np.einsum("mij,mj->mi", rotations, offsets)
 
     @property
     def rotations(self) -> np.ndarray:

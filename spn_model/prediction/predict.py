@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.storage.files import exchange, write_whole
+from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
 from spn_model.models.checkpoint import Checkpoint
@@ -108,7 +108,7 @@ def predict(
             world = _world(network)
             (partial / TUM).mkdir()
             for name, text in tum_texts(done, world):
-                write_whole(partial / TUM / f"{name}.txt", text)
+                write_atomically(partial / TUM / f"{name}.txt", text)
         if "wgs84" in options.formats and origin is not None:
             write_wgs84(partial / WGS84, done, origin)
         found = Predicted(
@@ -138,7 +138,7 @@ def predict(
                 **facts,
             },
         )
-        exchange(partial, folder)
+        replace_folder(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     if stop is not None:

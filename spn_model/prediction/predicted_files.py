@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from spn_data.errors import StageError
-from spn_data.exports.exported_frames import timestamps_us
+from spn_data.exports.tum import tum_text
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
 from spn_data.storage.files import write_csv
@@ -161,26 +161,14 @@ def _lines(rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode("utf-8")
 
 
-def write_tum(rows: Rows, world: str) -> Iterator[tuple[str, str]]:
-    """(sequence, text) of each flight: `timestamp tx ty tz qx qy qz qw`, camera axes into world axes.
+def tum_texts(rows: Rows, world: str) -> Iterator[tuple[str, str]]:
+    """Yield the name of each flight with its trajectory as the content of a TUM file.
 
-    As `spn_data.exports.tum` writes labels. Frames without a pose have no line, as the format has no way
-    to say so.
+    Frames without a pose have no line, because the format cannot represent them.
     """
     for name in dict.fromkeys(rows.sequences.tolist()):
         mine = np.flatnonzero((rows.sequences == name) & (rows.status == ESTIMATED))
-        lines = [
-            f"# {name}: camera poses, world from camera",
-            f"# {world}",
-            "# timestamp (s since the sequence's first frame) tx ty tz qx qy qz qw",
-        ]
-        poses = rows.poses[mine]
-        quats_xyzw = np.roll(poses.quats_wxyz * [1, -1, -1, -1], -1, axis=1)
-        stamps = timestamps_us(rows.time_s[mine])
-        for stamp, center, quat in zip(stamps, poses.centers, quats_xyzw, strict=True):
-            numbers = " ".join(f"{value:.9f}" for value in (*center, *quat))
-            lines.append(f"{stamp / 1e6:.6f} {numbers}")
-        yield name, "\n".join(lines) + "\n"
+        yield name, tum_text(name, rows.time_s[mine], rows.poses[mine], world)
 
 
 def write_wgs84(path: Path, rows: Rows, origin: GeoOrigin) -> None:

@@ -49,8 +49,8 @@ from spn_data.labels.labels import (
     LabelObservations,
     Labels,
     read_labels,
+    write_label_observations,
     write_labels,
-    write_seen_points,
 )
 from spn_data.labels.map_points import MapPoints
 from spn_data.pipeline.area_export import Format
@@ -99,7 +99,7 @@ def add_evaluation(root: Path) -> None:
     assert isinstance(work, StageWork)
     write_labels(work.path / POSES, labels)
     kept = seen.frame_idx != 5
-    write_seen_points(
+    write_label_observations(
         work.path / SEEN,
         LabelObservations(seen.frame_idx[kept], seen.point_ids[kept], seen.pixels[kept]),
     )
