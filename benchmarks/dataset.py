@@ -80,7 +80,7 @@ def write(area_folder: Path, target: Path, frames: int) -> Cost:
                 noisy = cv2.add(image, np.ascontiguousarray(part), dtype=cv2.CV_8U)
                 renderer = renderers[str(labels.cameras[row])]
                 ids, pixels = seen.of_frame(row)
-                moved, is_seen = renderer.move(pixels)
+                moved, is_seen = renderer.map_pixels(pixels)
                 frame = DatasetFrame(
                     name=f"{done:07d}/{labels.names[row]}",
                     sequence=str(labels.sequences[row]),

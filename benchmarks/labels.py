@@ -57,7 +57,7 @@ def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[
     if not len(registered):
         return figures
     true = true_poses(registered, truth)
-    found = registered.moved(world_from_map)
+    found = registered.transformed(world_from_map)
     error_m, error_deg = pose_errors(found.poses, true)
     turned = rotation_vectors(true.rotations @ np.transpose(found.poses.rotations, (0, 2, 1)))
     error = np.concatenate([true.centers - found.poses.centers, turned], axis=1)

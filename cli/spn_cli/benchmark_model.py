@@ -76,7 +76,7 @@ def run(
     if bool(frames) != (camera_file is not None):
         raise click.UsageError("--frame and --camera go together: a frame's camera must be known")
     area = options.open_area(area_folder)
-    folder = bundle if name is None else area.run(name) / names_of.BUNDLE
+    folder = bundle if name is None else area.run_folder(name) / names_of.BUNDLE
     assert folder is not None
     wanted = BenchmarkOptions(poses=poses, threads=threads)
     with tempfile.TemporaryDirectory(prefix="spn-benchmark-") as scratch:

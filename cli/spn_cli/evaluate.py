@@ -85,7 +85,7 @@ def run(
     from spn_model.training.training_figure import read_log, training_figure
 
     area = options.open_area(area_folder)
-    folders = {name: area.run(name) for name in names}
+    folders = {name: area.run_folder(name) for name in names}
     files = {name: folder / names_of.CHECKPOINT for name, folder in folders.items()}
     for name, file in files.items():
         if not file.is_file():
@@ -104,7 +104,7 @@ def run(
         area.check_fresh(names_of.SPLIT)
     path = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
     runs = area.root / names_of.RUNS
-    with machine.prepared(chosen):
+    with machine.limited_threads(chosen):
         networks = {name: load(file, chosen.device) for name, file in files.items()}
         with console.progress() as progress:
             found = compare(

@@ -66,15 +66,15 @@ def run(
     from spn_model.models.checkpoint import load
 
     area = options.open_area(area_folder)
-    file = area.run(name) / names_of.CHECKPOINT
+    file = area.run_folder(name) / names_of.CHECKPOINT
     if not file.is_file():
         raise StageError(
             f"{file.parent} holds no trained network; run spn-model train --run {name} first"
         )
-    folder = target or area.run(name) / names_of.BUNDLE
+    folder = target or area.run_folder(name) / names_of.BUNDLE
     source = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
     fingerprint = content_fingerprint(file)
-    metrics = _evaluation(area.run(name) / names_of.METRICS, name, fingerprint)
+    metrics = _evaluation(area.run_folder(name) / names_of.METRICS, name, fingerprint)
     wanted = BundleOptions(int8=int8, calibration_images=calibration_images)
     facts = {"run": name, "checkpoint": fingerprint, "evaluated": metrics is not None}
     if not overwrite and is_made_of(folder, facts, wanted):

@@ -113,7 +113,7 @@ def run(
     from spn_model.prediction.predict import predict as work
     from spn_model.training import machine
 
-    file = options.open_area(area_folder).run(name) / CHECKPOINT
+    file = options.open_area(area_folder).run_folder(name) / CHECKPOINT
     if not file.is_file():
         raise StageError(
             f"{file.parent} holds no trained network; run spn-model train --run {name} first"
@@ -123,7 +123,7 @@ def run(
     given = None if camera_file is None else read_camera(camera_file)
     flights, notes = find_flights(inputs, given)
     chosen = machine.choose(device, threads or 0, "float32")
-    with machine.prepared(chosen):
+    with machine.limited_threads(chosen):
         network = load(file, chosen.device)
         if network.view.camera is None and not network.model.any_camera:
             notes.append(

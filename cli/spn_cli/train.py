@@ -110,7 +110,7 @@ def run(
 
     area = options.open_area(area_folder)
     wanted = read_recipe(recipe).with_budget(images, minutes)
-    folder = area.run(run_name or Path(recipe).stem)
+    folder = area.run_folder(run_name or Path(recipe).stem)
     path = _dataset(area, dataset)
     with Dataset(path) as opened:
         unit = "m" if opened.info.units == "m" else "model units"

@@ -17,7 +17,7 @@ import tomli_w
 
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError, InUseError, StageError
-from spn_data.storage.files import LOCK, locked, write_whole
+from spn_data.storage.files import LOCK, locked, write_atomically
 from spn_data.storage.json_files import VERSION, check_version, write_json
 from spn_data.storage.stage_record import (
     StageRecord,
@@ -143,7 +143,7 @@ class Area:
         after = [f"{group}/{name}" for group in _GROUPS for name in self.sequences(group)]
         return tuple(stage for stage in (*STAGES, *after, SPLIT) if self.has(stage))
 
-    def run(self, name: str) -> Path:
+    def run_folder(self, name: str) -> Path:
         """Folder of a trained network, which need not exist. Raises InputError for what names no folder."""
         if safe_name(name) != name or name == COMPARED:
             raise InputError(
@@ -282,7 +282,7 @@ class Area:
                 for stage in self._moved_away():
                     self._old(stage).rename(self.folder(stage))
                 if (self.root / _NEXT / _READY).exists():
-                    self._take_next()
+                    self._replace_by_next()
         except InUseError:
             return
 
@@ -296,7 +296,7 @@ class Area:
             ]
         return [s for s in names if self._old(s).exists() and not self.folder(s).exists()]
 
-    def place_of(self, path: Path) -> str:
+    def stored_path(self, path: Path) -> str:
         """A user's path as area.toml holds it: a relative one from the area's folder on, so that it is found
         from any current folder, and where both have moved together."""
         if not path.is_absolute():
@@ -310,7 +310,7 @@ class Area:
         if facts.evaluation:
             table["evaluation"] = dict(sorted(facts.evaluation.items()))
         text = tomli_w.dumps(table)
-        write_whole(self.root / _FACTS, text)
+        write_atomically(self.root / _FACTS, text)
         self.facts = facts
 
     def _read_facts(self) -> Facts:
@@ -332,17 +332,17 @@ class Area:
     def has_unfinished_addition(self) -> bool:
         return (self.root / _NEXT).exists()
 
-    def drop_next(self) -> None:
+    def discard_next(self) -> None:
         """Throw away what an unfinished addition has made."""
         shutil.rmtree(self.root / _NEXT, ignore_errors=True)
 
-    def take_next(self) -> None:
+    def replace_by_next(self) -> None:
         """Replace the stages by those of the next version, all or none."""
         (self.root / _NEXT / _READY).touch()
-        self._take_next()
+        self._replace_by_next()
         self.facts = self._read_facts()
 
-    def _take_next(self) -> None:
+    def _replace_by_next(self) -> None:
         following = self.root / _NEXT
         for stage in STAGES:
             new, now, old = following / stage, self.folder(stage), self._old(stage)

@@ -1,4 +1,4 @@
-"""From a source to its candidate frames: every image measured once, rows for frames.csv."""
+"""Candidate frames of a source: every image is measured once and becomes a row of frames.csv."""
 
 from __future__ import annotations
 
@@ -16,20 +16,32 @@ from spn_data.capture.photos import PhotoHeaders, decode_photo_gray, read_header
 from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, safe_name
 from spn_data.errors import InputError
-from spn_data.storage.files import writing_whole
+from spn_data.storage.files import atomic_writer
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_data.telemetry.track import Telemetry
 
-_CACHE_VERSION = 1  # raised whenever measuring changes
-_ZOOM_CHANGE = 0.02  # relative change of focal length that makes another camera
+_CACHE_VERSION = 1  # increase whenever the measurements change
+_ZOOM_CHANGE = 0.02  # relative change of focal length that starts another camera
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """The measured images of one source, N rows.
 
-    part_start_s : (P,) when each video file begins on the sequence's clock; photos : headers of photos;
-    photo_telemetry : their EXIF and XMP, N rows on the sequence's clock; notes : one sentence each.
+    Attributes
+    ----------
+    source : Source
+        The sequence that the images belong to.
+    measured : Measurements
+        Sharpness and motion, N rows.
+    part_start_s : tuple of float, length P
+        Start of each video file on the sequence's clock; empty for photos.
+    photos : PhotoHeaders or None
+        Headers of the photos; None for a video.
+    photo_telemetry : Telemetry or None
+        EXIF and XMP of the photos, N rows on the sequence's clock; None for a video.
+    notes : tuple of str
+        What the user should know, one sentence each.
     """
 
     source: Source
@@ -47,18 +59,37 @@ def analyse(
     progress: Callable[[int], None] | None = None,
     cache: Path | None = None,
 ) -> Candidates:
-    """Measures every image of a source once, at a reduced size; `progress` hears how many are done.
+    """Measure every image of a source once, at a reduced size.
 
-    cache : a file (.npz) in which a video's measurements are kept: where it exists and the video's files
-    have the same names, sizes and times of change, nothing is decoded.
+    Parameters
+    ----------
+    source : Source
+        A video in one or several parts, or a folder of photos.
+    threads : int
+        Decoder threads, 0 for one per core.
+    progress : callable, optional
+        Called with the number of images measured so far.
+    cache : Path, optional
+        A file (.npz) that keeps the measurements of a video. If it exists and the video's files have the
+        same names, sizes and modification times, nothing is decoded.
+
+    Returns
+    -------
+    Candidates
+        One row per image.
+
+    Raises
+    ------
+    InputError
+        If a video cannot be decoded. Unreadable photos are kept as rows with a problem.
     """
     if source.kind is SourceKind.PHOTOS:
         return _analyse_photos(source, progress)
-    known = _read_cache(cache, source) if cache is not None else None
-    if known is not None:
+    cached = _read_cache(cache, source) if cache is not None else None
+    if cached is not None:
         if progress is not None:
-            progress(len(known.measured))
-        return known
+            progress(len(cached.measured))
+        return cached
     starts: list[float] = []
     notes: list[str] = []
     measured = measure(_video_images(source, threads, starts, notes), progress=progress)
@@ -68,13 +99,29 @@ def analyse(
     return candidates
 
 
-def frames_of(
+def build_frames(
     candidates: Candidates, choice: FrameChoice, *, focal: np.ndarray | None = None
 ) -> Frames:
-    """The rows of frames.csv for one source, telemetry still unknown.
+    """Return the rows of frames.csv for one source, with its telemetry still unknown.
 
-    focal : (N,) focal length in any unit where the telemetry tells it, NaN where not. A change of it by
-    2 %, or of the image's size, begins another camera, `<sequence>-2` and so on.
+    Parameters
+    ----------
+    candidates : Candidates
+        The measured images, N rows.
+    choice : FrameChoice
+        Status and reason of each of them.
+    focal : ndarray, shape (N,), optional
+        Focal length in any unit, as stated by the telemetry; NaN if unknown.
+
+    Returns
+    -------
+    Frames
+        N rows.
+
+    Notes
+    -----
+    A change of the focal length by more than 2 %, or of the image size, starts another camera named
+    `<sequence>-2` and so on. Returning to an earlier size and zoom returns to the earlier camera.
     """
     source, measured = candidates.source, candidates.measured
     n = len(measured)
@@ -111,7 +158,7 @@ def frames_of(
 def _video_images(
     source: Source, threads: int, starts: list[float], notes: list[str]
 ) -> Iterator[GrayImage]:
-    """The frames of all parts on one clock; fills when the parts start and what was lost."""
+    """Yield the frames of all parts on one clock; append part start times and decoding notes to the lists."""
     begin_s = 0.0
     for part_idx, part in enumerate(source.parts):
         report = video.DecodeReport()
@@ -130,7 +177,7 @@ def _video_images(
                 frame.image,
                 frame.damaged,
             )
-        # The next part begins one frame after this one's last.
+        # The next part begins one frame interval after the last frame of this one.
         step_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.04
         begin_s = round(begin_s + times[-1] + step_s, 6)
         notes += [f"{part.name}: {note}" for note in report.notes]
@@ -142,9 +189,11 @@ def _analyse_photos(source: Source, progress: Callable[[int], None] | None) -> C
     telemetry = telemetry_of_photos(
         [photo for photo in headers.metadata if photo is not None], source=source.sequence
     )
-    # Photos that can't be read take the time of the one before.
-    place = np.maximum(np.searchsorted(known, np.arange(len(source.parts)), side="right") - 1, 0)
-    times = telemetry.time_s[place] if known else np.zeros(len(source.parts))
+    # Unreadable photos take the time of the photo before.
+    last_readable = np.maximum(
+        np.searchsorted(known, np.arange(len(source.parts)), side="right") - 1, 0
+    )
+    times = telemetry.time_s[last_readable] if known else np.zeros(len(source.parts))
 
     def images() -> Iterator[GrayImage]:
         for i, (path, (width, height)) in enumerate(
@@ -159,14 +208,14 @@ def _analyse_photos(source: Source, progress: Callable[[int], None] | None) -> C
             yield GrayImage(i, 0, float(times[i]), width, height, gray, problem=problem)
 
     measured = measure(images(), lost_after=1, progress=progress)
-    spread = np.full(len(source.parts), -1)
-    spread[known] = np.arange(len(known))
-    rows = _spread(telemetry, spread, times)
+    telemetry_row = np.full(len(source.parts), -1)
+    telemetry_row[known] = np.arange(len(known))
+    rows = _expand_rows(telemetry, telemetry_row, times)
     return Candidates(source, measured, (), headers, rows, telemetry.notes)
 
 
-def _spread(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Telemetry:
-    """Rows of telemetry by index (N,), NaN where it is -1."""
+def _expand_rows(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Telemetry:
+    """Select telemetry rows by index (N,); rows with index -1 become NaN."""
 
     def column(values: np.ndarray) -> np.ndarray:
         result = np.full((len(row), *values.shape[1:]), np.nan)
@@ -190,8 +239,8 @@ def _spread(telemetry: Telemetry, row: np.ndarray, time_s: np.ndarray) -> Teleme
     )
 
 
-def _identity(source: Source) -> str:
-    """What the measurements of a video depend on."""
+def _cache_key(source: Source) -> str:
+    """Return a string of everything that a video's measurements depend on."""
     files = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in source.parts]
     return f"{_CACHE_VERSION} {MEASURE_WIDTH} {files!r}"
 
@@ -199,10 +248,10 @@ def _identity(source: Source) -> str:
 def _write_cache(path: Path, candidates: Candidates) -> None:
     measured = candidates.measured
     columns = {f.name: getattr(measured, f.name) for f in fields(measured)}
-    with writing_whole(path) as file:
+    with atomic_writer(path) as file:
         np.savez_compressed(
             file,
-            identity=np.array(_identity(candidates.source)),
+            identity=np.array(_cache_key(candidates.source)),
             part_start_s=np.array(candidates.part_start_s),
             notes=np.array(candidates.notes, dtype=np.str_),
             **columns,
@@ -210,10 +259,10 @@ def _write_cache(path: Path, candidates: Candidates) -> None:
 
 
 def _read_cache(path: Path, source: Source) -> Candidates | None:
-    """None where the cache is absent, damaged or of other files: then they are measured again."""
+    """Read cached measurements; None if the cache is missing, damaged or of other files."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            if str(data["identity"]) != _identity(source):
+            if str(data["identity"]) != _cache_key(source):
                 return None
             measured = Measurements(**{f.name: data[f.name] for f in fields(Measurements)})
             starts, notes = data["part_start_s"].tolist(), data["notes"].tolist()
@@ -223,7 +272,7 @@ def _read_cache(path: Path, source: Source) -> Candidates | None:
 
 
 def _camera_runs(measured: Measurements, focal: np.ndarray | None) -> list[object]:
-    """A key for each frame that changes with the size or the zoom; back at an old one, the old key."""
+    """Return one key per frame that changes with image size or zoom; a known combination keeps its key."""
     zooms: list[float] = []
     keys: list[object] = []
     zoom = 0
@@ -238,14 +287,14 @@ def _camera_runs(measured: Measurements, focal: np.ndarray | None) -> list[objec
 
 
 def _camera_names(sequence: str, keys: Sequence[object]) -> list[str]:
-    """`<sequence>` for the first key, `<sequence>-2` for the second; an unknown key takes the first's."""
+    """Name cameras `<sequence>`, `<sequence>-2`, ... in order of their keys; None takes the first name."""
     order = {key: i for i, key in enumerate(dict.fromkeys(k for k in keys if k is not None))}
     numbers = [order.get(key, 0) for key in keys]
     return [sequence if k == 0 else f"{sequence}-{k + 1}" for k in numbers]
 
 
 def photo_stems(paths: Sequence[Path]) -> list[str]:
-    """A safe name for each photo, unique also where case does not count."""
+    """Return a safe file stem for each photo, unique even if case is ignored."""
     taken: set[str] = set()
     stems = []
     for path in paths:

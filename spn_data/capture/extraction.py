@@ -1,4 +1,4 @@
-"""The chosen frames as image files, and what making them costs."""
+"""Writing the chosen frames as image files, and estimating what that costs."""
 
 from __future__ import annotations
 
@@ -15,25 +15,39 @@ from spn_data.capture.frames import Frames
 from spn_data.capture.photos import decode_photo, read_headers
 from spn_data.capture.sources import Source, SourceKind
 from spn_data.errors import InputError
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
 JPEG_QUALITY = 95
 
-# Measured with videos of 0.4 to 2.5 megapixels on two cores: decoding takes 0.007 (H.264 of usual bit
-# rate) to 0.012 CPU seconds a megapixel (noisy H.264, H.265), and JPEG files 0.3 to 0.65 bytes a pixel.
+# Measured on two cores with videos of 0.4 to 2.5 megapixels: decoding takes 0.007 (H.264 at a usual bit
+# rate) to 0.012 CPU seconds per megapixel (noisy H.264, H.265); JPEG files take 0.3 to 0.65 bytes per pixel.
 DECODE_S_PER_MEGAPIXEL = 0.007
 ENCODE_S_PER_MEGAPIXEL = 0.015
 BYTES_PER_PIXEL = 0.6
-CHOSEN_PER_S = 1.3  # of video, where no target is given
+CHOSEN_PER_S = 1.3  # frames per second of video if there is no target
 
 
 @dataclass(frozen=True)
 class ExtractionCost:
-    """What making the frames is expected to take."""
+    """The expected cost of making the frames.
+
+    Attributes
+    ----------
+    candidates : int
+        Candidate frames in all sources.
+    chosen : int
+        Frames expected to be chosen.
+    chosen_megapixels : float
+        Total size of the chosen frames.
+    seconds : float
+        CPU time.
+    disk_bytes : int
+        Disk space.
+    """
 
     candidates: int
     chosen: int
-    chosen_megapixels: float  # of all of them
+    chosen_megapixels: float
     seconds: float
     disk_bytes: int
 
@@ -46,11 +60,32 @@ def extract_chosen(
     threads: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Writes the chosen frames of one source as `<folder>/<frame>.jpg`; returns how many were written.
+    """Write the chosen frames of one source as `<folder>/<frame>.jpg`.
 
-    frames : the rows of this source. Each file appears whole, by renaming; those that exist are kept, so
-    that an interrupted call can be made again. `progress` hears how many chosen frames are done, kept ones
-    included. InputError where the source does not hold a chosen frame any more, or the disk is full.
+    Each file is written atomically and existing files are kept, so an interrupted call can be repeated.
+
+    Parameters
+    ----------
+    source : Source
+        The video or photos to extract from.
+    frames : Frames
+        The rows of this source.
+    folder : Path
+        Created if it does not exist.
+    threads : int
+        Decoder threads, 0 for one per core.
+    progress : callable, optional
+        Called with the number of chosen frames that are done, including those kept.
+
+    Returns
+    -------
+    int
+        Number of files written.
+
+    Raises
+    ------
+    InputError
+        If the source no longer contains a chosen frame, or the disk is full.
     """
     rows = np.flatnonzero(frames.chosen)
     targets = {int(r): folder / frames.names[r].split("/")[1] for r in rows}
@@ -65,11 +100,11 @@ def extract_chosen(
     if progress is not None:
         progress(done)
     for part in source.parts:
-        here = {r: path for r, path in missing.items() if frames.sources[r] == part.name}
-        if not here:
+        targets_of_part = {r: path for r, path in missing.items() if frames.sources[r] == part.name}
+        if not targets_of_part:
             continue
-        one = _extract_photo if source.kind is SourceKind.PHOTOS else _extract_video
-        for _ in one(part, frames, here, threads):
+        extract = _extract_photo if source.kind is SourceKind.PHOTOS else _extract_video
+        for _ in extract(part, frames, targets_of_part, threads):
             done += 1
             if progress is not None:
                 progress(done)
@@ -83,10 +118,31 @@ def estimate_cost(
     chosen_per_s: float = CHOSEN_PER_S,
     probe: Callable[[Path], video.VideoInfo] = video.probe,
 ) -> ExtractionCost:
-    """Time and disk for measuring, choosing and writing the frames of sources, from headers alone.
+    """Estimate time and disk space for measuring, choosing and writing the frames of all sources.
 
-    The number of frames that motion will choose is not known before; without a target (of all videos) it is
-    taken as `chosen_per_s`. Photos count whole, as they are. Rough: within a factor of two.
+    Reads headers only and is rough: within a factor of two.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        Videos and photo folders.
+    target_count : int, optional
+        Number of frames wanted from all videos together.
+    chosen_per_s : float
+        Frames per second of video, used if there is no target: how many frames the motion will select is
+        not known in advance. Photos all count, at their file size.
+    probe : callable
+        Returns the `VideoInfo` of a file.
+
+    Returns
+    -------
+    ExtractionCost
+        The estimate.
+
+    Raises
+    ------
+    InputError
+        If a video cannot be read.
     """
     candidates, chosen, chosen_megapixels, seconds = 0, 0.0, 0.0, 0.0
     photos, photo_bytes, photo_megapixels = 0, 0, 0.0
@@ -105,9 +161,8 @@ def estimate_cost(
             candidates += info.frame_count
             chosen += number
             chosen_megapixels += number * megapixel
-            seconds += (
-                2 * info.frame_count * megapixel * DECODE_S_PER_MEGAPIXEL
-            )  # measured, then extracted
+            # Every frame is decoded twice: once to measure, once to extract.
+            seconds += 2 * info.frame_count * megapixel * DECODE_S_PER_MEGAPIXEL
     if target_count is not None and chosen:
         chosen_megapixels *= target_count / chosen
         chosen = target_count
@@ -123,15 +178,28 @@ def estimate_cost(
 
 
 def check_space(folder: Path, needed_bytes: int) -> None:
-    """InputError where the disk of a folder, or of the nearest that exists above it, has too little room."""
+    """Check that the disk has room for the frames.
+
+    Parameters
+    ----------
+    folder : Path
+        Target folder; if it does not exist, its nearest existing parent is checked.
+    needed_bytes : int
+        Space needed.
+
+    Raises
+    ------
+    InputError
+        If less space is free.
+    """
     place = folder.absolute()
     while not place.exists():
         place = place.parent
     free = shutil.disk_usage(place).free
     if needed_bytes > free:
         raise InputError(
-            f"the frames need about {needed_bytes / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; "
-            "choose fewer frames, or another disk",
+            f"the frames need about {needed_bytes / 1e9:.2f} GB but only {free / 1e9:.2f} GB are free; "
+            "choose fewer frames or use another disk",
             path=folder,
         )
 
@@ -148,11 +216,11 @@ def _extract_video(
             break
         ok, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert ok
-        write_whole(targets[row], data.tobytes())
+        write_atomically(targets[row], data.tobytes())
         yield targets[row]
     if wanted:
         raise InputError(
-            f"frame {min(wanted)} is not in it any more: the video changed since it was measured",
+            f"frame {min(wanted)} is missing: the video has changed since it was measured",
             path=part,
         )
 
@@ -160,18 +228,18 @@ def _extract_video(
 def _extract_photo(
     part: Path, frames: Frames, targets: dict[int, Path], threads: int
 ) -> Iterator[Path]:
-    """The JPEG's own bytes where it stands upright already, else its pixels, turned."""
+    """Copy an upright JPEG byte by byte; re-encode any other photo as an upright JPEG."""
     [(row, target)] = targets.items()
     (metadata,) = read_headers([part]).metadata
     with part.open("rb") as file:
         is_jpeg = file.read(3) == b"\xff\xd8\xff"
     if is_jpeg and metadata is not None and metadata.orientation == 1:
-        write_whole(target, part.read_bytes())
+        write_atomically(target, part.read_bytes())
     else:
         image = decode_photo(part)
         if image.shape[:2] != (frames.height[row], frames.width[row]):
-            raise InputError("changed since it was measured", path=part)
+            raise InputError("the photo has changed since it was measured", path=part)
         ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert ok
-        write_whole(target, data.tobytes())
+        write_atomically(target, data.tobytes())
     yield target

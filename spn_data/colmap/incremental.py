@@ -78,7 +78,7 @@ def _map_small(
     job: MappingJob, options: pycolmap.IncrementalPipelineOptions
 ) -> dict[int, pycolmap.Reconstruction]:
     count, token = _Count(job), pycolmap.CancellationToken()
-    with child.interrupts(token.cancel):
+    with child.cancel_on_interrupt(token.cancel):
         models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
             job.database,
             job.images,
@@ -140,7 +140,7 @@ def _map_large(
     callbacks = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(int(callbacks.INITIAL_IMAGE_PAIR_REG_CALLBACK), count.initial)
     pipeline.add_callback(int(callbacks.NEXT_IMAGE_REG_CALLBACK), on_next)
-    with child.interrupts(interrupt):
+    with child.cancel_on_interrupt(interrupt):
         pipeline.reconstruct(mapper, options.get_mapper(), bool(job.start_from))
     made = {i: models.get(i) for i in range(models.size())}
     # The last images may have closed a loop, and lie metres off on one side of it.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.grouping import number_within
+from spn_data.geometry.grouping import rank_within_group
 from spn_data.geometry.pose import Poses
 from spn_data.work.timing import Progress
 
@@ -125,7 +125,7 @@ def _share(
     points, ranges, cells = points[free], ranges[free], cells[free]
     covered = np.zeros(count, dtype=bool)
     # One known point covers a cell, and one of the first few mostly is: the rest is seldom looked at.
-    is_first = number_within(cells, count) < _FIRST
+    is_first = rank_within_group(cells, count) < _FIRST
     for wanted in (is_first, ~is_first):
         part = np.flatnonzero(wanted & ~covered[cells])
         covered[cells[part][_known(center, points[part], ranges[part], seen, options)]] = True

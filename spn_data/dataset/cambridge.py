@@ -15,7 +15,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
 TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (
     f"dataset_{part}.txt" for part in ("train", "validation", "test")
@@ -89,7 +89,7 @@ def write_cambridge(path: Path, names: Sequence[str], poses: Poses) -> None:
     for name, row in zip(names, numbers.tolist(), strict=True):
         _check_name(name)
         lines.append(" ".join([name, *(f"{value:.6f}" for value in row)]))
-    write_whole(path, "\n".join(lines) + "\n")
+    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def far_positions(centers: np.ndarray) -> np.ndarray:

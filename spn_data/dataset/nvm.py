@@ -18,9 +18,9 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.grouping import number_within
+from spn_data.geometry.grouping import rank_within_group
 from spn_data.geometry.pose import Poses, canonical_quats
-from spn_data.storage.files import writing_whole
+from spn_data.storage.files import atomic_writer
 
 MAX_IMAGES = 1_000_000
 MAX_POINTS = 100_000_000
@@ -72,7 +72,7 @@ def nvm_model(
         points[1][used],
         new_idx,
         image_idx,
-        number_within(image_idx, len(names)),
+        rank_within_group(image_idx, len(names)),
         offsets_px,
     )
 
@@ -85,7 +85,7 @@ def offsets_from_center(camera: Camera, pixels: np.ndarray, focal_px: float) -> 
 def write_nvm(path: Path, model: NvmModel) -> None:
     """The file appears whole. Numbers are written so that they are read back the same, bit by bit."""
     _check(model)
-    with writing_whole(path, "w") as file:
+    with atomic_writer(path, "w") as file:
         file.writelines(_text(model))
 
 

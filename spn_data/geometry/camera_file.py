@@ -52,7 +52,7 @@ def read_camera(path: Path) -> Camera:
         ) from error
 
 
-def at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
+def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
     """A given camera for images of a size. Raises InputError, for `where`, where their shape is another."""
     if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
         raise InputError(
@@ -62,7 +62,7 @@ def at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camer
     return camera.scaled(width, height)
 
 
-def of_focal_length(focal_px: float, width: int, height: int) -> Camera:
+def camera_from_focal_length(focal_px: float, width: int, height: int) -> Camera:
     """A lens of which nothing but a focal length is known: centred, with a radial term of 0."""
     params = np.array([focal_px, width / 2, height / 2, 0.0])
     return Camera("SIMPLE_RADIAL", width, height, params)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def number_within(group: np.ndarray, count: int) -> np.ndarray:
+def rank_within_group(group: np.ndarray, count: int) -> np.ndarray:
     """(M,) how many rows of the same group, (M,) 0..count-1, come before each."""
     # Small integers are sorted by radix, several times faster.
     order = np.argsort(group.astype(np.min_scalar_type(count)), kind="stable")

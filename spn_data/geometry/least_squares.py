@@ -65,7 +65,7 @@ def pose_jacobians(
     return np.concatenate([-by_point, np.cross(points_cam[:, None], by_point_cam)], axis=2)
 
 
-def lens_mixing(parameters: Sequence[str]) -> np.ndarray:
+def lens_parameter_jacobian(parameters: Sequence[str]) -> np.ndarray:
     """(8, L) from L parameters, by their names in COLMAP's models, to fx, fy, cx, cy, k1, k2, p1, p2."""
     mixing = np.zeros((LENS, len(parameters)))
     for k, name in enumerate(parameters):
@@ -101,7 +101,7 @@ def point_whitening(
     return np.linalg.inv(np.linalg.cholesky(information))
 
 
-def cluster_pulls(
+def cluster_scores(
     residuals: np.ndarray, cluster: np.ndarray, design: sparse.csr_matrix
 ) -> sparse.csr_matrix:
     """(C, n) pull of each cluster's residuals together on the unknowns of a design (2 M, n).

@@ -169,7 +169,7 @@ class PinholeRenderer:
         size = (self.target.width, self.target.height)
         return cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
 
-    def move(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def map_pixels(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points of the full-size image come to lie: pixels (N, 2) and which are seen, (N,) bool.
 
         Both in COLMAP's pixel convention. Not seen are those that fall outside the rendered image or on

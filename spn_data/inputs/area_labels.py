@@ -17,7 +17,7 @@ from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
-from spn_data.labels.labels import LabelObservations, Labels, read_labels, read_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, read_label_observations, read_labels
 from spn_data.labels.map_points import MapPoints, covered_share
 from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.storage.json_files import read_json
@@ -214,8 +214,8 @@ def _read_stage(
     there = read_json(folder / REGISTRATION)["world_from_model"]
     written = similarity_from_json(there)
     if similarity_to_json(written) != similarity_to_json(world_from_model):
-        labels = labels.moved(world_from_model @ written.inverse())
-    return labels, read_seen_points(folder / SEEN)
+        labels = labels.transformed(world_from_model @ written.inverse())
+    return labels, read_label_observations(folder / SEEN)
 
 
 def together(parts: list[tuple[Labels, LabelObservations]]) -> tuple[Labels, LabelObservations]:

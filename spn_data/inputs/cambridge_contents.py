@@ -15,7 +15,7 @@ from spn_data.inputs.dataset_contents import GivenFrames
 from spn_data.labels.map_points import MapPoints
 from spn_data.split.audit import MIN_TRAINING_VIEWS
 from spn_data.split.groups import TRAIN, VALIDATION
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
 _LISTS = {TRAIN: TRAIN_LIST, VALIDATION: VALIDATION_LIST}
 
@@ -51,7 +51,7 @@ class CambridgeFolder:
         ok, data = cv2.imencode(".png", self._renderer(key).render(image))
         if not ok:
             raise ValueError(f"{frame} can't be encoded as PNG")
-        write_whole(path, data.tobytes())
+        write_atomically(path, data.tobytes())
 
     def finish(self, frames: GivenFrames, rows: np.ndarray, points: MapPoints) -> None:
         """The lists, each sorted by sequence and time, and the model. rows : of frames with an image."""
@@ -79,7 +79,7 @@ class CambridgeFolder:
             if frames.group[row] != TRAIN:
                 continue
             own_ids, pixels = frames.points_of(row)
-            moved, is_seen = renderer.move(pixels)
+            moved, is_seen = renderer.map_pixels(pixels)
             images.append(np.full(int(is_seen.sum()), image))
             ids.append(own_ids[is_seen])
             offsets.append(moved[is_seen] - [target.width / 2, target.height / 2])

@@ -122,7 +122,7 @@ class RenderedFrames:
         labels, key = self._frames.labels, str(self._frames.labels.cameras[row])
         renderer = self._renderer(key)
         ids, pixels = self._frames.points_of(row)
-        moved, is_seen = renderer.move(pixels)
+        moved, is_seen = renderer.map_pixels(pixels)
         return DatasetFrame(
             name=str(labels.names[row]),
             sequence=str(labels.sequences[row]),

@@ -10,7 +10,7 @@ import numpy as np
 from spn_data.capture.frames import Frames
 from spn_data.capture.photos import PhotoHeaders
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import at_size, camera_to_json, of_focal_length
+from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length, camera_to_json
 
 # Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
 _GUESSED_FOCAL_SHARE = 0.7
@@ -38,15 +38,15 @@ def start_cameras(
             camera = given.get(sequence, given.get("*"))
         focal_px = None if photos is None else photos.focal_px(row)
         if camera is not None:
-            camera, source = at_size(camera, width, height, sequence), "given"
+            camera, source = camera_at_size(camera, width, height, sequence), "given"
         elif fov is not None:
             camera = Camera.from_horizontal_fov(width, height, fov, (0.0,))
             source = f"horizontal field of view of {fov:g} deg, as given"
         elif focal_px is not None:
-            camera, source = of_focal_length(focal_px, width, height), "photo metadata"
+            camera, source = camera_from_focal_length(focal_px, width, height), "photo metadata"
         else:
             guess = _GUESSED_FOCAL_SHARE * max(width, height)
-            camera, source = of_focal_length(guess, width, height), "guess"
+            camera, source = camera_from_focal_length(guess, width, height), "guess"
         cameras[key] = {
             **camera_to_json(camera),
             "focal_is_known": source != "guess",

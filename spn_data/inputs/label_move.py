@@ -39,7 +39,7 @@ def _move(area: Area, stage: str) -> bool:
     now = read_world_from_model(area)
     if similarity_to_json(there) == similarity_to_json(now):
         return False
-    labels = read_labels(folder / POSES).moved(now @ there.inverse())
+    labels = read_labels(folder / POSES).transformed(now @ there.inverse())
     new = folder.with_name(f".moved-{folder.name}")
     shutil.rmtree(new, ignore_errors=True)
     shutil.copytree(

@@ -15,7 +15,7 @@ import numpy as np
 from spn_data.capture.frames import Frames, check_name
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, Similarity, canonical_quats
-from spn_data.storage.files import read_csv, write_csv, writing_whole
+from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000
 # What NumPy lets through of a damaged archive.
@@ -128,7 +128,7 @@ class Labels:
         }
         return cls(**values, poses=Poses.concatenate(p.poses for p in parts))
 
-    def moved(self, b_from_a: Similarity) -> Labels:
+    def transformed(self, b_from_a: Similarity) -> Labels:
         """The same labels in another frame of the same map; covariances turn and scale with it."""
         has = np.flatnonzero(self.registered)
         poses = b_from_a.apply_to_poses(self.poses[has]).at_rows(has, len(self))
@@ -287,9 +287,9 @@ def _number(cell: str) -> float:
     return value
 
 
-def write_seen_points(path: Path, seen: LabelObservations) -> None:
+def write_label_observations(path: Path, seen: LabelObservations) -> None:
     """As observations.npz, plain arrays; the file appears whole."""
-    with writing_whole(path) as file:
+    with atomic_writer(path) as file:
         np.savez_compressed(
             file,
             frame_idx=seen.frame_idx.astype(np.int64),
@@ -298,8 +298,8 @@ def write_seen_points(path: Path, seen: LabelObservations) -> None:
         )
 
 
-def read_seen_points(path: Path) -> LabelObservations:
-    """Raises InputError where it is not what `write_seen_points` writes. No pickle is opened."""
+def read_label_observations(path: Path) -> LabelObservations:
+    """Raises InputError where it is not what `write_label_observations` writes. No pickle is opened."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             seen = LabelObservations(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])

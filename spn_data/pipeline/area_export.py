@@ -27,7 +27,7 @@ from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
 from spn_data.inputs.area_labels import LabelledArea, map_folder, read_labelled_area, together
 from spn_data.inputs.frame_images import image_path
-from spn_data.storage.files import exchange
+from spn_data.storage.files import replace_folder
 from spn_data.storage.json_files import VERSION, write_json
 
 RECORD = "export.json"
@@ -123,7 +123,7 @@ def export(
             _write(area, one, folder, frames, images=options.images)
         if format_name == Format.ALL:
             write_json(partial / RECORD, {"version": VERSION, "format": Format.ALL.value})
-        exchange(partial, target)
+        replace_folder(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return ExportedLabels(

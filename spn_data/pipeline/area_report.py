@@ -26,7 +26,7 @@ from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportDa
 from spn_data.report.html import render
 from spn_data.report.verdict import AreaVerdict, verdict
 from spn_data.split.split_file import read_split
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import read_json
 from spn_data.storage.stage_record import versions
 
@@ -50,7 +50,7 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
     options = options or ReportOptions()
     path, data = area.root / FILE, report_data(area)
     html = render(data, max_points=options.max_points, max_frames=options.max_frames)
-    write_whole(path, html)
+    write_atomically(path, html)
     return path, verdict(data)
 
 

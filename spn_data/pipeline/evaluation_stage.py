@@ -28,7 +28,7 @@ from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
 from spn_data.inputs.source_fingerprints import fingerprints
-from spn_data.labels.labels import Labels, sigmas, write_labels, write_seen_points
+from spn_data.labels.labels import Labels, sigmas, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
@@ -80,7 +80,7 @@ def register(
     if isinstance(work, StageRecord):
         return work
     record = _register(area, work, source, given, options, progress, dispatch)
-    known = {**area.facts.evaluation, source.sequence: area.place_of(video)}
+    known = {**area.facts.evaluation, source.sequence: area.stored_path(video)}
     area.write_facts(Facts(sources=area.facts.sources, evaluation=known))
     return record
 
@@ -129,10 +129,10 @@ def _register(
     labels = labels_of(chosen, found)
     solution, covariance = found.solution, found.covariance
     world_from_model = read_world_from_model(area)
-    labels = labels.moved(world_from_model)
+    labels = labels.transformed(world_from_model)
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
-        write_seen_points(work.path / SEEN, found.seen)
+        write_label_observations(work.path / SEEN, found.seen)
         lens = {} if covariance is None else _lens_json(covariance)
         camera = {"version": VERSION, **camera_to_json(solution.camera), **lens}
         write_json(work.path / CAMERA, {**camera, "start": _start_json(taken.start)})

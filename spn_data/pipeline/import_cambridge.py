@@ -243,7 +243,7 @@ def _frame(
     if camera is None or model is None:
         return frame
     ids, pixels, xyz = model.points(k, width, height)
-    moved, is_seen = renderer.move(pixels)
+    moved, is_seen = renderer.map_pixels(pixels)
     return replace(
         frame,
         intrinsics=renderer.target.matrix,

@@ -90,10 +90,10 @@ def add(
     options = replace(options, geo=geo)
     found = plan(inputs, options.frames, extended=area, tested=area)
     if overwrite:
-        area.drop_next()
+        area.discard_next()
     following = area.next_area()
     _stages(following, found, inputs, options, watcher, overwrite=False, extended=area)
-    area.take_next()
+    area.replace_by_next()
 
 
 def _stages(
@@ -122,7 +122,7 @@ def _stages(
     )
     earlier = () if extended is None else extended.facts.sources
     lasting = area if extended is None else extended
-    given = [lasting.place_of(path) for path in inputs]
+    given = [lasting.stored_path(path) for path in inputs]
     area.write_facts(Facts(sources=(*earlier, *given), evaluation=lasting.facts.evaluation))
     tell(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)

@@ -26,7 +26,7 @@ from spn_data.inputs.area_labels import (
 )
 from spn_data.inputs.evaluation_source import FRAMES_FILE
 from spn_data.inputs.source_videos import find_videos
-from spn_data.labels.labels import LabelObservations, Labels, write_labels, write_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.labels.map_points import MapPoints
 from spn_data.registration.adjustment import lens_parameters
@@ -95,7 +95,7 @@ def track_sequence(
         labels = _with_covariances(area, labelled, labels, seen, sequence)
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
-        write_seen_points(work.path / SEEN, seen)
+        write_label_observations(work.path / SEEN, seen)
         after = map_hash(area.folder(MODEL))
         if after != before:
             raise StageError(f"{area.root}: the map changed while {sequence} was labelled")

@@ -30,7 +30,7 @@ from spn_data.reconstruction.correspondences import (
     match_missing,
 )
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
@@ -258,7 +258,7 @@ def _map(
             log=run.work / "mapping.log",
             progress=lambda registered: run.progress("mapping", min(registered, n), n),
         )
-    write_whole(done, json.dumps([model.name for model in models]))
+    write_atomically(done, json.dumps([model.name for model in models]))
     return models
 
 
@@ -274,7 +274,9 @@ def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path
         if attempt.thinned:
             model = _with_all_points(run, attempt, model)
         model = _without_misplaced(run, attempt.database, model, told)
-        write_whole(done, json.dumps({"model": str(model.relative_to(run.work)), "told": told}))
+        write_atomically(
+            done, json.dumps({"model": str(model.relative_to(run.work)), "told": told})
+        )
     found = json.loads(done.read_text())
     story += found["told"]
     return run.work / found["model"]

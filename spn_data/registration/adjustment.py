@@ -15,7 +15,7 @@ from spn_data.geometry.camera import MODELS, Camera
 from spn_data.geometry.least_squares import (
     POSE,
     cauchy_weights,
-    lens_mixing,
+    lens_parameter_jacobian,
     pose_jacobians,
     projection_jacobians,
     rows_to_sparse,
@@ -94,7 +94,7 @@ def linearize(
     by_camera_point[behind] = 0.0
     by_point = by_camera_point @ rotations
     by_pose = pose_jacobians(safe, by_camera_point, by_point)
-    by_lens = by_all @ lens_mixing(lens)
+    by_lens = by_all @ lens_parameter_jacobian(lens)
     return Linearized(residuals, by_pose, by_lens, by_point, lens)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from spn_data.geometry.least_squares import POSE, cauchy_weights, cluster_pulls, rows_to_sparse
+from spn_data.geometry.least_squares import POSE, cauchy_weights, cluster_scores, rows_to_sparse
 from spn_data.registration.adjustment import (
     Linearized,
     SequenceObservations,
@@ -126,7 +126,7 @@ def _design_effect(
     residuals = (residuals_px * np.sqrt(weights)[:, None]).ravel()
 
     def squared_pull(group: np.ndarray) -> np.ndarray:
-        pull = cluster_pulls(residuals, group, by_unknown)
+        pull = cluster_scores(residuals, group, by_unknown)
         return np.asarray(pull.multiply(pull).sum(axis=0)).ravel()
 
     single = squared_pull(np.arange(len(residuals_px)))

@@ -11,7 +11,7 @@ from spn_data.colmap.database import MapDatabase
 from spn_data.matching.putative import MatchOptions, match_descriptors
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.storage.files import writing_whole
+from spn_data.storage.files import atomic_writer
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
 
@@ -74,7 +74,7 @@ def look_up_missing(
     def store(result: list[tuple[str, np.ndarray]]) -> None:
         nonlocal done
         for name, matches in result:
-            with writing_whole(files[name]) as file:
+            with atomic_writer(files[name]) as file:
                 np.save(file, matches)
         done += len(result)
         progress("map matches", done, len(names))

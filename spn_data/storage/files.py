@@ -18,7 +18,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def writing_whole(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
+def atomic_writer(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """A file to write ("wb", or "w" for UTF-8 with its line ends as they are) that then takes its name.
 
     What stood there before stays until then, and of a failure nothing is left. Raises StageError where the
@@ -40,13 +40,13 @@ def writing_whole(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
-    """See `writing_whole`."""
-    with writing_whole(path, "w" if isinstance(content, str) else "wb") as file:
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """See `atomic_writer`."""
+    with atomic_writer(path, "w" if isinstance(content, str) else "wb") as file:
         file.write(content)
 
 
-def exchange(partial: Path, target: Path) -> None:
+def replace_folder(partial: Path, target: Path) -> None:
     """Give a complete folder its name; what stood there, if anything, goes only then."""
     old = target.with_name(f".{target.name}.old")
     shutil.rmtree(old, ignore_errors=True)
@@ -75,12 +75,12 @@ def locked(folder: Path, program: str) -> Iterator[None]:
 
 
 def write_csv(path: Path, columns: Mapping[str, Iterable[object]]) -> None:
-    """Columns of cells, all of one length, under their names; see `writing_whole`."""
+    """Columns of cells, all of one length, under their names; see `atomic_writer`."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
-    write_whole(path, text.getvalue())
+    write_atomically(path, text.getvalue())
 
 
 def read_csv(

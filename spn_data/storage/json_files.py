@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import FormatError
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 
 VERSION = 1  # of the area's layout and of stage.json
 
@@ -24,7 +24,7 @@ def write_json(path: Path, value: Any) -> None:
     StageError
         If the file cannot be written.
     """
-    write_whole(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
+    write_atomically(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -52,7 +52,7 @@ def check_version(path: Path, found: int) -> None:
         )
 
 
-def finite_or_none(value: float) -> float | None:
+def finite_or_none(value: float | np.floating[Any]) -> float | None:
     """Return a number as a Python float, or None (JSON null) if it is NaN or infinite."""
     return float(value) if math.isfinite(value) else None
 
@@ -64,7 +64,7 @@ def finite(value: Any) -> Any:
     other values are returned as they are.
     """
     if isinstance(value, float | np.floating):
-        return finite_or_none(float(value))
+        return finite_or_none(value)
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -10,7 +10,7 @@ import numpy as np
 
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 from spn_data.telemetry.track import Telemetry
 
 _COLUMNS = (
@@ -44,7 +44,7 @@ def write_track(path: Path, telemetry: Telemetry) -> None:
     )
     lines = [f"# {json.dumps(about)}", _COLUMNS]
     lines += [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows]
-    write_whole(path, "\n".join(lines) + "\n")
+    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def read_track(path: Path) -> Telemetry:

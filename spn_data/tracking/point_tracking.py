@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.grouping import number_within
+from spn_data.geometry.grouping import rank_within_group
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
 from spn_data.labels.map_points import covered_share
@@ -110,7 +110,7 @@ def spread(pixels: np.ndarray, width: int, height: int, count: int) -> np.ndarra
     columns = int(np.ceil(width / side))
     x, y = (pixels // side).astype(np.int64).T
     cells = y * columns + x
-    rank_in_cell = number_within(cells, int(cells.max()) + 1)
+    rank_in_cell = rank_within_group(cells, int(cells.max()) + 1)
     return np.sort(np.argsort(rank_in_cell, kind="stable")[:count])
 
 

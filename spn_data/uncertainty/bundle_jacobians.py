@@ -14,7 +14,7 @@ from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.camera import MODELS, Camera
 from spn_data.geometry.least_squares import (
     POSE,
-    lens_mixing,
+    lens_parameter_jacobian,
     point_whitening,
     pose_jacobians,
     projection_jacobians,
@@ -31,13 +31,13 @@ _RIDGE = 1e-12
 class Unknowns:
     """Columns of frames and lenses, `count` in all; those of frame i are 6 i to 6 i + 5.
 
-    lens_columns : by camera id, (L,); lens_mixing : by camera id, (8, L) from the L parameters that mapping
+    lens_columns : by camera id, (L,); lens_jacobian : by camera id, (8, L) from the L parameters that mapping
     estimated to fx, fy, cx, cy, k1, k2, p1, p2.
     """
 
     count: int
     lens_columns: dict[int, np.ndarray]
-    lens_mixing: dict[int, np.ndarray]
+    lens_jacobian: dict[int, np.ndarray]
 
     @classmethod
     def of(cls, scene: Scene, *, refine_principal_point: bool) -> Unknowns:
@@ -45,7 +45,9 @@ class Unknowns:
         count = POSE * len(scene.names)
         for camera_id in np.unique(scene.camera_ids).tolist():
             camera = scene.cameras[camera_id]
-            mixing[camera_id] = lens_mixing(_lens_parameters(camera, refine_principal_point))
+            mixing[camera_id] = lens_parameter_jacobian(
+                _lens_parameters(camera, refine_principal_point)
+            )
             columns[camera_id] = count + np.arange(mixing[camera_id].shape[1])
             count += mixing[camera_id].shape[1]
         return cls(count, columns, mixing)
@@ -81,7 +83,7 @@ class LinearizedBundle:
     residuals: np.ndarray
     views: np.ndarray
 
-    def information(self) -> sparse.csr_matrix:
+    def reduced_normal_matrix(self) -> sparse.csr_matrix:
         """(n, n) on frames and lenses after points are eliminated; singular by the gauge."""
         return (self.design.T @ self.design - self.coupling.T @ self.coupling).tocsr()
 
@@ -104,7 +106,7 @@ def linearize_bundle(
         own = np.flatnonzero(ids == camera_id)
         by_cam[own], by_lens = projection_jacobians(scene.cameras[camera_id], points_cam[own])
         columns = unknowns.lens_columns[camera_id]
-        lens[own, :, : len(columns)] = by_lens @ unknowns.lens_mixing[camera_id]
+        lens[own, :, : len(columns)] = by_lens @ unknowns.lens_jacobian[camera_id]
         lens_columns[own, : len(columns)] = columns
     by_point = by_cam @ rotations
     values = np.concatenate([pose_jacobians(points_cam, by_cam, by_point), lens], axis=2)
@@ -127,7 +129,7 @@ def linearize_bundle(
     )
 
 
-def gauge_directions(scene: Scene, unknowns: Unknowns) -> np.ndarray:
+def gauge_null_space(scene: Scene, unknowns: Unknowns) -> np.ndarray:
     """(n, 7) changes of the unknowns by moving, turning and scaling the world about its centres."""
     centers, rotations = scene.poses.centers, scene.poses.rotations
     offsets = centers - centers.mean(axis=0)

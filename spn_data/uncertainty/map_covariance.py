@@ -21,14 +21,14 @@ from scipy import sparse
 
 from spn_data.colmap.model import MapObservations, Scene
 from spn_data.errors import GeometryError
-from spn_data.geometry.least_squares import POSE, cluster_pulls
+from spn_data.geometry.least_squares import POSE, cluster_scores
 from spn_data.uncertainty.bundle_jacobians import (
     GAUGE,
     LinearizedBundle,
     Unknowns,
     linearize_bundle,
 )
-from spn_data.uncertainty.gauged_inverse import GaugedInverse
+from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, own_errors
 
 _FRAMES_AT_ONCE = 32
@@ -72,7 +72,7 @@ class MapCovariance:
     noise: TrackNoise | None
     _unknowns: Unknowns
     _frames: int
-    _inverse: GaugedInverse
+    _inverse: InnerConstraintInverse
     _pull: sparse.csr_matrix  # (n, n), M
     _place: (
         np.ndarray
@@ -104,7 +104,7 @@ class MapCovariance:
         squares, parts = 0.0, []
         for part in _parts(rows, cluster[seen.point_idx[rows]]):
             bundle = linearize_bundle(scene, seen, unknowns, part)
-            information = information + bundle.information()
+            information = information + bundle.reduced_normal_matrix()
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
                 pull = pull + _clustered_pull(bundle, cluster[bundle.points])
@@ -127,7 +127,7 @@ class MapCovariance:
             noise,
             unknowns,
             len(scene.names),
-            GaugedInverse.of(information, scene, unknowns),
+            InnerConstraintInverse.of(information, scene, unknowns),
             pull.tocsr(),
             place,
             np.concatenate([part[1] for part in parts]),
@@ -178,7 +178,7 @@ class MapCovariance:
         rows = (3 * place[:, None] + np.arange(3)).ravel()
         right = -(self._coupling[rows].T @ by_own.reshape(len(by_own), 3 * len(place)).T)
         if functional.camera_id is not None and functional.by_lens is not None:
-            mixing = self._unknowns.lens_mixing[functional.camera_id]
+            mixing = self._unknowns.lens_jacobian[functional.camera_id]
             right[self._unknowns.lens_columns[functional.camera_id]] += (
                 functional.by_lens @ mixing
             ).T
@@ -213,5 +213,5 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
 def _clustered_pull(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
     """(n, n) sum over clusters of the outer product of their pull on frames and lenses."""
     cluster = np.unique(cluster_of_point, return_inverse=True)[1]
-    pulls = cluster_pulls(bundle.residuals, cluster[bundle.point], bundle.design)
+    pulls = cluster_scores(bundle.residuals, cluster[bundle.point], bundle.design)
     return (pulls.T @ pulls).tocsr()

@@ -99,7 +99,7 @@ def send(event: Event) -> None:
 
 
 @contextmanager
-def interrupts(cancel: Callable[[], None]) -> Iterator[None]:
+def cancel_on_interrupt(cancel: Callable[[], None]) -> Iterator[None]:
     """In the child: SIGINT calls cancel instead of raising wherever Python happens to be."""
     before = signal.signal(signal.SIGINT, lambda *_: cancel())
     try:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import InputError
-from spn_data.work.parallel import Batch, Dispatch, Team, WorkerDiedError
+from spn_data.work.parallel import Batch, Dispatch, WorkerDiedError, WorkerPool
 
 _CONNECT_S = 10.0
 _WAIT_FOR_WORKERS_S = 30.0
@@ -28,7 +28,7 @@ def dispatch_to(address: str, workers: int) -> Iterator[Dispatch]:
     if address:
         yield partial(run_on_cluster, address)
     else:
-        with Team(workers) as team:
+        with WorkerPool(workers) as team:
             yield team.run
 
 
@@ -38,7 +38,7 @@ def run_on_cluster(
     batches: Iterable[Batch],
     on_result: Callable[[Any], None],
 ) -> None:
-    """As `parallel.Team.run`, by the workers of the scheduler at an address (tcp://host:8786).
+    """As `parallel.WorkerPool.run`, by the workers of the scheduler at an address (tcp://host:8786).
 
     Arguments travel with each call and results come back. Calls of a worker that dies are done again by
     others; WorkerDiedError names a batch that four of them died of. Raises InputError where there is no such

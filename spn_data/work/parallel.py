@@ -31,7 +31,7 @@ _IDLE_S = 0.5
 _LOOK_S = 0.2  # how often a waiting process looks whether it is to stop
 
 Batch = tuple[str, tuple[Any, ...]]
-# Calls a function for each batch and hands each result on: a Team does here, run_on_cluster elsewhere.
+# Calls a function for each batch and hands each result on: a WorkerPool does here, run_on_cluster elsewhere.
 Dispatch = Callable[[Callable[..., Any], Iterable[Batch], Callable[[Any], None]], None]
 
 
@@ -52,12 +52,12 @@ def run_batches(
     *,
     workers: int,
 ) -> None:
-    """As `Team.run`, by worker processes that end with it."""
-    with Team(workers) as team:
+    """As `WorkerPool.run`, by worker processes that end with it."""
+    with WorkerPool(workers) as team:
         team.run(function, batches, on_result)
 
 
-class Team:
+class WorkerPool:
     """Worker processes that stay from one run to the next: starting one takes most of a second of CPU.
 
     They are started as there is work for them, and end with the team's `with` block.

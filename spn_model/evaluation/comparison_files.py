@@ -1,4 +1,4 @@
-"""What an evaluation leaves in a folder: metrics.json, errors.csv and figures, exchanged together."""
+"""Files of an evaluation: metrics.json, errors.csv and figures, which are replaced together."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from spn_data.capture.sources import safe_name
 from spn_data.dataset.hdf5_schema import Role
-from spn_data.storage.files import write_whole
+from spn_data.storage.files import write_atomically
 from spn_model.evaluation import figures
 from spn_model.evaluation.baselines import MEAN
 from spn_model.evaluation.evaluate import EvaluatedGroup, NetworkComparison, NetworkCost
@@ -19,7 +19,19 @@ from spn_model.models.checkpoint import Checkpoint
 
 
 def of_network(comparison: NetworkComparison, name: str) -> NetworkComparison:
-    """The same with one network alone (and its dropout), beside all baselines."""
+    """Return a comparison that keeps one network (and its dropout estimates) and all baselines.
+
+    Parameters
+    ----------
+    comparison : NetworkComparison
+        Comparison of several networks.
+    name : str
+        Network to keep.
+
+    Returns
+    -------
+    NetworkComparison
+    """
     others = {n for n in comparison.networks if n != name and not n.startswith(f"{name}, ")}
     return replace(
         comparison,
@@ -45,19 +57,35 @@ def write_comparison(
     drawings: Path,
     more_drawings: Mapping[str, str] | None = None,
 ) -> None:
-    """metrics.json, errors.csv and a folder of SVG. facts : what is told besides, plain values.
+    """Write metrics.json, errors.csv and a folder of SVG figures.
 
-    Old figures go before anything is written and metrics.json comes last, so that figures never belong to
-    other numbers. Raises StageError where the disk does not take them.
+    Old figures are removed first and metrics.json is written last, so that figures never belong to other
+    numbers.
+
+    Parameters
+    ----------
+    comparison : NetworkComparison
+        What is written.
+    facts : mapping
+        Additional plain values for the `facts` of metrics.json.
+    metrics, errors, drawings : Path
+        Files metrics.json and errors.csv, and folder of figures.
+    more_drawings : mapping, optional
+        Further SVG figures by name, without suffix.
+
+    Raises
+    ------
+    StageError
+        If the disk does not accept the files.
     """
     metrics.unlink(missing_ok=True)
     shutil.rmtree(drawings, ignore_errors=True)
     drawings.mkdir(parents=True)
     for name, group in zip(_file_names(comparison.groups), comparison.groups, strict=True):
         for what, drawing in drawn(group, comparison).items():
-            write_whole(drawings / f"{name}-{what}.svg", drawing)
+            write_atomically(drawings / f"{name}-{what}.svg", drawing)
     for what, drawing in (more_drawings or {}).items():
-        write_whole(drawings / f"{what}.svg", drawing)
+        write_atomically(drawings / f"{what}.svg", drawing)
     evaluations = [one for group in comparison.groups for one in group.evaluations]
     write_errors(errors, evaluations)
     write_metrics(
@@ -77,7 +105,7 @@ def write_comparison(
 
 
 def network_facts(network: Checkpoint) -> dict[str, Any]:
-    """What a network is and how it was trained, for `facts`."""
+    """Return what a network is and how it was trained, for `facts` of `write_comparison`."""
     state = network.model.network.state_dict().values()
     return {
         "kind": network.model.kind,
@@ -90,12 +118,15 @@ def network_facts(network: Checkpoint) -> dict[str, Any]:
 
 
 def cost_facts(cost: NetworkCost) -> dict[str, Any]:
-    """As metrics.json has it."""
+    """Return the cost as written to metrics.json."""
     return {**asdict(cost), "ms_an_image": round(1000 * cost.seconds / cost.images, 3)}
 
 
 def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str]:
-    """Figures of a group by what they show; none of training images, whose nearest frame is themselves."""
+    """Draw the figures of a group, by name.
+
+    Training groups have none, because the nearest training frame of each of their frames is itself.
+    """
     if group.role is Role.TRAIN:
         return {}
     unit = "m" if comparison.units == "m" else "model units"
@@ -115,13 +146,13 @@ def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str
 
 
 def _of(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
-    """Those of some methods, in the order of these."""
+    """Select methods, in the given order."""
     by_method = {one.method: one for one in found}
     return [by_method[method] for method in methods]
 
 
 def _file_names(groups: Sequence[EvaluatedGroup]) -> list[str]:
-    """Names that any file system takes, each another one whatever groups are called."""
+    """Return unique file names of groups that every file system accepts."""
     names: list[str] = []
     for group in groups:
         base = name = safe_name(group.frames.group, "group").lower()

@@ -15,7 +15,7 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, SpnError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.storage.files import exchange, write_whole
+from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import finite, write_json
 from spn_data.work.timing import Progress
@@ -112,9 +112,9 @@ def export(
                 "options": asdict(options),
             }
             write_json(partial / DOCUMENT, document)
-            write_whole(partial / CARD, model_card(checkpoint, made, facts, metrics))
+            write_atomically(partial / CARD, model_card(checkpoint, made, facts, metrics))
             read_bundle(partial)
-            exchange(partial, folder)
+            replace_folder(partial, folder)
         except OSError as error:
             raise StageError(f"{folder} cannot be written: {error.strerror}") from error
         finally:

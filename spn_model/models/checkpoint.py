@@ -14,7 +14,7 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
-from spn_data.storage.files import writing_whole
+from spn_data.storage.files import atomic_writer
 from spn_data.storage.json_files import finite
 from spn_model.models.pose_model import PoseModel
 from spn_model.models.registry import make
@@ -87,7 +87,7 @@ def set_state(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> 
 def write_tensors(
     path: Path, form: str, tensors: Mapping[str, Tensor], document: Mapping[str, Any]
 ) -> None:
-    """A safetensors file with a JSON document in its header; see `writing_whole`.
+    """A safetensors file with a JSON document in its header; see `atomic_writer`.
 
     Numbers of the document that are not finite are written as null.
     """
@@ -95,7 +95,7 @@ def write_tensors(
     text = json.dumps(finite(document), sort_keys=True, allow_nan=False)
     content = safetensors_bytes(plain, {"format": form, "version": str(VERSION), "document": text})
     path.parent.mkdir(parents=True, exist_ok=True)
-    with writing_whole(path) as file:
+    with atomic_writer(path) as file:
         file.write(content)
 
 

@@ -16,7 +16,7 @@ from spn_data.capture.photos import PhotoHeaders, decode_photo, read_headers
 from spn_data.capture.sources import Source, SourceKind, discover
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import at_size, of_focal_length
+from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.telemetry.exif import telemetry_of_photos
 from spn_model.onboard.view import View
@@ -104,7 +104,7 @@ def _flight(source: Source, given: Camera | None) -> tuple[Flight, list[str]]:
         infos = [video.probe(part) for part in source.parts]
         if given is None:
             raise InputError(_REMEDY, path=source.parts[0])
-        cameras = tuple(at_size(given, i.width, i.height, i.path) for i in infos)
+        cameras = tuple(camera_at_size(given, i.width, i.height, i.path) for i in infos)
         expected = sum(info.frame_count for info in infos)
         notes = [f"{i.path.name}: {note}" for i in infos for note in i.notes]
         return Flight(source, cameras, "given", expected), notes
@@ -136,9 +136,9 @@ def _photo_camera(headers: PhotoHeaders, row: int, given: Camera | None) -> Came
         return None
     width, height = headers.sizes[row].tolist()
     if given is not None:
-        return at_size(given, width, height, headers.paths[row])
+        return camera_at_size(given, width, height, headers.paths[row])
     focal_px = headers.focal_px(row)
-    return None if focal_px is None else of_focal_length(focal_px, width, height)
+    return None if focal_px is None else camera_from_focal_length(focal_px, width, height)
 
 
 class Views:

@@ -27,7 +27,7 @@ from spn_data.inputs.area_labels import (
     read_world_from_model,
     similarity_to_json,
 )
-from spn_data.labels.labels import LabelObservations, Labels, write_labels, write_seen_points
+from spn_data.labels.labels import LabelObservations, Labels, write_label_observations, write_labels
 from spn_data.pipeline.area_coverage import PLANNED, read_coverage, stale_because
 from spn_data.storage.json_files import read_json, write_json
 
@@ -59,7 +59,7 @@ def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
     work = area.begin(f"{EVALUATION}/{name}", {"n": n}, {}, overwrite=True)
     write_labels(work.path / "poses.csv", labels)
     nothing = np.zeros(0, np.int64)
-    write_seen_points(
+    write_label_observations(
         work.path / "observations.npz", LabelObservations(nothing, nothing, np.zeros((0, 2)))
     )
     camera = next(iter(read_json(area.folder("1-frames") / "cameras.json")["cameras"].values()))

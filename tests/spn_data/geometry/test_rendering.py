@@ -191,7 +191,7 @@ def test_points_move_with_the_image(camera):
     pixels = camera.project(points)
     points = points[np.all((pixels > 0) & (pixels < [camera.width, camera.height]), axis=1)]
     renderer = SceneRenderer(camera, target)
-    moved, seen = renderer.move(camera.project(points))
+    moved, seen = renderer.map_pixels(camera.project(points))
     wanted = target.project(points)
     in_view = np.all((wanted >= 0) & (wanted < [480, 270]), axis=1)
     assert seen.sum() > 100
@@ -205,7 +205,9 @@ def test_points_move_with_the_image(camera):
 
 def test_no_points_move_to_no_points():
     """A frame that sees nothing is no special case."""
-    moved, seen = SceneRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).move(np.zeros((0, 2)))
+    moved, seen = SceneRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).map_pixels(
+        np.zeros((0, 2))
+    )
     assert moved.shape == (0, 2)
     assert seen.shape == (0,)
 

@@ -16,10 +16,10 @@ from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_fro
 from spn_data.labels.labels import (
     LabelObservations,
     Labels,
+    read_label_observations,
     read_labels,
-    read_seen_points,
+    write_label_observations,
     write_labels,
-    write_seen_points,
 )
 from spn_data.labels.map_hash import map_hash
 from spn_data.labels.map_points import MapPoints, covered_share
@@ -109,7 +109,7 @@ def test_labels_move_with_their_world() -> None:
     made = labels()
     has = made.registered
     b_from_a = Similarity(2.5, rotations_from_angles(np.array([[30.0, 10, -5]]))[0], np.ones(3))
-    moved = made.moved(b_from_a)
+    moved = made.transformed(b_from_a)
     assert np.allclose(moved.poses.centers[has], b_from_a.apply(made.poses.centers[has]))
     point = np.array([[3.0, 20, -1]])
     before = (point - made.poses.centers[:1]) @ made.poses.rotations[0].T
@@ -118,7 +118,7 @@ def test_labels_move_with_their_world() -> None:
     turn = 2.5 * b_from_a.rotation
     assert np.allclose(moved.covariance[0][:3, :3], turn @ made.covariance[0][:3, :3] @ turn.T)
     assert np.allclose(moved.covariance[0][3:, 3:], made.covariance[0][3:, 3:])
-    back = moved.moved(b_from_a.inverse())
+    back = moved.transformed(b_from_a.inverse())
     assert pose_errors(back.poses[has], made.poses[has])[0].max() < 1e-12
     assert np.allclose(back.covariance[has], made.covariance[has])
     assert np.isnan(moved.poses.centers[~has]).all()
@@ -148,29 +148,29 @@ def test_seen_points_are_selected_by_frame_and_come_back_from_their_file(tmp_pat
     assert some.of_frame(0)[0].tolist() == [3, 9, 7]
     assert len(some.of_frame(1)[0]) == 0
     assert some.of_frame(2)[1].tolist() == [[0, 1], [2, 3]]
-    write_seen_points(tmp_path / "o.npz", seen())
-    read = read_seen_points(tmp_path / "o.npz")
+    write_label_observations(tmp_path / "o.npz", seen())
+    read = read_label_observations(tmp_path / "o.npz")
     for column in fields(LabelObservations):
         assert np.array_equal(getattr(read, column.name), getattr(seen(), column.name))
 
 
 def test_a_damaged_file_of_observations_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "o.npz"
-    write_seen_points(path, seen())
+    write_label_observations(path, seen())
     whole = path.read_bytes()
     for bad in (whole[:100], b"", b"not an archive", whole[:60] + b"?" * 9 + whole[69:]):
         path.write_bytes(bad)
         with pytest.raises(InputError, match="is no file of observations"):
-            read_seen_points(path)
+            read_label_observations(path)
     np.savez(path, frame_idx=[0, 1], point_ids=[1, 2], pixels=np.zeros((2, 3)))
     with pytest.raises(InputError, match="shapes differ"):
-        read_seen_points(path)
+        read_label_observations(path)
     np.savez(path, frame_idx=[1, 0], point_ids=[1, 2], pixels=np.zeros((2, 2)))
     with pytest.raises(InputError, match="not sorted"):
-        read_seen_points(path)
+        read_label_observations(path)
     np.savez(path, frame_idx=np.array([{}], dtype=object), point_ids=[1], pixels=np.zeros((1, 2)))
     with pytest.raises(InputError, match="is no file of observations"):
-        read_seen_points(path)
+        read_label_observations(path)
 
 
 def test_the_hash_of_a_map_knows_every_byte_and_name(tmp_path: Path) -> None:

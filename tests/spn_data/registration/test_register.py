@@ -29,7 +29,7 @@ from spn_data.inputs.area_labels import (
     read_world_from_model,
     similarity_from_json,
 )
-from spn_data.labels.labels import _COLUMNS, Labels, read_labels, read_seen_points
+from spn_data.labels.labels import _COLUMNS, Labels, read_label_observations, read_labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.pipeline.frames_stage import FramesOptions, plan
 from spn_data.registration.register_options import CheckOptions
@@ -234,7 +234,10 @@ def test_the_order_of_sequences_and_the_number_of_workers_change_nothing(
         for file in ("poses.csv", "camera.json"):
             one, other = (a / EVALUATION / name / file for a in (area, bare))
             assert one.read_bytes() == other.read_bytes()
-        seen = [read_seen_points(a / EVALUATION / name / "observations.npz") for a in (area, bare)]
+        seen = [
+            read_label_observations(a / EVALUATION / name / "observations.npz")
+            for a in (area, bare)
+        ]
         assert np.array_equal(seen[0].pixels, seen[1].pixels)
         assert np.array_equal(seen[0].point_ids, seen[1].point_ids)
 
@@ -425,7 +428,7 @@ def test_labels_move_with_their_map(area: Path) -> None:
     new = read_world_from_model(Area(area))
     assert not np.allclose(new.translation, old.translation, atol=1e-6)
     after = read_labelled_area(Area(area))
-    expected = before.evaluation["medium"].moved(new @ old.inverse())
+    expected = before.evaluation["medium"].transformed(new @ old.inverse())
     found = after.evaluation["medium"]
     has = found.registered
     assert np.allclose(found.poses.centers[has], expected.poses.centers[has], atol=1e-9)

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from spn_data.errors import InputError, StageError
-from spn_data.storage.files import read_csv, write_csv, write_whole, writing_whole
+from spn_data.storage.files import atomic_writer, read_csv, write_atomically, write_csv
 
 
 def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> None:
     """Neither the caller's mistake nor a disk that is full touches the file or leaves a rest."""
     path = tmp_path / "list.csv"
-    write_whole(path, "before")
+    write_atomically(path, "before")
     with pytest.raises(TypeError):
-        write_whole(path, 3)  # type: ignore[arg-type]
+        write_atomically(path, 3)  # type: ignore[arg-type]
     with (
         pytest.raises(StageError, match=r"list\.csv cannot be written: No space left"),
-        writing_whole(path, "w"),
+        atomic_writer(path, "w"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert path.read_text() == "before"
@@ -35,7 +35,7 @@ def test_text_is_utf8_with_its_own_line_ends(tmp_path: Path) -> None:
 def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
     """A folder that is missing is the user's to see, with the file's name."""
     with pytest.raises(StageError, match=r"none/a\.txt cannot be written: No such file"):
-        write_whole(tmp_path / "none" / "a.txt", "")
+        write_atomically(tmp_path / "none" / "a.txt", "")
 
 
 @pytest.mark.parametrize(

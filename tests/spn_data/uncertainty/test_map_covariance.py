@@ -26,7 +26,7 @@ from spn_data.geometry.pose import (
 from spn_data.uncertainty.bundle_jacobians import (
     LinearizedBundle,
     Unknowns,
-    gauge_directions,
+    gauge_null_space,
     linearize_bundle,
 )
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance, MapCovarianceOptions
@@ -161,7 +161,7 @@ def test_derivatives_are_those_of_the_residuals() -> None:
     rotations = rotations_from_vectors(frames[:, 3:]) @ scene.poses.rotations
     cameras = {}
     for camera_id, camera in scene.cameras.items():
-        full = unknowns.lens_mixing[camera_id] @ change[unknowns.lens_columns[camera_id]]
+        full = unknowns.lens_jacobian[camera_id] @ change[unknowns.lens_columns[camera_id]]
         full = full if camera.model == "OPENCV" else full[[0, 2, 3, 4, 5]]
         cameras[camera_id] = replace(camera, params=camera.params + full)
     projected = np.empty_like(seen.pixels)
@@ -177,8 +177,8 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
     """The seven directions of the gauge are null vectors of the information, to rounding."""
     scene, seen = small().scene, small().seen
     unknowns, bundle = linearized(scene, seen)
-    information = bundle.information()
-    pull = information @ gauge_directions(scene, unknowns)
+    information = bundle.reduced_normal_matrix()
+    pull = information @ gauge_null_space(scene, unknowns)
     assert np.abs(pull).max() < 1e-9 * information.diagonal().max()
 
 
@@ -194,7 +194,7 @@ def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np
         by_point[2 * row : 2 * row + 2, 3 * j : 3 * j + 3] = (pixels[:3] - pixels[3:]).T / 2e-5
     full = np.hstack([bundle.design.toarray(), by_point])
     conditions = np.zeros((n + p, 7))
-    gauge = gauge_directions(scene, unknowns)
+    gauge = gauge_null_space(scene, unknowns)
     frames = np.arange(POSE * len(scene.names)).reshape(-1, POSE)[:, :3].ravel()
     conditions[frames] = gauge[frames]
     bordered = np.block([[full.T @ full, conditions], [conditions.T, np.zeros((7, 7))]])
@@ -224,7 +224,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
         if camera_id is not None:
             assert wanted.by_lens is not None
             row[:, unknowns.lens_columns[camera_id]] += (
-                wanted.by_lens @ unknowns.lens_mixing[camera_id]
+                wanted.by_lens @ unknowns.lens_jacobian[camera_id]
             )
         expected = row @ dense @ row.T
         found = covariance.functional_covariances([wanted])[0]

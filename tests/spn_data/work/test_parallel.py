@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.work.parallel import Team, WorkerDiedError, run_batches
+from spn_data.work.parallel import WorkerDiedError, WorkerPool, run_batches
 from spn_data.work.timing import cpu_seconds
 
 
@@ -94,7 +94,7 @@ def test_workers_compute_on_one_thread() -> None:
 def test_workers_stay_from_one_run_to_the_next_and_end_with_their_team() -> None:
     first: list[int] = []
     second: list[int] = []
-    with Team(2) as team:
+    with WorkerPool(2) as team:
         team.run(work_for, [(str(k), (0.1,)) for k in range(4)], first.append)
         team.run(work_for, [(str(k), (0.1,)) for k in range(4)], second.append)
     assert len(set(first)) == 2
@@ -104,7 +104,7 @@ def test_workers_stay_from_one_run_to_the_next_and_end_with_their_team() -> None
 
 def test_a_team_works_on_after_an_exception() -> None:
     results: list[int] = []
-    with Team(2) as team:
+    with WorkerPool(2) as team:
         with pytest.raises(ValueError, match="no 1"):
             team.run(fail, [("1", (1,))], print)
         team.run(square, [("3", (3,))], results.append)
@@ -113,7 +113,7 @@ def test_a_team_works_on_after_an_exception() -> None:
 
 def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
     before = cpu_seconds()
-    with Team(1) as team:
+    with WorkerPool(1) as team:
         team.run(work_for, [("a", (1.0,))], print)
         living = cpu_seconds() - before
     ended = cpu_seconds() - before
@@ -124,7 +124,7 @@ def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do as they like")
 def test_a_worker_keeps_its_memory_from_call_to_call_and_gives_it_back_when_it_idles() -> None:
     held: list[float] = []
-    with Team(1) as team:
+    with WorkerPool(1) as team:
         team.run(held_mb_before, [("a", (200,)), ("b", (200,))], held.append)
         time.sleep(1.5)
         team.run(held_mb_before, [("c", (0,))], held.append)

@@ -12,14 +12,14 @@ from scipy.sparse.linalg import splu
 from spn_data.colmap.model import Scene
 from spn_data.errors import GeometryError
 from spn_data.geometry.least_squares import POSE
-from spn_data.uncertainty.bundle_jacobians import GAUGE, Unknowns, gauge_directions
+from spn_data.uncertainty.bundle_jacobians import GAUGE, Unknowns, gauge_null_space
 
 _SMALLEST_PIVOT = 1e-10  # of the information scaled to a unit diagonal: less is rounding
 _UNTIED = "the map's measurements do not tie its frames together"
 
 
 @dataclass(frozen=True, eq=False)
-class GaugedInverse:
+class InnerConstraintInverse:
     """K = T G T^T, the inverse of an information S (n, n) under seven conditions, by a sparse factor.
 
     The conditions (the centres together neither move, turn nor scale) are those of a best similarity.
@@ -36,7 +36,9 @@ class GaugedInverse:
     inner: np.ndarray
 
     @classmethod
-    def of(cls, information: sparse.csr_matrix, scene: Scene, unknowns: Unknowns) -> GaugedInverse:
+    def of(
+        cls, information: sparse.csr_matrix, scene: Scene, unknowns: Unknowns
+    ) -> InnerConstraintInverse:
         """Raises GeometryError where more than a similarity is free."""
         diagonal = information.diagonal()
         if not np.all(diagonal > 0):
@@ -57,7 +59,7 @@ class GaugedInverse:
             raise GeometryError(_UNTIED) from error
         if float(np.min(factor.U.diagonal())) < _SMALLEST_PIVOT:
             raise GeometryError(_UNTIED)
-        directions = gauge_directions(scene, unknowns)
+        directions = gauge_null_space(scene, unknowns)
         conditions = np.zeros_like(directions)
         centers = (POSE * np.arange(len(scene.names))[:, None] + np.arange(3)).ravel()
         conditions[centers] = directions[centers]
