@@ -1,4 +1,4 @@
-"""Errors that tell the user where something is wrong, what was found, and what to do."""
+"""Exceptions whose messages say which file or option is wrong, what was found, and what to do."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ from pathlib import Path
 
 
 class SpnError(Exception):
-    """Raised when the user's data or request cannot be used."""
+    """Base class of all errors caused by the user's data or request."""
 
 
 class InputError(SpnError):
-    """Raised when a file that the user gave cannot be used; says which file and line."""
+    """An input file or option value that cannot be used; the message names the file and line.
+
+    Attributes
+    ----------
+    path : Path or str or None
+        The file, if there is one.
+    line : int or None
+        The line, counted from 1, if known.
+    """
 
     def __init__(self, message: str, *, path: Path | str | None = None, line: int | None = None):
         where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
@@ -20,16 +28,16 @@ class InputError(SpnError):
 
 
 class StageError(SpnError):
-    """Raised when a stage of the area is missing, stale, in use, or would be overwritten."""
+    """A stage of the area that is missing, stale or in use, would be overwritten, or cannot be written."""
 
 
 class InUseError(StageError):
-    """Raised when another process works in the folder."""
+    """A folder that another process is working in."""
 
 
 class GeometryError(SpnError):
-    """Raised when the geometry does not determine the answer: too few points, a line, no agreement."""
+    """A geometric problem without a unique solution: too few points, collinear points, no consensus."""
 
 
 class FormatError(SpnError):
-    """Raised when a file of ours is damaged or was made by a newer version."""
+    """A file written by this program that is damaged or was made by a newer version."""

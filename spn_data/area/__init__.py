@@ -1,0 +1,1 @@
+"""The layout of an area on disk and its stages."""

@@ -1,4 +1,4 @@
-"""Cameras: COLMAP's models and parameter order, projection, and the half-pixel to OpenCV."""
+"""Cameras: COLMAP's models and parameter order, projection, and the half-pixel shift to OpenCV."""
 
 from __future__ import annotations
 
@@ -21,8 +21,14 @@ MODELS: dict[str, tuple[str, ...]] = {
 class Camera:
     """Intrinsics of one lens at one image size.
 
-    model : a key of MODELS; params : (P,) float64 in COLMAP's order, in pixels; the centre of the
-    upper-left pixel is (0.5, 0.5).
+    Attributes
+    ----------
+    model : str
+        A key of `MODELS`.
+    width, height : int
+        Image size in pixels.
+    params : ndarray, shape (P,)
+        Parameters in COLMAP's order, float64, in pixels; the centre of the upper-left pixel is (0.5, 0.5).
     """
 
     model: str
@@ -32,7 +38,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise ValueError(f"camera model {self.model!r} is none of {', '.join(MODELS)}")
+            raise ValueError(
+                f"camera model {self.model!r} is not supported: use one of {', '.join(MODELS)}"
+            )
         if len(self.params) != len(MODELS[self.model]):
             raise ValueError(
                 f"{self.model} takes {len(MODELS[self.model])} parameters, got {len(self.params)}"
@@ -42,9 +50,16 @@ class Camera:
     def from_horizontal_fov(
         cls, width: int, height: int, fov_deg: float, distortion: tuple[float, ...] = ()
     ) -> Camera:
-        """Centred camera of a horizontal field of view (of the undistorted image).
+        """Return a camera with a centred principal point and a given horizontal field of view.
 
-        distortion : 0, 1, 2 or 4 terms, which choose the model.
+        Parameters
+        ----------
+        width, height : int
+            Image size in pixels.
+        fov_deg : float
+            Horizontal field of view of the undistorted image.
+        distortion : tuple of float, optional
+            0, 1, 2 or 4 distortion coefficients; their number selects the camera model.
         """
         f = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
         center = (width / 2, height / 2)
@@ -60,35 +75,46 @@ class Camera:
 
     @property
     def focal_px(self) -> tuple[float, float]:
-        """(fx, fy)."""
+        """Focal lengths (fx, fy) in pixels."""
         f = self._get("f")
         return self._get("fx", f), self._get("fy", f)
 
     @property
     def matrix(self) -> np.ndarray:
-        """K (3, 3) in COLMAP's pixel convention."""
+        """Calibration matrix K (3, 3) in COLMAP's pixel convention."""
         fx, fy = self.focal_px
         return np.array([[fx, 0, self._get("cx")], [0, fy, self._get("cy")], [0, 0, 1.0]])
 
     @property
     def opencv_matrix(self) -> np.ndarray:
-        """K (3, 3) in OpenCV's pixel convention, where the centre of the upper-left pixel is (0, 0)."""
+        """Calibration matrix K (3, 3) in OpenCV's convention: the upper-left pixel centre is (0, 0)."""
         k = self.matrix
         k[:2, 2] -= 0.5
         return k
 
     @property
     def opencv_distortion(self) -> np.ndarray:
-        """(k1, k2, p1, p2) in OpenCV's order."""
+        """Distortion coefficients (k1, k2, p1, p2) in OpenCV's order."""
         return np.array([self._get("k1"), self._get("k2"), self._get("p1"), self._get("p2")])
 
     @property
     def horizontal_fov_deg(self) -> float:
-        """Field of view of the undistorted image."""
+        """Horizontal field of view of the undistorted image, in degrees."""
         return float(np.rad2deg(2 * np.arctan(self.width / 2 / self.focal_px[0])))
 
     def project(self, points_cam: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN at and behind the camera plane."""
+        """Project points from the camera frame into the image.
+
+        Parameters
+        ----------
+        points_cam : ndarray, shape (N, 3)
+            Points in the camera frame.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            Distorted pixels; NaN for points on or behind the camera plane.
+        """
         points = np.asarray(points_cam, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = np.where(points[:, 2:] > 0, points[:, :2] / points[:, 2:], np.nan)
@@ -107,7 +133,18 @@ class Camera:
         return distorted * np.array([k[0, 0], k[1, 1]]) + k[:2, 2]
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Undistorted normalised image coordinates (N, 2) of pixels (N, 2): x/z and y/z of their rays."""
+        """Undistort pixels to normalised image coordinates.
+
+        Parameters
+        ----------
+        pixels : ndarray, shape (N, 2)
+            Distorted pixels.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            x/z and y/z of their rays in the camera frame.
+        """
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
         return cv2.undistortPoints(
@@ -115,7 +152,7 @@ class Camera:
         ).reshape(-1, 2)
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same lens on an image resized to width x height."""
+        """Return the same lens for an image resized to width x height."""
         sx, sy = width / self.width, height / self.height
         factors = {"f": sx, "fx": sx, "fy": sy, "cx": sx, "cy": sy}
         params = self.params * [factors.get(name, 1.0) for name in MODELS[self.model]]

@@ -1,4 +1,4 @@
-"""A camera as a JSON object: model, width, height, params (COLMAP's order, pixels); and for images."""
+"""Cameras as JSON objects (model, width, height, params in COLMAP's order), and default cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_BYTES = 100_000
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Plain values for json.dumps."""
+    """Return a camera as plain values for `json.dumps`."""
     return {
         "model": camera.model,
         "width": camera.width,
@@ -25,7 +25,18 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
 
 
 def camera_from_json(value: dict[str, Any]) -> Camera:
-    """Raises KeyError, TypeError or ValueError where it is no camera."""
+    """Return the camera that a JSON object describes.
+
+    Parameters
+    ----------
+    value : dict
+        With the keys model, width, height and params.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If it does not describe a valid camera.
+    """
     camera = Camera(
         str(value["model"]),
         int(value["width"]),
@@ -33,36 +44,58 @@ def camera_from_json(value: dict[str, Any]) -> Camera:
         np.array(value["params"], dtype=np.float64),
     )
     if not (np.isfinite(camera.params).all() and min(camera.focal_px) > 0):
-        raise ValueError("its parameters are no camera's")
+        raise ValueError("its parameters are not finite, or its focal length is not positive")
     if not (0 < camera.width <= 100_000 and 0 < camera.height <= 100_000):
-        raise ValueError(f"its image is {camera.width}x{camera.height}")
+        raise ValueError(f"its image size of {camera.width}x{camera.height} is not valid")
     return camera
 
 
 def read_camera(path: Path) -> Camera:
-    """Raises InputError where the file holds no camera."""
+    """Read a camera from a JSON file.
+
+    Raises
+    ------
+    InputError
+        If the file does not contain a valid camera.
+    """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise InputError("is too large to hold a camera", path=path)
+            raise InputError("is too large for a camera file", path=path)
         return camera_from_json(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"is no camera ({error}): expected model, width, height and params in COLMAP's order",
+            f"does not contain a camera ({error}); expected model, width, height and params "
+            "in COLMAP's order",
             path=path,
         ) from error
 
 
 def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
-    """A given camera for images of a size. Raises InputError, for `where`, where their shape is another."""
+    """Rescale a given camera to the size of the images it is used for.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera that the user gave.
+    width, height : int
+        Size of the images.
+    where : Path or str
+        File or sequence named in the error message.
+
+    Raises
+    ------
+    InputError
+        If the aspect ratios differ by more than 1 %.
+    """
     if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
         raise InputError(
-            f"the given camera is of {camera.width}x{camera.height}, the images are {width}x{height}",
+            f"the given camera is for {camera.width}x{camera.height} images, these are {width}x{height}",
             path=where,
         )
     return camera.scaled(width, height)
 
 
 def camera_from_focal_length(focal_px: float, width: int, height: int) -> Camera:
-    """A lens of which nothing but a focal length is known: centred, with a radial term of 0."""
+    """Return a camera of which only the focal length is known: centred, SIMPLE_RADIAL, with k1 = 0."""
     params = np.array([focal_px, width / 2, height / 2, 0.0])
     return Camera("SIMPLE_RADIAL", width, height, params)

@@ -8,7 +8,20 @@ from spn_data.geometry.pose import Poses
 
 
 def essential_matrix(poses: Poses, a: int, b: int) -> np.ndarray:
-    """(3, 3), x_b' E x_a = 0 for rays in the camera frames of two poses; its baseline has length one."""
+    """Return the essential matrix of two posed images.
+
+    Parameters
+    ----------
+    poses : Poses
+        Poses that include the two images.
+    a, b : int
+        Rows of the two images in `poses`.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+        E with x_b' E x_a = 0 for rays in the two camera frames; the baseline is scaled to unit length.
+    """
     rotations, centers = poses.rotations, poses.centers
     baseline = rotations[b] @ (centers[a] - centers[b])
     x, y, z = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
@@ -17,9 +30,19 @@ def essential_matrix(poses: Poses, a: int, b: int) -> np.ndarray:
 
 
 def sampson_errors(a: np.ndarray, b: np.ndarray, essential: np.ndarray) -> np.ndarray:
-    """First-order distance (K,) of matches from their epipolar lines, in units of the focal length.
+    """Return the Sampson distances of matches: the first-order distance from their epipolar lines.
 
-    a, b : (K, 2) undistorted, on the plane at distance one.
+    Parameters
+    ----------
+    a, b : ndarray, shape (K, 2)
+        Matched points in undistorted normalised image coordinates.
+    essential : ndarray, shape (3, 3)
+        Essential matrix with x_b' E x_a = 0.
+
+    Returns
+    -------
+    ndarray, shape (K,)
+        Distances in units of the focal length.
     """
     a, b = _homogeneous(a), _homogeneous(b)
     line_b, line_a = a @ essential.T, b @ essential

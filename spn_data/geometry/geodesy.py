@@ -1,4 +1,4 @@
-"""WGS84 and local East-North-Up metres, and what a height refers to."""
+"""WGS84 and local East-North-Up coordinates, and height references."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ METRES_PER_DEGREE = 111_195.0  # of latitude on that sphere, rounded
 
 
 class HeightReference(StrEnum):
-    """What a height is measured from."""
+    """The reference surface of a height."""
 
     ELLIPSOID = "ellipsoid"  # WGS84 ellipsoid
     AMSL = "amsl"  # mean sea level (a geoid model)
@@ -52,7 +52,18 @@ def metres_from_first_fix(lat_lon_deg: np.ndarray) -> np.ndarray:
 
 
 def ecef_from_wgs84(lat_lon_alt: np.ndarray) -> np.ndarray:
-    """Earth-centred metres (N, 3) of (latitude deg, longitude deg, ellipsoidal height m) (N, 3)."""
+    """Convert geodetic WGS84 coordinates to Earth-centred, Earth-fixed coordinates.
+
+    Parameters
+    ----------
+    lat_lon_alt : ndarray, shape (N, 3)
+        Latitude (deg), longitude (deg), ellipsoidal height (m).
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        ECEF coordinates in metres.
+    """
     lat, lon = np.deg2rad(lat_lon_alt[..., 0]), np.deg2rad(lat_lon_alt[..., 1])
     alt = lat_lon_alt[..., 2]
     n = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
@@ -67,9 +78,21 @@ def ecef_from_wgs84(lat_lon_alt: np.ndarray) -> np.ndarray:
 
 
 def wgs84_from_ecef(ecef: np.ndarray) -> np.ndarray:
-    """(latitude deg, longitude deg, ellipsoidal height m) (N, 3) of Earth-centred metres (N, 3).
+    """Convert Earth-centred, Earth-fixed coordinates to geodetic WGS84 coordinates.
 
-    Fixed-point iteration on the latitude; converges to below a nanometre near the surface in six rounds.
+    Parameters
+    ----------
+    ecef : ndarray, shape (N, 3)
+        ECEF coordinates in metres.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        Latitude (deg), longitude (deg), ellipsoidal height (m).
+
+    Notes
+    -----
+    Fixed-point iteration on the latitude; six iterations converge to below a nanometre near the surface.
     """
     x, y, z = np.moveaxis(np.asarray(ecef, dtype=np.float64), -1, 0)
     p = np.hypot(x, y)
@@ -78,18 +101,29 @@ def wgs84_from_ecef(ecef: np.ndarray) -> np.ndarray:
         n = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
         lat = np.arctan2(z + ECCENTRICITY_2 * n * np.sin(lat), p)
     n = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
-    # This form of the height holds at the poles too.
+    # This form of the height is also valid at the poles.
     alt = p * np.cos(lat) + z * np.sin(lat) - SEMI_MAJOR_M**2 / n
     return np.stack([np.rad2deg(lat), np.rad2deg(np.arctan2(y, x)), alt], axis=-1)
 
 
 @dataclass(frozen=True)
 class GeoOrigin:
-    """Where the local East-North-Up frame has its zero.
+    """Origin of a local East-North-Up frame.
 
-    lat_deg, lon_deg : WGS84; alt_m : height of the zero above `height_reference`. Where the reference is
-    not the ellipsoid, the difference to the ellipsoidal height tilts and scales nothing: horizontal
-    coordinates are off by at most 8 ppm per 50 m of undulation, which is stored rather than corrected.
+    Attributes
+    ----------
+    lat_deg, lon_deg : float
+        WGS84 latitude and longitude.
+    alt_m : float
+        Height of the origin above `height_reference`.
+    height_reference : HeightReference
+        What `alt_m` refers to.
+
+    Notes
+    -----
+    If the reference is not the ellipsoid, `alt_m` is used as if it were an ellipsoidal height. This neither
+    tilts nor scales the frame; horizontal coordinates are off by at most 8 ppm per 50 m of undulation. The
+    reference is stored and no correction is applied.
     """
 
     lat_deg: float
@@ -98,7 +132,7 @@ class GeoOrigin:
     height_reference: HeightReference = HeightReference.ELLIPSOID
 
     def plain(self) -> dict[str, float | str]:
-        """For JSON."""
+        """Return the origin as plain values for JSON."""
         return {
             "lat_deg": self.lat_deg,
             "lon_deg": self.lon_deg,
@@ -119,13 +153,35 @@ class GeoOrigin:
         return origin, enu_from_ecef
 
     def enu_from_wgs84(self, lat_lon_alt: np.ndarray) -> np.ndarray:
-        """East, north, up (N, 3) in metres of (latitude deg, longitude deg, height m) (N, 3)."""
+        """Convert geodetic coordinates to East-North-Up coordinates.
+
+        Parameters
+        ----------
+        lat_lon_alt : ndarray, shape (N, 3)
+            Latitude (deg), longitude (deg), height (m).
+
+        Returns
+        -------
+        ndarray, shape (N, 3)
+            East, north, up in metres.
+        """
         origin, enu_from_ecef = self._ecef_and_axes()
         return (
             ecef_from_wgs84(np.asarray(lat_lon_alt, dtype=np.float64)) - origin
         ) @ enu_from_ecef.T
 
     def wgs84_from_enu(self, enu: np.ndarray) -> np.ndarray:
-        """(latitude deg, longitude deg, height m) (N, 3) of east, north, up (N, 3) in metres."""
+        """Convert East-North-Up coordinates to geodetic coordinates.
+
+        Parameters
+        ----------
+        enu : ndarray, shape (N, 3)
+            East, north, up in metres.
+
+        Returns
+        -------
+        ndarray, shape (N, 3)
+            Latitude (deg), longitude (deg), height (m).
+        """
         origin, enu_from_ecef = self._ecef_and_axes()
         return wgs84_from_ecef(np.asarray(enu, dtype=np.float64) @ enu_from_ecef + origin)

@@ -1,4 +1,4 @@
-"""Rows that belong to groups."""
+"""Operations on rows that belong to groups."""
 
 from __future__ import annotations
 
@@ -6,10 +6,23 @@ import numpy as np
 
 
 def rank_within_group(group: np.ndarray, count: int) -> np.ndarray:
-    """(M,) how many rows of the same group, (M,) 0..count-1, come before each."""
-    # Small integers are sorted by radix, several times faster.
+    """Return the rank of each row among the rows of its group, in row order.
+
+    Parameters
+    ----------
+    group : ndarray, shape (M,)
+        Group of each row, 0..count-1.
+    count : int
+        Number of groups.
+
+    Returns
+    -------
+    ndarray, shape (M,)
+        Number of earlier rows of the same group.
+    """
+    # NumPy sorts small integers by radix, which is several times faster.
     order = np.argsort(group.astype(np.min_scalar_type(count)), kind="stable")
     sizes = np.bincount(group, minlength=count)
-    number = np.empty(len(group), dtype=np.int64)
-    number[order] = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return number
+    rank = np.empty(len(group), dtype=np.int64)
+    rank[order] = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return rank

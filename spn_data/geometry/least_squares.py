@@ -1,7 +1,7 @@
-"""What every least squares over images is made of: derivatives of pixels, robust weights, sparse rows.
+"""Building blocks of least squares over images: projection Jacobians, robust weights, sparse rows.
 
-A change of a pose is a move of its centre along the world's axes, then a rotation vector v in the camera
-frame with R_changed = exp(v) R: the order of every covariance of ours.
+A pose is updated by a translation of its centre along the world axes, followed by a rotation vector v in the
+camera frame with R_new = exp(v) R. All 6 x 6 pose covariances of this package use this parameterisation.
 """
 
 from __future__ import annotations
@@ -15,15 +15,30 @@ from spn_data.geometry.camera import Camera
 
 POSE = 6
 LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2
-# What each parameter of a lens moves of these.
-_OF_LENS = {
+# Indices of the lens terms that each parameter of a camera model sets.
+_LENS_TERMS_OF = {
     **{"f": (0, 1), "fx": (0,), "fy": (1,), "cx": (2,), "cy": (3,)},
     **{"k1": (4,), "k2": (5,), "p1": (6,), "p2": (7,)},
 }
 
 
 def projection_jacobians(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of pixels by points in the camera frame (M, 2, 3) and by the lens (M, 2, 8)."""
+    """Return the Jacobians of pixels with respect to points and intrinsics.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera that the points are projected with.
+    points_cam : ndarray, shape (M, 3)
+        Points in the camera frame.
+
+    Returns
+    -------
+    by_point_cam : ndarray, shape (M, 2, 3)
+        Derivatives by the points in the camera frame.
+    by_lens : ndarray, shape (M, 2, 8)
+        Derivatives by fx, fy, cx, cy, k1, k2, p1, p2.
+    """
     fx, fy = camera.focal_px
     k1, k2, p1, p2 = camera.opencv_distortion
     z = points_cam[:, 2]
@@ -61,25 +76,77 @@ def projection_jacobians(camera: Camera, points_cam: np.ndarray) -> tuple[np.nda
 def pose_jacobians(
     points_cam: np.ndarray, by_point_cam: np.ndarray, by_point: np.ndarray
 ) -> np.ndarray:
-    """Derivatives (M, 2, 6) by poses, from those (M, 2, 3) by points (M, 3) along camera and world axes."""
+    """Return the Jacobians of pixels with respect to poses (translation, then rotation vector; see above).
+
+    Parameters
+    ----------
+    points_cam : ndarray, shape (M, 3)
+        Points in the camera frame.
+    by_point_cam, by_point : ndarray, shape (M, 2, 3)
+        Derivatives of the pixels by the points along camera axes and along world axes.
+
+    Returns
+    -------
+    ndarray, shape (M, 2, 6)
+        Derivatives by the poses.
+    """
     return np.concatenate([-by_point, np.cross(points_cam[:, None], by_point_cam)], axis=2)
 
 
 def lens_parameter_jacobian(parameters: Sequence[str]) -> np.ndarray:
-    """(8, L) from L parameters, by their names in COLMAP's models, to fx, fy, cx, cy, k1, k2, p1, p2."""
-    mixing = np.zeros((LENS, len(parameters)))
+    """Return the Jacobian of the eight lens terms with respect to the parameters of a camera model.
+
+    Parameters
+    ----------
+    parameters : sequence of str
+        Names of L parameters as in COLMAP's models.
+
+    Returns
+    -------
+    ndarray, shape (8, L)
+        Derivatives of fx, fy, cx, cy, k1, k2, p1, p2.
+    """
+    jacobian = np.zeros((LENS, len(parameters)))
     for k, name in enumerate(parameters):
-        mixing[list(_OF_LENS[name]), k] = 1.0
-    return mixing
+        jacobian[list(_LENS_TERMS_OF[name]), k] = 1.0
+    return jacobian
 
 
 def cauchy_weights(residuals_px: np.ndarray, scale_px: float) -> np.ndarray:
-    """(M,) of residuals (M, 2)."""
+    """Return the weights of a Cauchy loss.
+
+    Parameters
+    ----------
+    residuals_px : ndarray, shape (M, 2)
+        Reprojection residuals.
+    scale_px : float
+        Scale of the loss.
+
+    Returns
+    -------
+    ndarray, shape (M,)
+        Weights in (0, 1].
+    """
     return 1 / (1 + (residuals_px**2).sum(axis=1) / scale_px**2)
 
 
 def rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
-    """(2 M, width) from blocks (M, 2, n) whose both rows have the columns (M, n)."""
+    """Assemble a sparse design matrix from dense 2 x n blocks.
+
+    Parameters
+    ----------
+    values : ndarray, shape (M, 2, n)
+        Blocks of two rows.
+    columns : ndarray, shape (M, n)
+        Columns of both rows of each block.
+    width : int
+        Number of columns of the matrix.
+
+    Returns
+    -------
+    csr_matrix, shape (2 M, width)
+        The two rows of each block, in order.
+    """
     m, two, n = values.shape
     pointers = n * np.arange(two * m + 1)
     return sparse.csr_matrix(
@@ -90,9 +157,23 @@ def rows_to_sparse(values: np.ndarray, columns: np.ndarray, width: int) -> spars
 def point_whitening(
     by_point: np.ndarray, point: np.ndarray, count: int, *, ridge: float
 ) -> np.ndarray:
-    """(P, 3, 3) Q with Q^T Q = V^-1, where V is the information on each point.
+    """Return the whitening of each point: a square root of the inverse of its normal matrix.
 
-    by_point : (M, 2, 3) derivatives; point : (M,) 0..P-1; ridge : added to V, as a share of its trace.
+    Parameters
+    ----------
+    by_point : ndarray, shape (M, 2, 3)
+        Derivatives of the measurements by their points.
+    point : ndarray, shape (M,)
+        Point of each measurement, 0..P-1.
+    count : int
+        Number of points P.
+    ridge : float
+        Regularisation added to the diagonal of the normal matrix V, as a share of its trace.
+
+    Returns
+    -------
+    ndarray, shape (P, 3, 3)
+        Q with Q^T Q = V^-1.
     """
     information = np.zeros((count, 3, 3))
     np.add.at(information, point, np.einsum("mki,mkj->mij", by_point, by_point))
@@ -104,9 +185,23 @@ def point_whitening(
 def cluster_scores(
     residuals: np.ndarray, cluster: np.ndarray, design: sparse.csr_matrix
 ) -> sparse.csr_matrix:
-    """(C, n) pull of each cluster's residuals together on the unknowns of a design (2 M, n).
+    """Return the score (gradient contribution) of each cluster of measurements.
 
-    residuals : (2 M,); cluster : (M,) 0..C-1 of each measurement.
+    The outer products of the scores are the meat of a cluster-robust (sandwich) covariance.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (2 M,)
+        Residuals of the measurements.
+    cluster : ndarray, shape (M,)
+        Cluster of each measurement, 0..C-1.
+    design : csr_matrix, shape (2 M, n)
+        Derivatives of the residuals by the unknowns.
+
+    Returns
+    -------
+    csr_matrix, shape (C, n)
+        Sum of design^T residuals over each cluster.
     """
     m = len(residuals)
     gather = sparse.csr_matrix(

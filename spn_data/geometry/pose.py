@@ -1,6 +1,7 @@
-"""Camera poses, similarities and their errors: the only place where quaternions and inversions are written.
+"""Camera poses, similarity transforms and pose errors.
 
-World axes are East, North, Up once a model is georeferenced; camera axes are x right, y down, z forward.
+This is the only module that implements quaternion operations and pose inversion. World axes are East, North,
+Up once a model is georeferenced; camera axes are x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from spn_data.errors import GeometryError
 
 
 def rotations_from_quats(quats_wxyz: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) from unit quaternions (N, 4), scalar first."""
+    """Convert unit quaternions (N, 4), scalar first, to rotation matrices (N, 3, 3)."""
     w, x, y, z = np.moveaxis(np.asarray(quats_wxyz, dtype=np.float64), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -25,10 +26,26 @@ def rotations_from_quats(quats_wxyz: np.ndarray) -> np.ndarray:
 
 
 def quats_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Unit quaternions (N, 4), scalar first and w >= 0, from rotation matrices (N, 3, 3).
+    """Convert rotation matrices to unit quaternions.
 
-    Takes the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000), which is the nearest
-    rotation also where the matrix is orthogonal only to rounding, and has no special case at 180 degrees.
+    Parameters
+    ----------
+    rotations : ndarray, shape (N, 3, 3)
+        Rotation matrices.
+
+    Returns
+    -------
+    ndarray, shape (N, 4)
+        Unit quaternions, scalar first and w >= 0.
+
+    Notes
+    -----
+    The quaternion is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix. It gives the nearest
+    rotation if the matrix is orthogonal only up to rounding, and has no special case at 180 degrees.
+
+    References
+    ----------
+    Bar-Itzhack 2000, "New method for extracting the quaternion from a rotation matrix".
     """
     m = np.asarray(rotations, dtype=np.float64)
     k = np.empty((*m.shape[:-2], 4, 4))
@@ -46,11 +63,27 @@ def quats_from_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def canonical_quats(quats_wxyz: np.ndarray) -> np.ndarray:
-    """The same rotations as unit quaternions with w >= 0 (w = 0: first non-zero component positive)."""
+    """Normalise quaternions and choose their sign.
+
+    Parameters
+    ----------
+    quats_wxyz : ndarray, shape (N, 4)
+        Quaternions, scalar first, of any non-zero length.
+
+    Returns
+    -------
+    ndarray, shape (N, 4)
+        Unit quaternions of the same rotations with w >= 0 (w = 0: first non-zero component positive).
+
+    Raises
+    ------
+    ValueError
+        If a quaternion has length zero.
+    """
     quats = np.asarray(quats_wxyz, dtype=np.float64)
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     if not np.all(norms > 0):
-        raise ValueError("a quaternion of length zero is no rotation")
+        raise ValueError("a quaternion of length zero does not define a rotation")
     quats = quats / norms
     first = np.argmax(np.abs(quats) > 1e-15, axis=-1)
     sign = np.sign(np.take_along_axis(quats, first[..., None], axis=-1))
@@ -63,7 +96,7 @@ def conjugate_quats(quats_wxyz: np.ndarray) -> np.ndarray:
 
 
 def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
-    """Rotation vectors (N, 3) in radians, of length at most pi, from rotation matrices (N, 3, 3)."""
+    """Convert rotation matrices (N, 3, 3) to rotation vectors (N, 3) in radians, of length at most pi."""
     quats = quats_from_rotations(rotations)
     vector = quats[..., 1:]
     sine = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -73,7 +106,7 @@ def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
 
 
 def rotations_from_vectors(vectors: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) from rotation vectors (N, 3) in radians."""
+    """Convert rotation vectors (N, 3) in radians to rotation matrices (N, 3, 3)."""
     vectors = np.asarray(vectors, dtype=np.float64)
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     half = angle / 2
@@ -83,11 +116,23 @@ def rotations_from_vectors(vectors: np.ndarray) -> np.ndarray:
 
 
 def rotations_from_angles(heading_pitch_roll_deg: np.ndarray) -> np.ndarray:
-    """cam_from_world rotations (N, 3, 3) in an ENU world from (heading, pitch, roll) (N, 3) in degrees.
+    """Convert heading, pitch and roll to rotations from an ENU world to the camera.
 
-    heading : of the optical axis, clockwise from north; pitch : of the optical axis above the horizon
-    (-90 looks straight down, and heading is then the direction of the image's top); roll : clockwise
-    rotation of the camera about its axis as seen from behind it (its right side goes down).
+    Parameters
+    ----------
+    heading_pitch_roll_deg : ndarray, shape (N, 3)
+        Angles in degrees. Heading: of the optical axis, clockwise from north. Pitch: of the optical axis
+        above the horizon (-90 looks straight down, and heading is then the direction of the image's top).
+        Roll: clockwise rotation of the camera about its axis as seen from behind it (its right side goes
+        down).
+
+    Returns
+    -------
+    ndarray, shape (N, 3, 3)
+        cam_from_world rotations.
+
+    Notes
+    -----
     These are the conventions of DJI's gimbal angles.
     """
     heading, pitch, roll = np.moveaxis(
@@ -106,9 +151,18 @@ def rotations_from_angles(heading_pitch_roll_deg: np.ndarray) -> np.ndarray:
 
 
 def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """(heading, pitch, roll) (N, 3) in degrees of cam_from_world rotations (N, 3, 3) in an ENU world.
+    """Convert rotations from an ENU world to the camera into heading, pitch and roll.
 
-    heading lies in [0, 360). Straight up or down, heading and roll are one: roll is then given as 0.
+    Parameters
+    ----------
+    rotations : ndarray, shape (N, 3, 3)
+        cam_from_world rotations.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        Heading in [0, 360), pitch and roll in degrees, as in `rotations_from_angles`. Straight up or down,
+        heading and roll are not separable: roll is 0.
     """
     m = np.asarray(rotations, dtype=np.float64)
     right, down, forward = m[..., 0, :], m[..., 1, :], m[..., 2, :]
@@ -127,9 +181,13 @@ def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
 class Poses:
     """Camera poses of N frames, in the Cambridge convention.
 
-    centers : (N, 3) float64, camera centres in the world frame, metres once georegistered.
-    quats_wxyz : (N, 4) float64, unit, w >= 0, rotating world axes into camera axes
-        (x right, y down, z forward), so ``x_cam = R(q) @ (x_world - center)``.
+    Attributes
+    ----------
+    centers : ndarray, shape (N, 3)
+        Camera centres in the world frame, float64, in metres once georeferenced.
+    quats_wxyz : ndarray, shape (N, 4)
+        Unit quaternions with w >= 0, float64, that rotate world axes into camera axes (x right, y down,
+        z forward): ``x_cam = R(q) @ (x_world - center)``.
     """
 
     centers: np.ndarray
@@ -137,24 +195,32 @@ class Poses:
 
     @classmethod
     def from_rotations(cls, centers: np.ndarray, cam_from_world: np.ndarray) -> Poses:
-        """From centres (N, 3) and cam_from_world rotations (N, 3, 3)."""
+        """Return poses of centres (N, 3) and cam_from_world rotations (N, 3, 3)."""
         return cls(np.asarray(centers, dtype=np.float64), quats_from_rotations(cam_from_world))
 
     @classmethod
     def from_cam_from_world(cls, quats_xyzw: np.ndarray, translations: np.ndarray) -> Poses:
-        """From COLMAP's ``x_cam = R @ x_world + t``: (N, 4) scalar-last quaternions, (N, 3) t."""
+        """Return poses from COLMAP's ``x_cam = R @ x_world + t``.
+
+        Parameters
+        ----------
+        quats_xyzw : ndarray, shape (N, 4)
+            Quaternions of R, scalar last.
+        translations : ndarray, shape (N, 3)
+            Translations t.
+        """
         quats = canonical_quats(np.roll(np.asarray(quats_xyzw, dtype=np.float64), 1, axis=-1))
         centers = -np.einsum("nji,nj->ni", rotations_from_quats(quats), translations)
         return cls(centers, quats)
 
     @classmethod
     def unknown(cls, n: int) -> Poses:
-        """N poses that are NaN."""
+        """Return n poses that are NaN."""
         return cls(np.full((n, 3), np.nan), np.full((n, 4), np.nan))
 
     @classmethod
     def concatenate(cls, parts: Iterable[Poses]) -> Poses:
-        """Those of several, one after the other."""
+        """Return the poses of all parts in order."""
         parts = [Poses(np.zeros((0, 3)), np.zeros((0, 4))), *parts]
         return cls(
             np.concatenate([p.centers for p in parts]),
@@ -162,13 +228,13 @@ class Poses:
         )
 
     def at_rows(self, rows: np.ndarray | list[int], n: int) -> Poses:
-        """N poses, these at `rows`, the others unknown."""
+        """Return n poses with these at `rows` and NaN elsewhere."""
         poses = Poses.unknown(n)
         poses.centers[rows], poses.quats_wxyz[rows] = self.centers, self.quats_wxyz
         return poses
 
     def to_cam_from_world(self) -> tuple[np.ndarray, np.ndarray]:
-        """COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""
+        """Return COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""
         translations = -np.einsum("nij,nj->ni", self.rotations, self.centers)
         return np.roll(self.quats_wxyz, -1, axis=-1), translations
 
@@ -195,7 +261,7 @@ class Poses:
 
     @property
     def rotations(self) -> np.ndarray:
-        """cam_from_world rotations (N, 3, 3)."""
+        """Rotations (N, 3, 3) from world axes to camera axes."""
         return rotations_from_quats(self.quats_wxyz)
 
     def __len__(self) -> int:
@@ -210,7 +276,17 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """``y = scale * rotation @ x + translation``; a variable that holds one is named ``b_from_a``."""
+    """Similarity transform ``y = scale * rotation @ x + translation``; variables are named ``b_from_a``.
+
+    Attributes
+    ----------
+    scale : float
+        Scale, > 0.
+    rotation : ndarray, shape (3, 3)
+        Rotation matrix.
+    translation : ndarray, shape (3,)
+        Translation in the target frame.
+    """
 
     scale: float
     rotation: np.ndarray  # (3, 3)
@@ -218,59 +294,91 @@ class Similarity:
 
     @classmethod
     def identity(cls) -> Similarity:
+        """Return the identity."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod
     def fit(
         cls, source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
     ) -> Similarity:
-        """Least-squares target_from_source over corresponding points (N, 3), N >= 3, weights (N,) >= 0.
+        """Fit the least-squares target_from_source over corresponding points.
 
-        Raises GeometryError where the points lie on one line or coincide (nothing fixes the rotation).
+        Parameters
+        ----------
+        source, target : ndarray, shape (N, 3)
+            Corresponding points, N >= 3.
+        weights : ndarray, shape (N,), optional
+            Weights >= 0; all 1 by default.
+
+        Raises
+        ------
+        GeometryError
+            If fewer than 3 points have weight, or if they are collinear or coincide, so that the rotation is
+            undetermined.
+
+        References
+        ----------
         Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
         """
         source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
         w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
         if np.count_nonzero(w) < 3:
-            raise GeometryError(f"a similarity needs 3 points, {np.count_nonzero(w)} given")
+            raise GeometryError(f"a similarity needs at least 3 points, got {np.count_nonzero(w)}")
         w = w / w.sum()
         source_mean, target_mean = w @ source, w @ target
         source_0, target_0 = source - source_mean, target - target_mean
         u, singular, vt = np.linalg.svd((target_0 * w[:, None]).T @ source_0)  # eq. 38
         if singular[1] <= 1e-9 * singular[0] or singular[0] == 0:
-            raise GeometryError("the points lie on one line: they fix no rotation about it")
+            raise GeometryError(
+                "the points are collinear: the rotation about their line is undetermined"
+            )
         sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
         rotation = (u * sign) @ vt  # eq. 40
         scale = float((singular * sign).sum() / (w @ (source_0**2).sum(axis=1)))  # eq. 42
         return cls(scale, rotation, target_mean - scale * rotation @ source_mean)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) in the target frame."""
+        """Transform points (..., 3) into the target frame."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
     def apply_to_poses(self, poses: Poses) -> Poses:
-        """The same cameras seen in the target frame."""
+        """Transform camera poses into the target frame."""
         return Poses.from_rotations(self.apply(poses.centers), poses.rotations @ self.rotation.T)
 
     def inverse(self) -> Similarity:
+        """Return the inverse transform."""
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
     def __matmul__(self, other: Similarity) -> Similarity:
-        """``c_from_b @ b_from_a`` is c_from_a."""
+        """Compose transforms: ``c_from_b @ b_from_a`` is c_from_a."""
         return Similarity(
             self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation)
         )
 
 
 def rotation_errors_deg(quats_wxyz: np.ndarray, true_quats_wxyz: np.ndarray) -> np.ndarray:
-    """Angles (N,) in degrees between rotations (N, 4): 4 arcsin(min |q -+ r| / 2), exact also near zero."""
+    """Return the angles between pairs of rotations.
+
+    Parameters
+    ----------
+    quats_wxyz, true_quats_wxyz : ndarray, shape (N, 4)
+        Unit quaternions, scalar first.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Angles in degrees: 4 arcsin(min |q -+ r| / 2), which is exact near zero too.
+    """
     q, r = np.asarray(quats_wxyz), np.asarray(true_quats_wxyz)
     chord = np.minimum(np.linalg.norm(q - r, axis=-1), np.linalg.norm(q + r, axis=-1))
     return np.rad2deg(4 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
 
 
 def pose_errors(estimated: Poses, true: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Position errors (N,) in the world's unit and rotation errors (N,) in degrees. Nothing is aligned."""
+    """Return position errors (N,) in the world's unit and rotation errors (N,) in degrees.
+
+    The poses are compared as they are, without alignment.
+    """
     error_m = np.linalg.norm(estimated.centers - true.centers, axis=-1)
     return error_m, rotation_errors_deg(estimated.quats_wxyz, true.quats_wxyz)

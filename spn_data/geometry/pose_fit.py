@@ -1,4 +1,4 @@
-"""The pose of one image from map points that it sees, from a near start."""
+"""Nonlinear refinement of one camera pose from 2D-3D correspondences."""
 
 from __future__ import annotations
 
@@ -19,8 +19,15 @@ _BEHIND_PX = 1e6  # residual of a point behind the camera
 class PoseFit:
     """A pose fitted to K points.
 
-    poses : (1,); residuals_px : (K, 2) projected minus measured; inverse : (6, 6) of the robust normal
-    matrix, over the centre and a rotation vector in the camera frame, for residuals of one pixel.
+    Attributes
+    ----------
+    poses : Poses
+        The one fitted pose.
+    residuals_px : ndarray, shape (K, 2)
+        Projected minus measured pixels.
+    inverse : ndarray, shape (6, 6)
+        Inverse of the robust normal matrix over the centre and a rotation vector in the camera frame, for
+        residuals of one pixel.
     """
 
     poses: Poses
@@ -28,7 +35,7 @@ class PoseFit:
     inverse: np.ndarray
 
     def inliers(self, max_error_px: float) -> np.ndarray:
-        """(K,) bool."""
+        """Return the mask (K,) of points whose reprojection error is below a limit."""
         return (self.residuals_px**2).sum(axis=1) < max_error_px**2
 
 
@@ -41,10 +48,28 @@ def fit_pose(
     first_px: float,
     last_px: float,
 ) -> PoseFit | None:
-    """Least robust cost (Cauchy) over points (K, 3) and pixels (K, 2); None where it does not converge.
+    """Refine a pose by minimising a Cauchy loss of the reprojection errors.
 
-    The scale of the loss shrinks from first_px to last_px, so that a start some pixels off finds its way
-    and far outliers count little at the end.
+    The scale of the loss shrinks from `first_px` to `last_px`, so that a start that is off by some pixels
+    converges and distant outliers have little influence at the end.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera of the image.
+    start : Poses
+        One initial pose.
+    xyz : ndarray, shape (K, 3)
+        Map points in the world frame.
+    pixels : ndarray, shape (K, 2)
+        Their measurements in the (distorted) image.
+    first_px, last_px : float
+        Scale of the loss in the first and in the last iterations.
+
+    Returns
+    -------
+    PoseFit or None
+        None if the refinement does not converge.
     """
     center, rotation = start.centers[0], start.rotations[0]
     scale = max(first_px, last_px)

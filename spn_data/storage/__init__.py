@@ -1,0 +1,1 @@
+"""Atomic files, locks, JSON and CSV files, and the record of a stage."""

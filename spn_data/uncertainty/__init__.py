@@ -1,0 +1,1 @@
+"""Covariance of a frozen map: of its poses, intrinsics and points."""

@@ -1,0 +1,1 @@
+"""Worker processes, Dask clusters, native child processes, and timing."""

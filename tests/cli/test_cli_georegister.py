@@ -12,7 +12,8 @@ import pytest
 from click.testing import CliRunner, Result
 from spn_cli.data import main
 
-from spn_data.area.area import GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import GEO, MODEL
 from spn_data.colmap.model import read_scene
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
@@ -110,7 +111,7 @@ def test_a_camera_of_another_shape_is_refused(flight1: Path, tmp_path: Path) -> 
     file.write_text(json.dumps(camera_to_json(Camera.from_horizontal_fov(400, 300, 70))))
     result = run("reconstruct", flight1, "--area", tmp_path / "area", "--camera", file)
     assert result.exit_code == 1
-    assert "the given camera is of 400x300, the images are 320x180" in result.stderr
+    assert "the given camera is for 400x300 images, these are 320x180" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def test_a_camera_of_another_shape_is_refused(photos, video):
     """A calibration of 16:9 video is none of 4:3 images; the size alone may differ."""
     wide = Camera("SIMPLE_PINHOLE", 128, 72, np.array([80.0, 64.0, 36.0]))
     for source in (photos, video):
-        with pytest.raises(InputError, match="the given camera is of 128x72, the images are"):
+        with pytest.raises(InputError, match="the given camera is for 128x72 images, these are"):
             find_flights([source], wide)
     (flight,), _ = find_flights([photos], CAMERA.scaled(640, 480))
     camera = flight.cameras[0]
