@@ -128,7 +128,7 @@ def test_a_camera_of_another_shape_is_refused(flight1: Path, tmp_path: Path) -> 
 )
 def test_a_file_that_holds_no_camera_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "camera.json").write_text(text)
-    with pytest.raises(InputError, match=r"camera\.json: is no camera"):
+    with pytest.raises(InputError, match=r"camera\.json: does not contain a camera"):
         read_camera(tmp_path / "camera.json")
 
 

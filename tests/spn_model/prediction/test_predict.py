@@ -354,7 +354,7 @@ def test_errors_of_the_command_are_one_line(network, photos, video, tmp_path):
     unknown = commanded(tmp_path, video, *out)
     assert "give it as --camera FILE" in unknown.output
     wrong = commanded(tmp_path, video, "--camera", photos / "000.png", *out)
-    assert "is no camera" in wrong.output
+    assert "does not contain a camera" in wrong.output
     for ran in (missing, unknown, wrong):
         assert ran.exit_code == 1
         assert "Traceback" not in ran.output
