@@ -1,0 +1,1 @@
+"""Errors of estimated poses, baselines, calibration of covariances, and figures of both."""

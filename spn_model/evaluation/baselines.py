@@ -1,4 +1,4 @@
-"""What a network must beat: the mean pose, the most similar training image, the paper's table."""
+"""Baselines that need no network: mean pose, image retrieval, and the published results of the paper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MEAN, ORACLE = "mean training pose", "nearest training pose (oracle)"
 VLAD, GEM = "retrieval, VLAD of SIFT", "retrieval, GeM of SqueezeNet"
 
 FeatureMaps = Callable[[np.ndarray], np.ndarray]
-"""Images (B, H, W, 3) uint8 RGB to feature maps (B, C, h, w) float32."""
+"""Maps images (B, H, W, 3) uint8 RGB to feature maps (B, C, h, w) float32."""
 
 
 class Images(Protocol):
@@ -27,11 +27,11 @@ class Images(Protocol):
     def __len__(self) -> int: ...
 
     def image(self, row: int) -> np.ndarray:
-        """(H, W, 3) uint8 RGB."""
+        """Return an image, (H, W, 3) uint8 RGB."""
         ...
 
     def valid(self, row: int) -> np.ndarray | None:
-        """(H, W) bool: pixels that show the scene; None where all do."""
+        """Return the mask (H, W) bool of pixels that show the scene, or None if all do."""
         ...
 
 
@@ -39,39 +39,42 @@ class PosedImages(Images, Protocol):
     """Images with their true poses."""
 
     @property
-    def poses(self) -> Poses: ...
+    def poses(self) -> Poses:
+        """True poses (N)."""
+        ...
 
 
 Describe = Callable[[Images], np.ndarray]
-"""Unit vectors (N, D) float32 of images; the zero vector for one that shows nothing."""
+"""Maps N images to unit vectors (N, D) float32; an image without features gives the zero vector."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VladOptions:
-    """Retrieval by VLAD of SIFT."""
+    """Options of retrieval by VLAD of SIFT descriptors."""
 
     features: FeatureOptions = field(default_factory=lambda: FeatureOptions(max_features=1000))
     words: int = 64
-    vocabulary_images: int = 200  # at most, evenly spread over the training images
+    vocabulary_images: int = 200  # maximum, evenly spread over the training images
     seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class GemOptions:
-    """Retrieval by generalised-mean pooling of feature maps."""
+    """Options of retrieval by generalised-mean (GeM) pooling of feature maps."""
 
-    power: float = 3.0  # 1: the mean; infinite: the maximum
-    batch: int = 8  # images at a time: bounds the memory
+    power: float = 3.0  # 1: mean pooling; infinity: max pooling
+    batch: int = 8  # images per call; bounds the memory
 
 
 def mean_pose(training: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Mean centre (3,) and mean unit quaternion (4,) of at least one pose.
+    """Return the mean centre (3,) and mean unit quaternion (4,) of at least one pose.
 
-    The quaternion is the eigenvector of the largest eigenvalue of sum q q^T, which does not depend on
-    signs: Markley et al. 2007, "Averaging quaternions", eq. 12. Where rotations cancel out it is arbitrary.
+    The quaternion is the eigenvector of the largest eigenvalue of sum q q^T, which does not depend on the
+    signs of the quaternions: Markley et al. 2007, "Averaging quaternions", eq. 12. It is arbitrary if the
+    rotations cancel out. Raises ValueError if there is no pose.
     """
     if len(training) == 0:
-        raise ValueError("no poses have no mean")
+        raise ValueError("cannot average zero poses")
     quats = training.quats_wxyz
     return training.centers.mean(axis=0), canonical_quats(np.linalg.eigh(quats.T @ quats)[1][:, -1])
 
@@ -79,47 +82,59 @@ def mean_pose(training: Poses) -> tuple[np.ndarray, np.ndarray]:
 def baselines(
     training: PosedImages, groups: Sequence[PosedImages], describe: Mapping[str, Describe]
 ) -> list[list[Estimates]]:
-    """For each group: the mean training pose, the oracle, and each way of looking up, by its name.
+    """Return, for each group, the estimates of the mean training pose, the oracle, and each retrieval method.
 
-    Training images are described once. The training frames themselves are no group to look up: each would
-    find itself. Raises ValueError for them.
+    describe : image descriptors, by name of the retrieval method. The training images are described only
+    once. Raises ValueError if a group is the training group: each of its frames would retrieve itself.
     """
     if any(group is training for group in groups):
-        raise ValueError("a training frame looked up finds itself")
-    found = [[guess_mean(training.poses, len(g)), oracle(training.poses, g.poses)] for g in groups]
+        raise ValueError("the training group cannot be queried: each frame would retrieve itself")
+    found = [
+        [
+            mean_pose_estimates(training.poses, len(g)),
+            nearest_pose_estimates(training.poses, g.poses),
+        ]
+        for g in groups
+    ]
     for method, described in describe.items():
         known = described(training)
         for estimates, group in zip(found, groups, strict=True):
-            estimates.append(look_up(method, training.poses, known, described(group)))
+            estimates.append(retrieve(method, training.poses, known, described(group)))
     return found
 
 
-def guess_mean(training: Poses, frames: int) -> Estimates:
-    """The mean training pose for each of N frames: what is known without an image."""
+def mean_pose_estimates(training: Poses, frames: int) -> Estimates:
+    """Estimate the mean training pose for each of N frames: the best guess without an image."""
     center, quat = mean_pose(training)
     return Estimates(MEAN, Poses(np.tile(center, (frames, 1)), np.tile(quat, (frames, 1))))
 
 
-def oracle(training: Poses, true: Poses) -> Estimates:
-    """The nearest training pose for each of N frames: no lookup of one training frame can be better.
+def nearest_pose_estimates(training: Poses, true: Poses) -> Estimates:
+    """Estimate the nearest training pose for each of N frames: a bound on retrieval of one training image.
 
-    Nearest is the smallest distance + angle / 10 degrees per metre. Raises GeometryError without training.
+    The nearest training pose has the smallest distance + angle / (10 degrees per metre) to the true pose.
+    Raises GeometryError if there are no training poses.
     """
     return Estimates(ORACLE, training[nearest_rows(true, training)])
 
 
-def look_up(method: str, training: Poses, described: np.ndarray, queries: np.ndarray) -> Estimates:
-    """The pose of the most similar of M training images for each of N images.
+def retrieve(method: str, training: Poses, described: np.ndarray, queries: np.ndarray) -> Estimates:
+    """Estimate, for each of N images, the pose of the most similar of M training images.
 
-    described : (M, D), queries : (N, D) unit vectors. NaN for an image that is the zero vector.
+    described : (M, D), queries : (N, D), unit vectors. The pose is NaN if the query is the zero vector.
+    Raises ValueError if `training` and `described` have different lengths.
     """
     if len(training) != len(described):
-        raise ValueError(f"{len(training)} training poses of {len(described)} images")
-    return posed(method, training, most_similar(described, queries))
+        raise ValueError(f"{len(training)} training poses for {len(described)} descriptors")
+    return estimates_at(method, training, most_similar(described, queries))
 
 
 def most_similar(described: np.ndarray, queries: np.ndarray) -> np.ndarray:
-    """(N,) row of the most similar of M images (M, D) for each of N (N, D), unit vectors; -1 for zero."""
+    """Return the row (N,) of the most similar training image for each query.
+
+    described : (M, D), queries : (N, D), unit vectors, compared by their dot product. The row is -1 if the
+    query is the zero vector.
+    """
     rows = np.full(len(queries), -1)
     shows = np.flatnonzero(np.any(queries != 0, axis=1))
     if len(shows):
@@ -127,8 +142,8 @@ def most_similar(described: np.ndarray, queries: np.ndarray) -> np.ndarray:
     return rows
 
 
-def posed(method: str, training: Poses, rows: np.ndarray) -> Estimates:
-    """The training poses at rows (N,); NaN at -1."""
+def estimates_at(method: str, training: Poses, rows: np.ndarray) -> Estimates:
+    """Estimate the training poses at rows (N,); NaN where the row is -1."""
     centers, quats = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
     found = rows >= 0
     centers[found], quats[found] = training.centers[rows[found]], training.quats_wxyz[rows[found]]
@@ -136,7 +151,7 @@ def posed(method: str, training: Poses, rows: np.ndarray) -> Estimates:
 
 
 def vlad(training: Images, options: VladOptions | None = None) -> Describe:
-    """Describes images by VLAD of RootSIFT with a vocabulary from the training images alone."""
+    """Return a VLAD descriptor of RootSIFT whose vocabulary comes from the training images alone."""
     options = options or VladOptions()
     count = min(len(training), options.vocabulary_images)
     rows = np.unique(np.linspace(0, len(training) - 1, count).round().astype(np.int64))
@@ -153,10 +168,10 @@ def vlad(training: Images, options: VladOptions | None = None) -> Describe:
 
 
 def gem(feature_maps: FeatureMaps, options: GemOptions | None = None) -> Describe:
-    """Describes images by generalised-mean pooling of non-negative feature maps.
+    """Return a descriptor that pools non-negative feature maps by their generalised mean.
 
     Radenovic et al. 2018, "Fine-tuning CNN image retrieval with no human annotation", eq. 3.
-    Invalid pixels are taken as they are, black.
+    Invalid pixels are not masked: they enter the feature maps as black.
     """
     options = options or GemOptions()
 
@@ -164,27 +179,31 @@ def gem(feature_maps: FeatureMaps, options: GemOptions | None = None) -> Describ
         parts = []
         for first in range(0, len(images), options.batch):
             rows = range(first, min(first + options.batch, len(images)))
-            parts.append(pool(feature_maps(np.stack([images.image(r) for r in rows])), options))
+            parts.append(gem_pool(feature_maps(np.stack([images.image(r) for r in rows])), options))
         return np.concatenate(parts) if parts else np.zeros((0, 0), np.float32)
 
     return describe
 
 
-def pool(maps: np.ndarray, options: GemOptions) -> np.ndarray:
-    """Unit vectors (B, C): the power mean over the cells of feature maps (B, C, h, w), all at least 0."""
+def gem_pool(maps: np.ndarray, options: GemOptions) -> np.ndarray:
+    """Return unit vectors (B, C): the power mean over the cells of feature maps (B, C, h, w).
+
+    Negative values of the maps are clipped to 0. An all-zero map gives the zero vector.
+    """
     positive = np.maximum(np.asarray(maps, np.float64), 0.0)
     highest = np.maximum(positive.max(axis=(2, 3), keepdims=True), 1e-12)
-    # Relative to the highest cell, so that no power overflows.
+    # Normalise by the largest cell, so that the power does not overflow.
     mean = ((positive / highest) ** options.power).mean(axis=(2, 3)) ** (1 / options.power)
     pooled = mean * highest[:, :, 0, 0]
     length = np.linalg.norm(pooled, axis=1, keepdims=True)
     return np.asarray(np.where(length > 1e-9, pooled / np.maximum(length, 1e-9), 0.0), np.float32)
 
 
-def better(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Of retrieval methods on one group, the one with the smaller median of error + angle / 10 deg per m.
+def better_retrieval(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Return the retrieval method with the smaller median of position error + angle / (10 degrees per metre).
 
-    Chosen by the very frames that are judged, in favour of retrieval: a network must beat the better one.
+    evaluations : of the retrieval methods on one group. The choice uses the evaluated frames themselves and
+    so favours retrieval: a network has to beat the better of the two.
     """
     return min(evaluations, key=_cost)
 
@@ -202,7 +221,7 @@ def _sift(images: Images, row: int, options: VladOptions) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Published:
-    """A published error of a network; sequence : medium or low, as the paper's coverage."""
+    """A published error of a network. sequence : "medium" or "low", the coverage in the paper."""
 
     network: str
     sequence: str
@@ -213,8 +232,8 @@ class Published:
 PAPER_SOURCE = (
     "Mueller, Urban, Jutzi 2017: SqueezePoseNet: Image Based Pose Regression with Small Convolutional "
     "Neural Networks for Real Time UAS Navigation. ISPRS Annals IV-2/W3, table 1. Measured in the LaFiDa "
-    "atrium, 39 m x 36 m x 18 m, with cameras of its own: another place than the one evaluated here. "
-    "Whether the figures are means or medians is not said."
+    "atrium, 39 m x 36 m x 18 m, with other cameras: not the place that is evaluated here. "
+    "The paper does not say whether its figures are means or medians."
 )
 PAPER_TABLE_1 = (
     Published("PoseNet", "medium", 8.60, 50.83),

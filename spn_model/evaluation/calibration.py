@@ -1,4 +1,4 @@
-"""Whether stated covariances of poses are as large as the errors that are made."""
+"""Calibration of pose covariances: whether stated covariances match the actual errors."""
 
 from __future__ import annotations
 
@@ -7,23 +7,38 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-DOF = 6  # of a pose
-FAR_SHARE = 0.001  # of frames with a right covariance lies farther than "beyond": 22.46
-LEVELS = np.round(np.arange(0.05, 1.0, 0.05), 2)  # at which the reliability curve is read
+DOF = 6  # degrees of freedom of a pose
+TAIL_SHARE = 0.001  # of frames have a NEES above 22.46 if the covariance is right: "beyond"
+LEVELS = np.round(np.arange(0.05, 1.0, 0.05), 2)  # confidence levels of the reliability curve
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How stated covariances of one group fit its errors e; d^2 = e^T C^-1 e is chi-squared where they do.
+    """How well the stated covariances C of one group match its errors e.
 
-    frames : with a pose and a covariance that can be inverted; unusable : with a pose and a covariance
-    that is not positive definite; unknown : with a pose and no covariance (NaN).
-    ratio : median d^2 over that of chi-squared with 6 degrees of freedom (5.348). 1 is right; 4 means
-        errors twice as large as stated. position_ratio, rotation_ratio : the same of either half (2.366).
-    beyond : share of d^2 above 22.46, where a right covariance leaves 0.1 %.
-    sigma, sigma_deg : medians of the stated standard deviations (root of the trace of either half).
-    expected, observed : the reliability curve: share of frames whose error lies within the ellipsoid
-        that should hold the expected share. Where all covariances are right, the two are equal.
+    NEES = e^T C^-1 e follows a chi-squared distribution with 6 degrees of freedom if C is right. All figures
+    are NaN if no frame has a usable covariance.
+
+    Attributes
+    ----------
+    frames : int
+        Frames with a pose and a positive definite covariance.
+    unusable : int
+        Frames with a pose and a covariance that is not positive definite.
+    unknown : int
+        Frames with a pose and without a covariance (NaN).
+    ratio : float
+        Median NEES divided by the median of chi-squared with 6 degrees of freedom (5.348). The ideal value is
+        1; 4 means that errors are twice as large as stated.
+    position_ratio, rotation_ratio : float
+        The same for position or rotation alone (3 degrees of freedom, median 2.366).
+    beyond : float
+        Share of frames with a NEES above 22.46, which a right covariance exceeds in 0.1 % of frames.
+    sigma, sigma_deg : float
+        Medians of the stated standard deviations of position and rotation (root of the trace of the block).
+    expected, observed : tuple of float
+        Reliability curve: the share of frames whose error is expected to be, and is, within the confidence
+        ellipsoid. Both are equal if all covariances are right.
     """
 
     frames: int
@@ -39,10 +54,24 @@ class Calibration:
     observed: tuple[float, ...]
 
 
-def squared_distances(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """e^T C^-1 e (N,) of errors (N, D) under covariances (N, D, D).
+def nees(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the normalised estimation error squared (NEES) e^T C^-1 e of each frame.
 
-    NaN where the covariance is unknown or is not positive definite.
+    Parameters
+    ----------
+    errors : ndarray, shape (N, D)
+        Errors e.
+    covariance : ndarray, shape (N, D, D)
+        Stated covariances C.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        NaN where the covariance is unknown or not positive definite.
+
+    References
+    ----------
+    Bar-Shalom, Li, Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4.
     """
     errors, covariance = np.asarray(errors, float), np.asarray(covariance, float)
     squared = np.full(len(errors), np.nan)
@@ -57,7 +86,10 @@ def squared_distances(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def is_covariance(covariance: np.ndarray) -> np.ndarray:
-    """(N,) bool: finite and positive definite, judged on correlations, for metres and radians differ."""
+    """Return which covariances (N, D, D) are finite and positive definite, (N,) bool.
+
+    The test uses correlations, because positions in metres and rotations in radians have different scales.
+    """
     covariance = np.asarray(covariance, float)
     good = np.isfinite(covariance).all(axis=(1, 2))
     good[good] = np.all(np.einsum("nii->ni", covariance[good]) > 0, axis=1)
@@ -66,7 +98,7 @@ def is_covariance(covariance: np.ndarray) -> np.ndarray:
 
 
 def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stated standard deviations (N,) of position and, in degrees, of rotation; NaN where unknown."""
+    """Return stated standard deviations (N,) of position and of rotation (degrees); NaN where unknown."""
     usable = is_covariance(covariance)
     trace = np.full((len(covariance), 2), np.nan)
     trace[usable, 0] = np.einsum("nii->n", covariance[usable, :3, :3])
@@ -75,16 +107,26 @@ def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def calibrate(errors: np.ndarray, covariance: np.ndarray) -> Calibration:
-    """Of errors (N, 6) (true minus estimated centre; rotation vector v, R_true = exp(v) R) and covariances.
+    """Compare errors with their stated covariances.
 
-    NaN in all figures where no frame has a usable covariance.
+    Parameters
+    ----------
+    errors : ndarray, shape (N, 6)
+        True minus estimated centre, then the rotation vector v with R_true = exp(v) R.
+    covariance : ndarray, shape (N, 6, 6)
+        Stated covariances; NaN where unknown.
+
+    Returns
+    -------
+    Calibration
+        Its figures are NaN if no frame has a usable covariance.
     """
     usable = is_covariance(covariance)
     unknown = int(np.isnan(covariance).any(axis=(1, 2)).sum())
     e, c = errors[usable], covariance[usable]
-    pose = squared_distances(e, c)
-    position = squared_distances(e[:, :3], c[:, :3, :3])
-    rotation = squared_distances(e[:, 3:], c[:, 3:, 3:])
+    pose = nees(e, c)
+    position = nees(e[:, :3], c[:, :3, :3])
+    rotation = nees(e[:, 3:], c[:, 3:, 3:])
     sigma, sigma_deg = sigmas(c)
     inside = np.sort(chdtr(DOF, pose))
     observed = np.searchsorted(inside, LEVELS, side="right") / max(len(pose), 1)
@@ -95,7 +137,7 @@ def calibrate(errors: np.ndarray, covariance: np.ndarray) -> Calibration:
         ratio=_median(pose) / float(chdtri(DOF, 0.5)),
         position_ratio=_median(position) / float(chdtri(3, 0.5)),
         rotation_ratio=_median(rotation) / float(chdtri(3, 0.5)),
-        beyond=float((pose > chdtri(DOF, FAR_SHARE)).mean()) if len(pose) else float("nan"),
+        beyond=float((pose > chdtri(DOF, TAIL_SHARE)).mean()) if len(pose) else float("nan"),
         sigma=_median(sigma),
         sigma_deg=_median(sigma_deg),
         expected=tuple(LEVELS.tolist()),

@@ -18,7 +18,7 @@ from spn_model.evaluation.tables import write_errors, write_metrics
 from spn_model.models.checkpoint import Checkpoint
 
 
-def of_network(comparison: NetworkComparison, name: str) -> NetworkComparison:
+def select_network(comparison: NetworkComparison, name: str) -> NetworkComparison:
     """Return a comparison that keeps one network (and its dropout estimates) and all baselines.
 
     Parameters
@@ -82,7 +82,7 @@ def write_comparison(
     shutil.rmtree(drawings, ignore_errors=True)
     drawings.mkdir(parents=True)
     for name, group in zip(_file_names(comparison.groups), comparison.groups, strict=True):
-        for what, drawing in drawn(group, comparison).items():
+        for what, drawing in draw_figures(group, comparison).items():
             write_atomically(drawings / f"{name}-{what}.svg", drawing)
     for what, drawing in (more_drawings or {}).items():
         write_atomically(drawings / f"{what}.svg", drawing)
@@ -122,7 +122,7 @@ def cost_facts(cost: NetworkCost) -> dict[str, Any]:
     return {**asdict(cost), "ms_an_image": round(1000 * cost.seconds / cost.images, 3)}
 
 
-def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str]:
+def draw_figures(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str]:
     """Draw the figures of a group, by name.
 
     Training groups have none, because the nearest training frame of each of their frames is itself.
@@ -130,14 +130,14 @@ def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str
     if group.role is Role.TRAIN:
         return {}
     unit = "m" if comparison.units == "m" else "model units"
-    beside = [group.retrieval] if group.retrieval else []
-    shown = [*comparison.networks, *beside]
+    baseline = [group.retrieval] if group.retrieval else []
+    shown = [*comparison.networks, *baseline]
     compared = [e for e in group.evaluations if e.method != MEAN]
     found = {
         "trajectories": figures.trajectories(
-            comparison.training, group.frames, _of(group.estimates, shown), unit=unit
+            comparison.training, group.frames, _select_methods(group.estimates, shown), unit=unit
         ),
-        "histograms": figures.histograms(_of(group.evaluations, shown), unit=unit),
+        "histograms": figures.histograms(_select_methods(group.evaluations, shown), unit=unit),
         "distance": figures.error_curves(compared, unit=unit),
     }
     if any(e.calibration is not None and e.calibration.frames for e in group.evaluations):
@@ -145,7 +145,7 @@ def drawn(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str
     return found
 
 
-def _of(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
+def _select_methods(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
     """Select methods, in the given order."""
     by_method = {one.method: one for one in found}
     return [by_method[method] for method in methods]

@@ -1,4 +1,4 @@
-"""Trained networks on the groups of a data set, beside what needs no network. Nothing is ever aligned."""
+"""Evaluation of trained networks and baselines on the groups of a data set, without any alignment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
-from spn_model.evaluation.baselines import GEM, VLAD, better, guess_mean, oracle, posed
+from spn_model.evaluation.baselines import (
+    GEM,
+    VLAD,
+    better_retrieval,
+    estimates_at,
+    mean_pose_estimates,
+    nearest_pose_estimates,
+)
 from spn_model.evaluation.dropout import dropout_estimates, has_dropout
 from spn_model.evaluation.metrics import (
     Estimates,
@@ -26,7 +33,7 @@ from spn_model.evaluation.metrics import (
     evaluate,
     evaluation_frames,
 )
-from spn_model.evaluation.retrieval import most_alike
+from spn_model.evaluation.retrieval import most_similar_images
 from spn_model.evaluation.validation import spread_rows
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.pose_model import PoseEstimates, PoseModel
@@ -37,21 +44,35 @@ _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What is judged, and beside what."""
+    """What is evaluated, and which baselines are computed.
 
-    # Of the training images, spread evenly: errors there tell what the network has learnt by heart.
+    Attributes
+    ----------
+    training_images : int
+        Number of training images to evaluate as well, evenly spread. Their errors show how far the network
+        memorises its training set.
+    batch : int
+        Batch size.
+    baselines : bool
+        Whether the baselines are computed.
+    dropout_samples : int
+        Samples of Monte-Carlo dropout, for each network that has dropout; 0 disables it.
+    seed : int
+        Random seed of dropout.
+    """
+
     training_images: int = 200
-    batch: int = 8  # images given to a network at once
+    batch: int = 8
     baselines: bool = True
-    dropout_samples: int = 0  # Monte-Carlo dropout beside each network that has dropout; 0: none
-    seed: int = 0  # of dropout
+    dropout_samples: int = 0
+    seed: int = 0
 
 
 @dataclass(frozen=True)
 class NetworkCost:
-    """Of one network, after a first image that does not count: images as they lie in the data set to poses.
+    """Cost of estimating poses with one network, from pixels in memory to poses, after one warm-up image.
 
-    seconds : wall clock; cpu_seconds : of this process, all its threads; batch : images given at once.
+    seconds : wall clock; cpu_seconds : CPU time of all threads of this process; batch : batch size.
     """
 
     images: int
@@ -64,8 +85,22 @@ class NetworkCost:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedGroup:
-    """One group. estimates, evaluations : of the same methods, networks first. retrieval : the better one
-    of the two, None without baselines and for training images, each of which would find itself."""
+    """Estimates and evaluations of all methods on one group.
+
+    Attributes
+    ----------
+    role : Role
+        Role of the group in the data set.
+    frames : EvaluationFrames
+        The evaluated frames.
+    estimates : tuple of Estimates
+        By method, networks first.
+    evaluations : tuple of Evaluation
+        Of the same methods in the same order.
+    retrieval : str or None
+        Name of the better retrieval method; None without baselines, and for training images, each of which
+        would retrieve itself.
+    """
 
     role: Role
     frames: EvaluationFrames
@@ -78,7 +113,24 @@ class EvaluatedGroup:
 class NetworkComparison:
     """Networks and baselines on all groups: test, validation, training.
 
-    networks : names of networks, of Monte-Carlo dropout too; costs : by network; notes : one sentence each.
+    Attributes
+    ----------
+    training : Poses
+        All training poses.
+    units : str
+        "m" or "model".
+    dataset : Path
+        The evaluated data set.
+    fingerprint : str
+        Its fingerprint.
+    groups : tuple of EvaluatedGroup
+        In the order test, validation, training.
+    networks : tuple of str
+        Names of the networks, and of their Monte-Carlo dropout estimates.
+    costs : mapping of str to NetworkCost
+        By name in `networks`.
+    notes : tuple of str
+        One sentence each.
     """
 
     training: Poses
@@ -100,11 +152,33 @@ def compare(
     *,
     kept: Path | None = None,
 ) -> NetworkComparison:
-    """Judge networks, by name, on all test groups, validation frames and a sample of the training frames.
+    """Evaluate networks on all test groups, the validation frames and a sample of the training frames.
 
-    world_names : fingerprints of a data set that decide its world; kept : see `most_alike`.
-    Raises InputError where the data set is of another world than a network's, or has no frames to judge by;
-    FormatError where it is no data set, or of another version.
+    Parameters
+    ----------
+    path : Path
+        Data set.
+    networks : mapping of str to Checkpoint
+        Networks by name.
+    world_names : sequence of str
+        Names of the fingerprints that identify the world of a data set.
+    progress : Progress
+        Receives the network's name, frames done, and frames in total.
+    options : EvaluateOptions, optional
+        What is evaluated.
+    kept : Path, optional
+        Cache of the retrieval baselines, see `most_similar_images`.
+
+    Returns
+    -------
+    NetworkComparison
+
+    Raises
+    ------
+    InputError
+        If the data set belongs to another world than a network, or has no frames to evaluate on.
+    FormatError
+        If the file is not a data set, or has another version.
     """
     options = options or EvaluateOptions()
     with Dataset(path) as data:
@@ -128,39 +202,45 @@ def compare(
         found: list[list[Estimates]] = [[] for _ in chosen]
         costs = {}
         for name, network in networks.items():
-            learnt = [g.name for g in groups if g.name in network.facts.get("trained_on", ())]
-            if learnt:
+            learned = [g.name for g in groups if g.name in network.facts.get("trained_on", ())]
+            if learned:
                 notes.append(
-                    f"{name} was trained on {', '.join(learnt)} too: there its errors are those of training "
-                    "images, and baselines knew less."
+                    f"{name} was also trained on {', '.join(learned)}: its errors there are training errors, "
+                    "and the baselines did not use those images."
                 )
-            parts, costs[name] = _estimated(network.model, chosen, progress, name, options)
+            parts, costs[name] = _estimate_poses(network.model, chosen, progress, name, options)
             for estimates, part in zip(found, parts, strict=True):
                 estimates.append(Estimates(name, part.poses, part.covariance))
             if options.dropout_samples:
                 if not has_dropout(network.model):
-                    notes.append(f"{name} has no dropout: there is nothing to sample.")
+                    notes.append(f"{name} has no dropout layers: Monte-Carlo dropout was skipped.")
                     continue
-                told = f"{name}, {options.dropout_samples} dropout samples"
-                parts, costs[told] = _estimated(
-                    network.model, chosen, progress, told, options, options.dropout_samples
+                method = f"{name}, {options.dropout_samples} dropout samples"
+                parts, costs[method] = _estimate_poses(
+                    network.model, chosen, progress, method, options, options.dropout_samples
                 )
                 for estimates, part in zip(found, parts, strict=True):
-                    estimates.append(Estimates(told, part.poses, part.covariance))
-        alike = most_alike(data, training, groups, progress, kept) if options.baselines else None
+                    estimates.append(Estimates(method, part.poses, part.covariance))
+        most_similar = (
+            most_similar_images(data, training, groups, progress, kept)
+            if options.baselines
+            else None
+        )
         judged = []
         for k, (group, of) in enumerate(chosen):
             if options.baselines:
-                found[k].append(guess_mean(training.poses, len(of)))
-            if alike is not None and group is not training:
-                looked_up = [posed(m, training.poses, alike[m][k]) for m in (VLAD, GEM)]
-                found[k] += [*looked_up, oracle(training.poses, group.poses)]
+                found[k].append(mean_pose_estimates(training.poses, len(of)))
+            if most_similar is not None and group is not training:
+                looked_up = [
+                    estimates_at(m, training.poses, most_similar[m][k]) for m in (VLAD, GEM)
+                ]
+                found[k] += [*looked_up, nearest_pose_estimates(training.poses, group.poses)]
             evaluations = tuple(evaluate(one, frames[k]) for one in found[k])
             retrieval = [e for e in evaluations if e.method in (VLAD, GEM)]
-            best = better(retrieval).method if retrieval else None
+            best = better_retrieval(retrieval).method if retrieval else None
             judged.append(EvaluatedGroup(group.role, frames[k], tuple(found[k]), evaluations, best))
         if len(rows) < len(training):
-            notes.append(f"Of {len(training)} training images, {len(rows)} are judged.")
+            notes.append(f"{len(rows)} of {len(training)} training images were evaluated.")
         return NetworkComparison(
             training.poses,
             data.info.units,
@@ -176,49 +256,69 @@ def compare(
 def check_world(
     network: Checkpoint, data: Dataset, name: str, world_names: Sequence[str], fingerprint: str
 ) -> None:
-    """Raises InputError where poses of a network and labels of a data set cannot be compared.
+    """Check that poses of a network can be compared with the labels of a data set.
 
-    The data set that it was trained on can. Another one is of the same world where unit, origin and what
-    decides the world are the same, and a network that knows one camera needs images of that one.
+    The data set that the network was trained on always passes. Another one has to have the same unit, origin
+    and world fingerprints; if the network supports only one camera, it also has to have images of that
+    camera.
+
+    Parameters
+    ----------
+    network : Checkpoint
+        Trained network.
+    data : Dataset
+        Data set to compare with.
+    name : str
+        The network's name, for the message.
+    world_names : sequence of str
+        Names of the fingerprints that identify the world of a data set.
+    fingerprint : str
+        Fingerprint of `data`.
+
+    Raises
+    ------
+    InputError
+        If worlds or cameras differ.
     """
     view = network.view
     if fingerprint == view.dataset:
         return
-    why = _other_world(view, data, world_names)
-    if why:
+    difference = _world_difference(view, data, world_names)
+    if difference:
         raise InputError(
-            f"is of another world than the one that {name} was trained in: {why}; errors would mean "
-            "nothing. Train anew on this data set, or name the one that it was trained on",
+            f"belongs to another world than {name} was trained in ({difference}), so errors would be "
+            "meaningless; train on this data set, or use one of the world of the training",
             path=data.path,
         )
     if not network.model.any_camera and not _same_camera(view, data):
         raise InputError(
-            f"its images are of another camera than the one that {name} was trained for, and its kind of "
-            "network knows no other; make the data set with the same rendering",
+            f"has images of another camera than {name} was trained for, and this kind of network supports "
+            "only one; create the data set with the same rendering",
             path=data.path,
         )
 
 
-def _other_world(view: View, data: Dataset, names: Sequence[str]) -> str | None:
+def _world_difference(view: View, data: Dataset, names: Sequence[str]) -> str | None:
+    """Return how the worlds of network and data set differ, or None if they are the same."""
     info = data.info
     if info.units != view.units:
-        return f"lengths are in units {info.units!r}, the network's in {view.units!r}"
+        return f"its unit is {info.units!r}, the network's is {view.units!r}"
     if info.up_is_known != view.up_is_known:
-        return "only one of the two knows where up is"
+        return "the vertical is known in only one of the two"
     here, there = info.origin, view.origin
     if (here is None) != (there is None):
-        return "only one of the two has a known place"
+        return "only one of the two is georeferenced"
     if here is not None and there is not None:
         apart = max(abs(here.lat_deg - there.lat_deg), abs(here.lon_deg - there.lon_deg))
         heights_differ = abs(here.alt_m - there.alt_m) > _SAME_M
         if apart > _SAME_DEG or heights_differ or here.height_reference != there.height_reference:
-            return "its origin is another"
+            return "its origin differs"
     decided = [name for name in names if name in info.fingerprints or name in view.made_from]
     if not decided:
-        return "nothing tells that both are of the same map"
+        return "no fingerprint shows that both belong to the same map"
     for name in decided:
         if info.fingerprints.get(name) != view.made_from.get(name):
-            return f"{name} is another"
+            return f"{name} differs"
     return None
 
 
@@ -232,25 +332,25 @@ def _same_camera(view: View, data: Dataset) -> bool:
 
 
 def _groups(data: Dataset) -> tuple[DatasetGroup, list[DatasetGroup], list[str]]:
-    """The training group; those to judge by, test before validation; what was left out."""
+    """Return the training group, the groups to evaluate (test first), and notes on skipped groups."""
     of_training = [group for group in data.of_role(Role.TRAIN) if len(group)]
     if len(of_training) != 1:
         raise InputError(
-            f"has {len(of_training)} groups with training frames, where one is needed to compare with",
+            f"has {len(of_training)} groups with training frames; exactly one is needed",
             path=data.path,
         )
     found = [*data.of_role(Role.TEST), *data.of_role(Role.VALIDATION)]
     groups = [group for group in found if len(group)]
     if not groups:
         raise InputError(
-            "holds no frames to judge a network by: every test and validation group is empty",
+            "has no frames to evaluate on: every test and validation group is empty",
             path=data.path,
         )
-    notes = [f"Group {group.name} is empty: left out." for group in found if not len(group)]
+    notes = [f"Group {group.name} is empty and was skipped." for group in found if not len(group)]
     return of_training[0], groups, notes
 
 
-def _estimated(
+def _estimate_poses(
     model: PoseModel,
     chosen: Sequence[tuple[DatasetGroup, np.ndarray]],
     progress: Progress,
@@ -258,10 +358,10 @@ def _estimated(
     options: EvaluateOptions,
     samples: int = 0,
 ) -> tuple[list[PoseEstimates], NetworkCost]:
-    """What a network says of each part's rows, and what it cost without reading the images."""
+    """Return a network's estimates of the chosen rows of each group, and its cost without image reading."""
     total, done, seconds, cpu = sum(len(rows) for _, rows in chosen), 0, 0.0, 0.0
     group, rows = chosen[0]
-    # Caches, threads and kernels are set up by a first image, which would otherwise be counted.
+    # Warm-up: the first image sets up caches, threads and kernels, which must not be timed.
     model.estimate(group.image(int(rows[0]))[None], group.intrinsics[rows[:1]])
     parts = []
     for group, rows in chosen:

@@ -1,4 +1,4 @@
-"""Feature maps of ImageNet's SqueezeNet 1.1, for images that nothing was trained on."""
+"""Feature maps of SqueezeNet 1.1 trained on ImageNet, for retrieval without training on the area."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ WEIGHTS = "squeezenet1_1-features"
 
 
 def squeezenet_maps(weights: str = WEIGHTS) -> FeatureMaps:
-    """Maps of fire9 (B, 512, about H / 16, about W / 16), all at least 0, of uint8 RGB (B, H, W, 3).
+    """Return a function that computes the fire9 maps (B, 512, about H / 16, about W / 16) of RGB images.
 
-    weights : a name of the catalogue, or a file. Raises InputError where they cannot be had.
+    The maps are non-negative, images (B, H, W, 3) uint8. weights : a name in the catalogue of weights, or a
+    file. Raises InputError if the weights cannot be found.
     """
-    # Slope 0 is the ReLU that it was pretrained with, and untrained normalisation the identity to 1e-5.
+    # Slope 0 gives the ReLU of the pretraining; untrained batch normalisation is the identity to 1e-5.
     network = SqueezePoseNet(SqueezePoseNetOptions(slope=0.0))
     path = find(weights)
     load_pretrained(network, read_tensors(path), path)

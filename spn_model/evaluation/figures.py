@@ -1,4 +1,4 @@
-"""Figures of an evaluation, as the paper's 6 to 9, and of its uncertainty; SVG (docs/evaluation.md)."""
+"""Figures of an evaluation as SVG: figures 6 to 9 of the paper, and calibration (docs/evaluation.md)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from spn_model.evaluation.svg import COLOURS, INK, SOFT, Panel
 from spn_model.evaluation.trajectory_view import thinned, trajectory_panel
 
 _MOST_BARS = 25
-_FAR = 1.5  # times the p95: errors that are larger stretch no scale
+_FAR = 1.5  # times the p95: larger errors do not extend the scale
 _ROW = 150.0
 
 
 def trajectories(
     training: Poses, frames: EvaluationFrames, estimates: Sequence[Estimates], *, unit: str = "m"
 ) -> str:
-    """Training cameras, true trajectory and estimates, obliquely and from above (the paper's 6 and 8).
+    """Draw training cameras, true trajectory and estimates, obliquely and from above (the paper's 6 and 8).
 
-    Each estimate hangs on a thin line from its true place. Estimates far outside the place are not
-    drawn but counted. Of very many frames an even choice is drawn.
+    A thin line connects each estimate with its true position. Estimates far outside the area are counted in
+    the legend instead of drawn. Long sequences are thinned evenly.
     """
     heading = f"{frames.group}: trajectories"
     drawn = len(thinned(len(frames)))
@@ -42,7 +42,7 @@ def trajectories(
     for k, one in enumerate(estimates):
         missing = int(np.isnan(one.poses.centers).any(axis=1).sum())
         notes = [
-            *([f"{outside[k]} outside the picture"] if outside[k] else []),
+            *([f"{outside[k]} outside the plot"] if outside[k] else []),
             *([f"{missing} without a pose"] if missing else []),
             *([f"{drawn} of {len(frames)} frames drawn"] if drawn < len(frames) else []),
         ]
@@ -53,10 +53,10 @@ def trajectories(
 
 
 def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
-    """Spatial and angular errors of each method on one group, a row a method (the paper's 7 and 9).
+    """Draw histograms of position and rotation errors on one group, one row per method (the paper's 7 and 9).
 
-    Scales are common to the methods. Where a few frames lie far beyond all others, the scale ends at the
-    largest p95, and a paler bar counts what is beyond.
+    All methods share the scales. If a few errors are far larger than the others, the scale ends at the
+    largest p95, and a paler bar counts the errors beyond it.
     """
     heading = f"{evaluations[0].frames.group}: errors"
     parts = [svg.text(20, 22, heading, bold=True)]
@@ -85,7 +85,7 @@ def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
                 420.0,
                 80.0,
                 (0.0, edge + 1.5 * steps[column]),
-                (0.0, max(1.0, float(bars.max()) * 1.3)),  # room for words
+                (0.0, max(1.0, float(bars.max()) * 1.3)),  # room for the text
             )
             label = f"position error ({unit})" if column == 0 else "rotation error (deg)"
             parts.append(panel.axes(label, "frames", one.method))
@@ -95,22 +95,24 @@ def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
                 ends = panel.on_page(np.array([median, median]), np.array(panel.y_range))
                 parts.append(svg.line(ends, INK, dash="4 3"))
             missing = one.summary.frames - one.summary.located
-            told = f"median {median:.2f}" if np.isfinite(median) else "no median: too few poses"
-            told += f", {bars[-1]} beyond {edge:g}" if bars[-1] else ""
-            told += f", {missing} without a pose" if missing else ""
-            parts.append(svg.text(panel.left + 416, top_px + 12, told, anchor="end", colour=SOFT))
+            caption = f"median {median:.2f}" if np.isfinite(median) else "no median: too few poses"
+            caption += f", {bars[-1]} beyond {edge:g}" if bars[-1] else ""
+            caption += f", {missing} without a pose" if missing else ""
+            parts.append(
+                svg.text(panel.left + 416, top_px + 12, caption, anchor="end", colour=SOFT)
+            )
     return svg.document(1000, 62 + _ROW * len(evaluations), heading, parts)
 
 
 def error_curves(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
-    """Median errors against the distance to the nearest training frame, with quartiles and counts.
+    """Draw median errors against the distance to the nearest training frame, with quartiles and counts.
 
-    On the dashed line an error is as large as that distance: the best that looking up can give.
+    On the dashed line the error equals that distance: the best that retrieval can achieve.
     """
     frames = evaluations[0].frames
     heading = f"{frames.group}: error against distance to the nearest training frame"
     bins = [part for one in evaluations for part in one.curve]
-    # Bins end where the group does: the last may have no end of its own.
+    # The last bin may be open-ended: clip bins at the largest distance of the group.
     far = max(float(frames.nearest_m.max()) * 1.02, 1e-6)
     limits = [
         _limit([part.position_q75 for part in bins]),
@@ -133,16 +135,16 @@ def error_curves(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
             parts.append(
                 svg.text(place[0], place[1] + 10, str(part.frames), anchor="middle", colour=SOFT)
             )
-    parts.append(svg.text(54, 376, "Figures at the top: frames of each bin.", colour=SOFT))
+    parts.append(svg.text(54, 376, "Numbers at the top: frames per bin.", colour=SOFT))
     entries = [(one.method, COLOURS[k % len(COLOURS)]) for k, one in enumerate(evaluations)]
     parts.append(svg.legend(62, 398, entries))
     return svg.document(1000, 398 + 17 * len(entries), heading, parts)
 
 
 def calibration(evaluations: Sequence[Evaluation]) -> str:
-    """Reliability of stated covariances: share of frames within the ellipsoid that should hold a share.
+    """Draw the reliability curve of stated covariances: observed against expected share of frames.
 
-    Methods without covariances are left out. Raises ValueError where none states any.
+    Methods without covariances are left out. Raises ValueError if no method states a covariance.
     """
     stated = [
         (k, one)
@@ -155,10 +157,10 @@ def calibration(evaluations: Sequence[Evaluation]) -> str:
     panel = Panel(54.0, 66.0, 320.0, 320.0, (0.0, 1.0), (0.0, 1.0))
     parts = [
         svg.text(20, 22, heading, bold=True),
-        panel.axes("share of frames that should lie within", "share that does"),
+        panel.axes("expected share within the ellipsoid", "observed share"),
         svg.line(panel.on_page(np.array([0, 1]), np.array([0, 1])), SOFT, dash="5 4"),
-        svg.text(panel.left + 8, panel.top + 16, "too cautious", colour=SOFT),
-        svg.text(panel.left + 312, panel.top + 308, "too sure", anchor="end", colour=SOFT),
+        svg.text(panel.left + 8, panel.top + 16, "underconfident", colour=SOFT),
+        svg.text(panel.left + 312, panel.top + 308, "overconfident", anchor="end", colour=SOFT),
     ]
     entries = []
     for k, one in stated:
@@ -170,8 +172,8 @@ def calibration(evaluations: Sequence[Evaluation]) -> str:
         parts.append(svg.dots(points, colour))
         entries.append(
             (
-                f"{one.method}: ratio {figures.ratio:.2f} (1 is right), "
-                f"{100 * figures.beyond:.1f} % beyond (0.1 % is right), {figures.frames} frames",
+                f"{one.method}: ratio {figures.ratio:.2f} (ideal: 1), "
+                f"{100 * figures.beyond:.1f} % beyond (ideal: 0.1 %), {figures.frames} frames",
                 colour,
             )
         )
@@ -184,7 +186,7 @@ def _both(one: Evaluation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reach(values: np.ndarray) -> float:
-    """Where a scale for finite errors may end."""
+    """Return the end of the scale for finite errors."""
     if len(values) == 0:
         return 1e-6
     p95, largest = float(np.quantile(values, 0.95)), float(values.max())
@@ -192,16 +194,16 @@ def _reach(values: np.ndarray) -> float:
 
 
 def _counts(values: np.ndarray, step: float, top: float) -> np.ndarray:
-    """Frames in each bin of width step from 0 to top, then those beyond; NaN is in none."""
+    """Count frames in each bin of width `step` from 0 to `top`, and those beyond; NaN is not counted."""
     known = values[np.isfinite(values)]
     bars = round(top / step)
     index = np.minimum((known / step).astype(np.int64), bars)
-    # A value of exactly the top belongs to the last bin.
+    # A value equal to `top` belongs to the last bin.
     return np.bincount(np.where(known == top, bars - 1, index), minlength=bars + 1)
 
 
 def _bars(panel: Panel, counts: np.ndarray, step: float, colour: str) -> str:
-    """Bars of the bins; the one beyond the scale stands apart and is paler."""
+    """Draw the bars of the bins; the one beyond the scale is set apart and paler."""
     last = len(counts) - 1
     parts = []
     for k in np.flatnonzero(counts):
@@ -214,7 +216,7 @@ def _bars(panel: Panel, counts: np.ndarray, step: float, colour: str) -> str:
 
 
 def _curve(panel: Panel, bins: Sequence[CurveBin], far: float, column: int, colour: str) -> str:
-    """Medians as a line with dots, quartiles as a band, cut at the panel's top; infinite ones left out."""
+    """Draw medians as a line with dots and quartiles as a band, clipped at the top; skip infinite values."""
     x = np.array([_middle(part, far) for part in bins])
     median = np.array(
         [part.position_median if column == 0 else part.rotation_median_deg for part in bins]

@@ -1,4 +1,4 @@
-"""How far estimated poses are from true ones. Nothing is ever aligned (docs/evaluation.md)."""
+"""Errors of estimated poses, without any alignment (docs/evaluation.md)."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ import numpy as np
 from spn_data.coverage.nearest_frame import CoverageOptions, nearest_frames
 from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors
-from spn_model.evaluation.calibration import Calibration, calibrate, sigmas, squared_distances
+from spn_model.evaluation.calibration import Calibration, calibrate, nees, sigmas
 
 ENU = ("east", "north", "up")
-_NO_PLACE = ("x", "y", "z")
+_UNREFERENCED_AXES = ("x", "y", "z")
 STRATA = ("high", "medium", "low")
 _UNIT_TOLERANCE = 1e-4
-# With no limit on either, every frame is of one stratum, and the nearest is that of the smallest sum.
+# Without limits all frames are in one stratum, and the nearest frame is the one with the smallest sum.
 _NEAREST = CoverageOptions(high_m=np.inf, high_deg=np.inf, medium_m=np.inf, medium_deg=np.inf)
 DEG_PER_M = _NEAREST.deg_per_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricOptions:
-    """What is counted. Lengths in the world's unit."""
+    """Thresholds and bins of the metrics, in the unit of the world's lengths."""
 
     within: tuple[tuple[float, float], ...] = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))  # m, degrees
-    # of the distance to the nearest training frame; the last bin has no end
+    # edges of the distance to the nearest training frame; the last bin is open-ended
     bin_edges_m: tuple[float, ...] = (0, 0.5, 1, 1.5, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluationFrames:
-    """N frames of one group, with what is true of them.
+    """N frames of one group with their true poses.
 
-    names, strata : (N,) str; a stratum may be "" (unknown). poses : the truth, finite.
-    nearest_m, nearest_deg : (N,) to the nearest training frame: of all, the one with the smallest
-    distance + angle / 10 degrees per metre. axes : names of the world's axes.
+    names, strata : (N,) str; a stratum of "" is unknown. poses : true poses, finite. nearest_m, nearest_deg :
+    (N,) distance and angle to the nearest training frame, the one with the smallest distance +
+    angle / (10 degrees per metre). axes : names of the world axes.
     """
 
     group: str
@@ -54,10 +54,10 @@ class EvaluationFrames:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What one method says of N frames.
+    """Pose estimates of one method for N frames.
 
-    poses : NaN where it gives none. covariance : (N, 6, 6), over (centre; rotation vector v in the camera
-    frame, R_true = exp(v) R), NaN where unknown; None from a method that states none.
+    poses : NaN where there is none. covariance : (N, 6, 6), over (centre; rotation vector v in the camera
+    frame, R_true = exp(v) R), NaN where unknown; None for a method without covariances.
     """
 
     method: str
@@ -67,10 +67,11 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
-    """Of N frames; NaN where there is no pose, or no covariance.
+    """Errors of N frames; NaN where there is no pose, or no covariance.
 
-    error_m, error_deg : (N,) as `spn_data.geometry.pose.pose_errors`. signed_m : (N, 3), estimated minus true
-    centre: negative up is too low. sigma_m, sigma_deg : (N,) stated. distance_sq : (N,) e^T C^-1 e.
+    error_m, error_deg : (N,) as in `spn_data.geometry.pose.pose_errors`. signed_m : (N, 3), estimated minus
+    true centre: a negative value along up is too low. sigma_m, sigma_deg : (N,) stated standard deviations.
+    nees : (N,) NEES, e^T C^-1 e.
     """
 
     error_m: np.ndarray
@@ -78,18 +79,20 @@ class FrameErrors:
     signed_m: np.ndarray
     sigma_m: np.ndarray
     sigma_deg: np.ndarray
-    distance_sq: np.ndarray
+    nees: np.ndarray
 
     @property
     def located(self) -> np.ndarray:
-        """(N,) bool: with a pose."""
+        """Which frames have a pose, (N,) bool."""
         return np.isfinite(self.error_m)
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Of errors over all frames: one without a pose is infinitely wrong in median and p95, and not in the
-    mean, which is over the frames with a pose."""
+    """Median, mean and 95th percentile of errors.
+
+    A frame without a pose counts as an infinite error in median and p95. The mean is over frames with a pose.
+    """
 
     median: float
     mean: float
@@ -98,7 +101,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Along one axis: signed (estimated minus true) over frames with a pose; absolute over all frames."""
+    """Errors along one axis.
+
+    Signed errors (estimated minus true) are over frames with a pose, absolute errors over all frames.
+    """
 
     axis: str
     signed_median: float
@@ -109,7 +115,7 @@ class AxisErrors:
 
 @dataclass(frozen=True)
 class Within:
-    """Share of all frames within both limits."""
+    """Share of all frames whose position and rotation errors are both within limits (included)."""
 
     limit: float
     limit_deg: float
@@ -118,7 +124,23 @@ class Within:
 
 @dataclass(frozen=True)
 class Summary:
-    """Errors of some frames. located : of them have a pose."""
+    """Error statistics of some frames of a group.
+
+    Attributes
+    ----------
+    frames : int
+        All frames.
+    located : int
+        Frames with a pose.
+    position : Spread
+        Position errors in the world's unit.
+    rotation_deg : Spread
+        Rotation errors in degrees.
+    within : tuple of Within
+        Shares of frames within pairs of limits.
+    axes : tuple of AxisErrors
+        Position errors along the axes of the world.
+    """
 
     frames: int
     located: int
@@ -130,7 +152,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class CurveBin:
-    """Errors of the frames whose nearest training frame is `low` to `high` away (low within, high not)."""
+    """Errors of frames whose distance to the nearest training frame is in [low, high)."""
 
     low: float
     high: float
@@ -143,7 +165,25 @@ class CurveBin:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One method on one group. strata : by name, those with frames; calibration : None without covariance."""
+    """Evaluation of one method on one group.
+
+    Attributes
+    ----------
+    method : str
+        Name of the method.
+    frames : EvaluationFrames
+        The evaluated frames.
+    errors : FrameErrors
+        Errors of each frame.
+    summary : Summary
+        Statistics of all frames.
+    strata : dict of str to Summary
+        Statistics by stratum of coverage, for strata that have frames.
+    curve : tuple of CurveBin
+        Errors against the distance to the nearest training frame.
+    calibration : Calibration or None
+        None for a method without covariances.
+    """
 
     method: str
     frames: EvaluationFrames
@@ -155,8 +195,8 @@ class Evaluation:
 
 
 def axes_of(info: DatasetInfo) -> tuple[str, str, str]:
-    """Names of the axes of a data set's world."""
-    return _NO_PLACE if info.origin is None else ENU
+    """Return the names of the axes of a data set's world."""
+    return _UNREFERENCED_AXES if info.origin is None else ENU
 
 
 def evaluation_frames(
@@ -168,24 +208,30 @@ def evaluation_frames(
     *,
     axes: tuple[str, str, str] = ENU,
 ) -> EvaluationFrames:
-    """The group with its distances to the training frames. Raises GeometryError without training frames."""
+    """Return a group with its distances to the training frames.
+
+    Raises GeometryError if there are no training frames.
+    """
     nearest = nearest_frames(poses, training, _NEAREST)
     return EvaluationFrames(group, names, strata, poses, nearest.distance, nearest.angle_deg, axes)
 
 
 def nearest_rows(poses: Poses, training: Poses) -> np.ndarray:
-    """(N,) row of the nearest training frame, as `EvaluationFrames` means it."""
+    """Return the row (N,) of the nearest training frame, as defined in `EvaluationFrames`."""
     return nearest_frames(poses, training, _NEAREST).frame
 
 
 def evaluate(
     estimates: Estimates, frames: EvaluationFrames, options: MetricOptions | None = None
 ) -> Evaluation:
-    """Errors, shares, strata, curve and calibration of one method on one group of at least one frame."""
+    """Compute errors, shares, strata, curve and calibration of one method on one group.
+
+    Raises ValueError if the group is empty, and as `frame_errors` does.
+    """
     options = options or MetricOptions()
     if len(frames) == 0:
-        raise ValueError(f"group {frames.group} holds no frames")
-    errors, vectors = _errors(estimates, frames.poses)
+        raise ValueError(f"group {frames.group} has no frames")
+    errors, vectors = _errors_and_vectors(estimates, frames.poses)
     calibration = None
     if estimates.covariance is not None:
         located = errors.located
@@ -207,21 +253,25 @@ def evaluate(
 
 
 def frame_errors(estimates: Estimates, true: Poses) -> FrameErrors:
-    """Errors of each frame. Raises ValueError where lengths differ or a quaternion is not unit."""
-    return _errors(estimates, true)[0]
+    """Return the errors of each frame.
+
+    Raises ValueError if the numbers of frames differ, a true pose is not finite, or an estimated quaternion
+    is not normalised.
+    """
+    return _errors_and_vectors(estimates, true)[0]
 
 
-def _errors(estimates: Estimates, true: Poses) -> tuple[FrameErrors, np.ndarray]:
-    """Errors, and error vectors (N, 6) as the covariance is of: true minus estimated, NaN without a pose."""
+def _errors_and_vectors(estimates: Estimates, true: Poses) -> tuple[FrameErrors, np.ndarray]:
+    """Return errors, and (N, 6) error vectors that match the covariance (true minus estimated, or NaN)."""
     found, n = estimates.poses, len(true)
     if len(found) != n:
-        raise ValueError(f"{len(found)} estimated poses of {n} frames")
+        raise ValueError(f"{len(found)} estimated poses for {n} frames")
     if not (np.isfinite(true.centers).all() and np.isfinite(true.quats_wxyz).all()):
         raise ValueError("a true pose is not finite")
     located = np.isfinite(found.centers).all(axis=1) & np.isfinite(found.quats_wxyz).all(axis=1)
     length = np.linalg.norm(found.quats_wxyz[located], axis=1)
     if np.any(np.abs(length - 1) > _UNIT_TOLERANCE):
-        raise ValueError(f"{estimates.method}: an estimated quaternion is not of length one")
+        raise ValueError(f"{estimates.method}: an estimated quaternion is not normalised")
     columns = np.full((n, 5), np.nan)
     vectors = np.full((n, 6), np.nan)
     sub, sub_true = found[located], true[located]
@@ -231,10 +281,12 @@ def _errors(estimates: Estimates, true: Poses) -> tuple[FrameErrors, np.ndarray]
     vectors[located, 3:] = rotation_vectors(turned)
     if estimates.covariance is not None:
         if estimates.covariance.shape != (n, 6, 6):
-            raise ValueError(f"covariances {estimates.covariance.shape} of {n} frames")
+            raise ValueError(
+                f"covariances have shape {estimates.covariance.shape}, expected {(n, 6, 6)}"
+            )
         covariance = estimates.covariance[located]
         columns[located, 2], columns[located, 3] = sigmas(covariance)
-        columns[located, 4] = squared_distances(vectors[located], covariance)
+        columns[located, 4] = nees(vectors[located], covariance)
     errors = FrameErrors(
         columns[:, 0], columns[:, 1], -vectors[:, :3], columns[:, 2], columns[:, 3], columns[:, 4]
     )
@@ -244,7 +296,7 @@ def _errors(estimates: Estimates, true: Poses) -> tuple[FrameErrors, np.ndarray]
 def error_curve(
     errors: FrameErrors, nearest_m: np.ndarray, edges_m: Sequence[float]
 ) -> tuple[CurveBin, ...]:
-    """Errors against distance to the nearest training frame: bins that hold frames, nearest first."""
+    """Return errors against the distance to the nearest training frame, in non-empty bins, nearest first."""
     edges = [*edges_m, np.inf]
     position, rotation = _or_infinite(errors.error_m), _or_infinite(errors.error_deg)
     bins = []
@@ -258,13 +310,13 @@ def error_curve(
 
 
 def quantile(values: np.ndarray, share: float) -> float:
-    """Linear between values, which may be infinite; NaN of no values."""
+    """Return a quantile, linearly interpolated between values, which may be infinite; NaN without values."""
     if len(values) == 0:
         return float("nan")
     ordered = np.sort(values)
     at = share * (len(values) - 1)
     low, high = ordered[int(np.floor(at))], ordered[int(np.ceil(at))]
-    if low == high:  # also where both are infinite
+    if low == high:  # also if both are infinite
         return float(high)
     return float(low + (high - low) * (at - np.floor(at)))
 

@@ -1,4 +1,4 @@
-"""Which training image looks most like each frame of a data set, found once and kept beside it."""
+"""Image retrieval on a data set: the most similar training image of each frame, cached in a file."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from spn_data.work.timing import Progress
 from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
 from spn_model.evaluation.feature_maps import squeezenet_maps
 
-VERSION = 1  # of what is kept; another one whenever a way of describing images changes
+VERSION = 1  # of the cache; increase it if image descriptors change
 _METHODS = (VLAD, GEM)
 _MAX_BYTES = 100_000_000
 
 
-def most_alike(
+def most_similar_images(
     dataset: Dataset,
     training: DatasetGroup,
     groups: Sequence[DatasetGroup],
     progress: Progress,
     kept: Path | None = None,
 ) -> dict[str, list[np.ndarray]]:
-    """By method, for each group, (N,) row of the training image that looks most alike, -1 where none does.
+    """Return, by method and for each group, the row (N,) of the most similar training image.
 
-    kept : file that the rows are read from where they were found for this very data set before, and written
-    to else. Only rows are kept, never poses: labels that are made anew are never mixed with old ones.
+    The row is -1 if there is none. kept : cache file. Rows are read from it if it belongs to this very data
+    set, otherwise they are computed and written to it. It holds rows only, never poses, so that poses of new
+    labels are never mixed with old ones.
     """
     key = _key(dataset, training, groups)
     if kept is not None:
@@ -42,7 +43,7 @@ def most_alike(
     total = len(training) + sum(len(group) for group in groups)
     rows: dict[str, list[np.ndarray]] = {}
     for method in _METHODS:
-        counted = [_Counted(g, progress, f"{method}", total) for g in (training, *groups)]
+        counted = [_ProgressImages(g, progress, f"{method}", total) for g in (training, *groups)]
         done = 0
         for images in counted:
             images.before = done
@@ -57,8 +58,8 @@ def most_alike(
     return rows
 
 
-class _Counted:
-    """Images that tell how far they have been read; row by row, in their order."""
+class _ProgressImages:
+    """Images that report progress as they are read, row by row in order."""
 
     def __init__(self, images: Images, progress: Progress, step: str, total: int):
         self._images, self._progress, self._step, self._total = images, progress, step, total
@@ -76,7 +77,7 @@ class _Counted:
 
 
 def _key(dataset: Dataset, training: DatasetGroup, groups: Sequence[DatasetGroup]) -> str:
-    """Changes with anything that decides which images are compared and how."""
+    """Return a hash of everything that decides which images are compared, and how."""
     digest = hashlib.sha256()
     stated = {
         "version": VERSION,
@@ -94,7 +95,7 @@ def _key(dataset: Dataset, training: DatasetGroup, groups: Sequence[DatasetGroup
 def _read(
     path: Path, key: str, training: DatasetGroup, groups: Sequence[DatasetGroup]
 ) -> dict[str, list[np.ndarray]] | None:
-    """What is kept, or None where it is of something else, or damaged: it is then found anew."""
+    """Return the cached rows, or None if the cache belongs to other data or is damaged."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             return None

@@ -1,4 +1,4 @@
-"""Charts as SVG: panels with axes, lines, dots; styled by attributes alone, to stand in any page."""
+"""SVG charts: panels with axes, lines and dots, styled by attributes so that they work in any page."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from html import escape
 import numpy as np
 
 INK, SOFT, GRID = "#222222", "#8a8f98", "#e3e5e8"
-# Okabe & Ito's colours, which people with any colour vision tell apart.
+# The colour-blind safe palette of Okabe and Ito.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A chart's area on the page (pixels) and the values at its edges."""
+    """Plot area of a chart.
+
+    Attributes
+    ----------
+    left, top, width, height : float
+        Place on the page in pixels.
+    x_range, y_range : tuple of float
+        Values at the edges of the area.
+    """
 
     left: float
     top: float
@@ -26,7 +34,7 @@ class Panel:
     y_range: tuple[float, float]
 
     def on_page(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Page positions (N, 2) of values; y grows upwards."""
+        """Return page positions (N, 2) of values; y grows upwards."""
         (x0, x1), (y0, y1) = self.x_range, self.y_range
         across = (np.asarray(x, float) - x0) / (x1 - x0) * self.width + self.left
         return np.stack(
@@ -35,7 +43,7 @@ class Panel:
         )
 
     def axes(self, x_label: str, y_label: str, title: str = "") -> str:
-        """Grid, ticks and labels."""
+        """Draw grid, ticks and labels."""
         bottom, right = self.top + self.height, self.left + self.width
         parts = []
         for value in ticks(*self.x_range):
@@ -55,7 +63,7 @@ class Panel:
 
 
 def document(width: float, height: float, label: str, parts: Iterable[str]) -> str:
-    """The whole figure; label : what it shows, for readers that do not see it."""
+    """Return the whole figure. label : accessible description of its content."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
         f'aria-label="{_words(label)}" font-family="system-ui, sans-serif" font-size="12" '
@@ -72,7 +80,7 @@ def line(
     dash: str = "",
     opacity: float = 1.0,
 ) -> str:
-    """A line through page positions (N, 2)."""
+    """Draw a line through page positions (N, 2)."""
     return strokes([points], colour, width=width, dash=dash, opacity=opacity)
 
 
@@ -84,7 +92,7 @@ def strokes(
     dash: str = "",
     opacity: float = 1.0,
 ) -> str:
-    """Many lines as one path; empty without lines."""
+    """Draw several lines as one path; return an empty string without lines."""
     path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) for points in lines)
     dashed = f' stroke-dasharray="{dash}"' if dash else ""
     faint = f' stroke-opacity="{opacity:g}"' if opacity < 1 else ""
@@ -98,23 +106,23 @@ def strokes(
 def dots(
     points: np.ndarray, colour: str, *, radius: float = 2.5, titles: Sequence[str] = ()
 ) -> str:
-    """Filled circles at page positions (N, 2); titles : shown under the pointer."""
-    told = [f"<title>{_words(title)}</title>" for title in titles] or [""] * len(points)
+    """Draw filled circles at page positions (N, 2). titles : tooltips."""
+    tooltips = [f"<title>{_words(title)}</title>" for title in titles] or [""] * len(points)
     circles = "".join(
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}">{title}</circle>'
-        for (x, y), title in zip(points, told, strict=True)
+        for (x, y), title in zip(points, tooltips, strict=True)
     )
     return f'<g fill="{colour}">{circles}</g>'
 
 
 def area(points: np.ndarray, colour: str, *, opacity: float = 0.15) -> str:
-    """A filled polygon of page positions (N, 2)."""
+    """Draw a filled polygon of page positions (N, 2)."""
     path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
     return f'<path d="M{path}Z" fill="{colour}" fill-opacity="{opacity:g}"/>'
 
 
 def box(x: float, y: float, width: float, height: float, colour: str, *, opacity: float = 1) -> str:
-    """A filled rectangle on the page."""
+    """Draw a filled rectangle."""
     return (
         f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" '
         f'fill="{colour}" fill-opacity="{opacity:g}"/>'
@@ -124,7 +132,7 @@ def box(x: float, y: float, width: float, height: float, colour: str, *, opacity
 def text(
     x: float, y: float, words: str, *, anchor: str = "start", bold: bool = False, colour: str = INK
 ) -> str:
-    """Words at a page position; anchor : start, middle or end."""
+    """Draw text at a page position. anchor : start, middle or end."""
     weight = ' font-weight="600"' if bold else ""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}"{weight}>'
@@ -133,7 +141,7 @@ def text(
 
 
 def legend(x: float, y: float, entries: Sequence[tuple[str, str]]) -> str:
-    """(words, colour) below each other."""
+    """Draw legend entries (text, colour) below each other."""
     return "".join(
         dots(np.array([[x, y + 17 * k - 4]]), colour, radius=4) + text(x + 10, y + 17 * k, words)
         for k, (words, colour) in enumerate(entries)
@@ -141,12 +149,12 @@ def legend(x: float, y: float, entries: Sequence[tuple[str, str]]) -> str:
 
 
 def _words(text: str) -> str:
-    """Text that no XML parser stumbles over: control characters are none, whatever a file's names hold."""
+    """Escape text for XML and replace characters that are not printable, whatever names of files hold."""
     return escape("".join(c if c.isprintable() else "\ufffd" for c in text))
 
 
 def ticks(low: float, high: float, about: int = 6) -> list[float]:
-    """Round values within a range that isn't empty, 1, 2 or 5 times a power of ten apart."""
+    """Return round values within a non-empty range, 1, 2 or 5 times a power of ten apart."""
     step = round_step((high - low) / about)
     first = math.ceil(low / step - 1e-9)
     last = math.floor(high / step + 1e-9)
@@ -154,6 +162,9 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
 
 
 def round_step(value: float) -> float:
-    """The smallest of 1, 2, 5 times a power of ten that is no smaller. Raises ValueError unless positive."""
+    """Return the smallest of 1, 2, 5 times a power of ten that is not smaller than a value.
+
+    Raises ValueError unless the value is positive.
+    """
     power = 10.0 ** math.floor(math.log10(value))
     return min(m * power for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9))

@@ -1,4 +1,4 @@
-"""What evaluations become for others: metrics.json, errors.csv, and rows of a table."""
+"""Evaluations as metrics.json, errors.csv, and rows of a table."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ def write_metrics(
     retrieval: Mapping[str, str],
     facts: Mapping[str, Any],
 ) -> None:
-    """metrics.json; the file appears whole.
+    """Write metrics.json atomically.
 
-    units : "m" or "model", of all lengths. retrieval : the better retrieval method, by group.
-    facts : plain values of the run that stand beside (times, memory, seeds).
+    units : "m" or "model", of all lengths. retrieval : name of the better retrieval method, by group. facts :
+    additional plain values of the run (times, memory, seeds). Raises ValueError for two evaluations of the
+    same method and group.
     """
     groups: dict[str, dict[str, Any]] = {}
     for one in evaluations:
         methods = groups.setdefault(one.frames.group, {})
         if one.method in methods:
-            raise ValueError(f"two evaluations of {one.method} on {one.frames.group}")
+            raise ValueError(f"duplicate evaluation of {one.method} on {one.frames.group}")
         methods[one.method] = {
             **asdict(one.summary),
             "strata": {name: asdict(summary) for name, summary in one.strata.items()},
@@ -58,7 +59,10 @@ def write_metrics(
 
 
 def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
-    """errors.csv: a row for each frame and method, all in one world; empty cells are unknown."""
+    """Write errors.csv: one row per frame and method; empty cells are unknown.
+
+    All evaluations have to be in the same world.
+    """
     columns: dict[str, list[str]] = {}
     for one in evaluations:
         frames, errors = one.frames, one.errors
@@ -78,7 +82,7 @@ def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
             },
             "sigma": _cells(errors.sigma_m, 4),
             "sigma_deg": _cells(errors.sigma_deg, 4),
-            "distance_sq": _cells(errors.distance_sq, 4),
+            "distance_sq": _cells(errors.nees, 4),
         }
         for name, cells in parts.items():
             columns.setdefault(name, []).extend(cells)
@@ -86,7 +90,7 @@ def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
 
 
 def header(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Titles of the columns of `rows`."""
+    """Return the column titles of `rows`."""
     within = evaluations[0].summary.within
     axes = evaluations[0].frames.axes
     return [
@@ -98,18 +102,19 @@ def header(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def rows(evaluations: Sequence[Evaluation]) -> list[list[str]]:
-    """The table of one group, a row a method, as texts; the paper's rows come from `paper_rows`."""
+    """Return the table of one group as text, one row per method; `paper_rows` gives the paper's rows."""
     return [[one.method, *_figures(one.summary), _calibration(one)] for one in evaluations]
 
 
 def paper_rows(sequence: str, columns: int) -> list[list[str]]:
-    """The paper's table 1 for `medium` or `low`, as rows as long as those of `rows`; none for others.
+    """Return table 1 of the paper for sequence "medium" or "low", with as many columns as `rows`.
 
-    Whether its figures are means or medians it does not say: they stand under the median, with a mark.
+    Other sequences have no rows.
+    The paper does not say whether its figures are means or medians: they are listed as medians, with a mark.
     """
     return [
         [
-            *(f"{row.network} (paper, another court)", "", ""),
+            *(f"{row.network} (paper, another place)", "", ""),
             *(f"{row.position_m:.2f}*", "", "", f"{row.rotation_deg:.2f}*"),
             *[""] * (columns - 7),
         ]
@@ -134,7 +139,7 @@ def _calibration(one: Evaluation) -> str:
 
 
 def _text(value: float, digits: int, sign: str = "") -> str:
-    """NaN is unknown; infinite: too few frames have a pose."""
+    """Format a value; NaN (unknown) gives an empty string, infinity (too few poses) "none"."""
     if math.isnan(value):
         return ""
     return "none" if math.isinf(value) else f"{value:{sign}.{digits}f}"

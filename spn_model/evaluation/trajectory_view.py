@@ -1,4 +1,4 @@
-"""Cameras of a place seen from one direction, without perspective."""
+"""Orthographic view of camera trajectories."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from spn_model.evaluation import svg
 from spn_model.evaluation.metrics import Estimates, EvaluationFrames
 from spn_model.evaluation.svg import COLOURS, GRID, INK, SOFT
 
-_AROUND = 0.25  # of the place's extent: estimates farther outside it are not drawn
-MOST_DRAWN = 1500  # cameras, and estimates of one method: more are thinned evenly
-_GAP = 8.0  # times the median step: a longer one is no step of the flight
+_MARGIN = 0.25  # of the area's extent: estimates farther outside are not drawn
+MOST_DRAWN = 1500  # cameras, and estimates of one method; more are thinned evenly
+_GAP = 8.0  # times the median step: a longer step interrupts the trajectory
 
 
 def view_matrix(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
-    """(2, 3): page right and page up in the world, seen from a direction above the horizon.
+    """Return the projection (2, 3) from the world to page right and page up, seen from above the horizon.
 
-    azimuth : of where the eye stands, from the world's first axis towards its second. Elevation 90 with
-    azimuth -90 is a map: first axis right, second up.
+    azimuth_deg : direction of the viewer, from the world's first axis towards its second. Elevation 90 with
+    azimuth -90 gives a map: first axis right, second axis up.
     """
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -42,16 +42,16 @@ def trajectory_panel(
     estimates: Sequence[Estimates],
     unit: str,
 ) -> tuple[str, list[int]]:
-    """SVG of one view within (left, top, width, height), and how many estimates of each method lie outside.
+    """Draw one view as SVG and return the number of estimates of each method outside it.
 
-    view_deg : azimuth and elevation.
+    place_px : left, top, width, height of the panel. view_deg : azimuth and elevation.
     """
     left, top, width, height = place_px
     known = np.concatenate([training.centers, frames.poses.centers])
     low, high = known.min(axis=0), known.max(axis=0)
-    around = max(_AROUND * float((high - low).max()), 1e-3)
+    margin = max(_MARGIN * float((high - low).max()), 1e-3)
     inside = [
-        np.all((e.poses.centers >= low - around) & (e.poses.centers <= high + around), axis=1)
+        np.all((e.poses.centers >= low - margin) & (e.poses.centers <= high + margin), axis=1)
         for e in estimates
     ]
     found = np.concatenate(
@@ -83,7 +83,9 @@ def trajectory_panel(
     parts.append(svg.strokes(zip(on_page(cameras.centers), on_page(ahead), strict=True), SOFT))
     parts.append(svg.dots(on_page(cameras.centers), SOFT, radius=1.6))
     parts.append(
-        svg.strokes(_stretches(on_page(frames.poses.centers), frames.poses.centers), INK, width=1.6)
+        svg.strokes(
+            _split_at_gaps(on_page(frames.poses.centers), frames.poses.centers), INK, width=1.6
+        )
     )
     rows = thinned(len(frames))
     for k, (one, within) in enumerate(zip(estimates, inside, strict=True)):
@@ -100,7 +102,7 @@ def trajectory_panel(
 
 
 def thinned(count: int) -> np.ndarray:
-    """Rows, evenly spread, of what is drawn of `count`."""
+    """Return the evenly spaced rows to draw out of `count`."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_DRAWN)).round().astype(int))
 
 
@@ -114,9 +116,9 @@ def _floor(
     *,
     view_deg: tuple[float, float],
 ) -> str:
-    """Grid at the lowest height, with figures at its front edges; a scale of heights at its left corner."""
+    """Draw a grid at the lowest height, labels at its front edges, and a height scale at its left corner."""
     eye = np.array([np.cos(np.deg2rad(view_deg[0])), np.sin(np.deg2rad(view_deg[0]))])
-    # The edges that the eye is nearest to; straight from above, the left and the lower one.
+    # The edges nearest to the viewer; from straight above, the left and the lower edge.
     front = np.where(eye > 1e-9, high[:2], low[:2])
     grids = [_steps(low[k], high[k], step) for k in range(3)]
     floor = low[2]
@@ -145,14 +147,14 @@ def _floor(
 def _figures(
     places: np.ndarray, values: np.ndarray, axis: str, unit: str, middle: np.ndarray
 ) -> str:
-    """Figures beside places on the page, away from its middle; the last one carries the axis's name."""
+    """Draw tick labels on the outer side of an axis, and the name of the axis."""
     along = places[-1] - places[0]
     across = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
     if np.dot(across, places.mean(axis=0) - middle) < 0:
         across = -across
     anchor = "middle" if abs(across[0]) < 0.5 else "start" if across[0] > 0 else "end"
     words = [f"{value:g}" for value in values]
-    # Where an axis is short on the page, figures would cover each other.
+    # Skip labels that would overlap on a short axis.
     every = max(1, int(np.ceil(26 / max(float(np.hypot(*along)) / max(len(values) - 1, 1), 1e-9))))
     parts = [
         svg.text(x, y, word, anchor=anchor, colour=SOFT)
@@ -169,12 +171,12 @@ def _middle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _steps(low: float, high: float, step: float) -> np.ndarray:
-    """Multiples of step from low to high, which are multiples themselves."""
+    """Return the multiples of `step` from `low` to `high`, which are multiples themselves."""
     return np.round(np.arange(round(low / step), round(high / step) + 1) * step, 9) + 0.0
 
 
-def _stretches(on_page: np.ndarray, centers: np.ndarray) -> list[np.ndarray]:
-    """The trajectory, interrupted where frames are left out or another sequence begins."""
+def _split_at_gaps(on_page: np.ndarray, centers: np.ndarray) -> list[np.ndarray]:
+    """Split the trajectory where frames are missing or another sequence begins."""
     apart = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     usual = float(np.median(apart)) if len(apart) else 0.0
     breaks = np.flatnonzero(apart > _GAP * max(usual, 1e-9)) + 1

@@ -1,4 +1,4 @@
-"""How far a member is off while it is trained: on validation frames, and on images that it trains on."""
+"""Errors of a pose model during training, on validation frames and on training images."""
 
 from __future__ import annotations
 
@@ -11,27 +11,45 @@ from spn_data.geometry.pose import Poses
 from spn_model.evaluation.metrics import Estimates, frame_errors, quantile
 from spn_model.models.pose_model import PoseEstimates, PoseModel
 
-_AT_ONCE = 8  # images given to `estimate`
+_BATCH = 8  # batch size of `estimate`
 
 
 class PosedImages(Protocol):
-    """Images with poses: a group of a data set, or rendered views."""
+    """Images with poses: a group of a data set, or rendered views.
+
+    Attributes
+    ----------
+    intrinsics : ndarray, shape (N, 3, 3)
+        Camera matrices.
+    poses : Poses
+        True poses (N).
+    """
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """(N, 3, 3)."""
+        """Camera matrices (N, 3, 3)."""
 
     @property
     def poses(self) -> Poses:
-        """The true ones (N)."""
+        """True poses (N)."""
 
     def image(self, row: int) -> np.ndarray:
-        """(H, W, 3) uint8 RGB."""
+        """Return an image, (H, W, 3) uint8 RGB."""
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Of some frames; one without a pose is infinitely wrong. Metres, or the world's unit; degrees."""
+class ValidationErrors:
+    """Error statistics of some frames; a frame without a pose counts as an infinite error.
+
+    Attributes
+    ----------
+    frames, located : int
+        All frames, and frames with a pose.
+    median_m, p95_m : float
+        Position errors in metres, or in the world's unit.
+    median_deg, p95_deg : float
+        Rotation errors in degrees.
+    """
 
     frames: int
     located: int
@@ -42,26 +60,58 @@ class Errors:
 
     @property
     def score(self) -> float:
-        """What is compared between moments of a training: the lower the better, of any unit."""
+        """Geometric mean of the median errors: lower is better, and the unit does not affect the order."""
         return float(np.sqrt(self.median_m * self.median_deg))
 
     def plain(self) -> dict[str, Any]:
-        """By name, as the log has them."""
+        """Return the values by name, as written to the training log."""
         return asdict(self)
 
 
 def spread_rows(count: int, limit: int) -> np.ndarray:
-    """At most `limit` rows of `count`, evenly spread, always the same."""
+    """Return at most `limit` of `count` rows, evenly spread and always the same.
+
+    Parameters
+    ----------
+    count : int
+        Number of rows to choose from.
+    limit : int
+        Greatest number of rows to return.
+
+    Returns
+    -------
+    ndarray of int
+        Rows in ascending order.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
 
 
-def judge(model: PoseModel, frames: PosedImages, rows: np.ndarray) -> tuple[Errors, PoseEstimates]:
-    """The member's estimates of these rows, and their errors. The network is left in eval mode."""
+def validate(
+    model: PoseModel, frames: PosedImages, rows: np.ndarray
+) -> tuple[ValidationErrors, PoseEstimates]:
+    """Estimate the poses of some rows and compare them with the true poses.
+
+    Parameters
+    ----------
+    model : PoseModel
+        Pose model; its network is left in eval mode.
+    frames : PosedImages
+        Images with true poses.
+    rows : ndarray of int
+        Rows of `frames` to use.
+
+    Returns
+    -------
+    errors : ValidationErrors
+        Error statistics.
+    estimates : PoseEstimates
+        Estimates, in the order of `rows`.
+    """
     model.network.eval()
     intrinsics = frames.intrinsics
     found = []
-    for first in range(0, len(rows), _AT_ONCE):
-        part = rows[first : first + _AT_ONCE]
+    for first in range(0, len(rows), _BATCH):
+        part = rows[first : first + _BATCH]
         images = np.stack([frames.image(int(row)) for row in part])
         found.append(model.estimate(images, intrinsics[part]))
     estimates = PoseEstimates.concatenate(found)
@@ -69,7 +119,7 @@ def judge(model: PoseModel, frames: PosedImages, rows: np.ndarray) -> tuple[Erro
     position, rotation = (
         np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)
     )
-    summary = Errors(
+    summary = ValidationErrors(
         frames=len(rows),
         located=int(errors.located.sum()),
         median_m=quantile(position, 0.5),

@@ -21,7 +21,7 @@ from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.storage.files import read_csv
 from spn_model.evaluation import retrieval
 from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, VLAD
-from spn_model.evaluation.comparison_files import drawn, of_network, write_comparison
+from spn_model.evaluation.comparison_files import draw_figures, select_network, write_comparison
 from spn_model.evaluation.dropout import dropout_estimates, has_dropout
 from spn_model.evaluation.evaluate import (
     EvaluatedGroup,
@@ -103,19 +103,19 @@ def test_training_images_are_a_fixed_sample(dataset, tmp_path):
     found = judged(dataset, EvaluateOptions(baselines=False, training_images=5), n=network)
     frames = group_of(found, "train").frames
     assert [int(name[-10:-4]) for name in frames.names] == [0, 3, 6, 8, 11]
-    assert found.notes == ("Of 12 training images, 5 are judged.",)
+    assert found.notes == ("5 of 12 training images were evaluated.",)
 
 
 MOVED = GeoOrigin(-33.87, 151.2, 12.5, HeightReference.TAKEOFF)
 HIGHER = GeoOrigin(-33.86, 151.2, 13.5, HeightReference.TAKEOFF)
 ABOVE_SEA = GeoOrigin(-33.86, 151.2, 12.5, HeightReference.AMSL)
 OTHER_WORLDS = {
-    "lengths are in units 'model'": {"units": "model"},
-    "knows where up is": {"up_is_known": False},
-    "has a known place": {"origin": None},
-    "its origin is another": {"origin": MOVED},
-    "3-geo is another": {"fingerprints": {"3-geo": "another"}},
-    "2-model is another": {"fingerprints": {**INFO.fingerprints, "2-model": "another"}},
+    "its unit is 'model'": {"units": "model"},
+    "the vertical is known in only one": {"up_is_known": False},
+    "only one of the two is georeferenced": {"origin": None},
+    "its origin differs": {"origin": MOVED},
+    "3-geo differs": {"fingerprints": {"3-geo": "another"}},
+    "2-model differs": {"fingerprints": {**INFO.fingerprints, "2-model": "another"}},
 }
 
 
@@ -133,7 +133,7 @@ def test_another_height_is_another_world(dataset, tmp_path, origin):
     """An origin that lies higher, or counts from something else, moves every pose."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     other = write_judged(tmp_path / "other.h5", {"train": 2, "low": 1}, origin=origin)
-    with pytest.raises(InputError, match="its origin is another"):
+    with pytest.raises(InputError, match="its origin differs"):
         judged(other, n=network)
 
 
@@ -143,7 +143,7 @@ def test_worlds_that_nothing_tells_apart_are_refused(tmp_path):
     network = write_network(tmp_path / "n.safetensors", plain)
     judged(plain, n=network)
     other = write_judged(tmp_path / "b.h5", {"train": 9, "medium": 2}, fingerprints={})
-    with pytest.raises(InputError, match="nothing tells that both are of the same map"):
+    with pytest.raises(InputError, match="no fingerprint shows that both belong to the same map"):
         judged(other, n=network)
 
 
@@ -161,7 +161,7 @@ def test_another_camera_needs_a_network_that_takes_any(dataset, tmp_path, monkey
     assert INFO.camera is not None
     lens = replace(INFO.camera, params=INFO.camera.params * [1.1, 1, 1])
     other = write_judged(tmp_path / "b.h5", camera=lens)
-    with pytest.raises(InputError, match="of another camera than the one that n was trained for"):
+    with pytest.raises(InputError, match="of another camera than n was trained for"):
         judged(other, n=network)
     monkeypatch.setattr(TinyModel, "any_camera", True)
     judged(other, n=network)
@@ -172,7 +172,7 @@ def test_empty_groups_are_told_and_all_empty_refused(tmp_path):
     path = write_judged(tmp_path / "a.h5", {"train": 6, "medium": 3})
     network = write_network(tmp_path / "n.safetensors", path)
     found = judged(path, n=network)
-    assert "Group low is empty: left out." in found.notes
+    assert "Group low is empty and was skipped." in found.notes
     empty = write_judged(tmp_path / "b.h5", {"train": 6})
     with pytest.raises(InputError, match="every test and validation group is empty"):
         judged(empty, n=network)
@@ -217,7 +217,7 @@ def test_what_looks_alike_is_found_once(dataset, tmp_path, monkeypatch):
         described.clear()
         with Dataset(path) as data:
             groups = [data.groups[name] for name in ("low", "medium")]
-            return retrieval.most_alike(data, data.groups["train"], groups, silent, kept)
+            return retrieval.most_similar_images(data, data.groups["train"], groups, silent, kept)
 
     first = found(dataset)
     assert described == [12, 4, 7, 12, 4, 7]
@@ -271,9 +271,9 @@ def test_dropout_stands_beside_its_network_where_there_is_any(dataset, tmp_path)
     assert has_dropout(some.model)
     found = judged(dataset, replace(ALONE, dropout_samples=8), some=some, none=none)
     assert found.networks == ("some", "some, 8 dropout samples", "none")
-    assert "none has no dropout: there is nothing to sample." in found.notes
-    assert of_network(found, "some").networks == ("some", "some, 8 dropout samples")
-    assert of_network(found, "none").networks == ("none",)
+    assert "none has no dropout layers: Monte-Carlo dropout was skipped." in found.notes
+    assert select_network(found, "some").networks == ("some", "some, 8 dropout samples")
+    assert select_network(found, "none").networks == ("none",)
 
 
 def test_files_of_a_comparison(beside, tmp_path):
@@ -282,7 +282,7 @@ def test_files_of_a_comparison(beside, tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "old.svg").write_text("<svg")
     write_comparison(
-        of_network(beside, "a"), {"runs": {}}, **{k: tmp_path / v for k, v in names.items()}
+        select_network(beside, "a"), {"runs": {}}, **{k: tmp_path / v for k, v in names.items()}
     )
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert sorted(metrics["groups"]["medium"]) == sorted(["a", MEAN, VLAD, GEM, ORACLE])
@@ -325,14 +325,14 @@ def test_a_group_of_any_name_gets_files_inside_its_folder(dataset, tmp_path):
 
 def test_figures_hold_the_network_beside_the_better_retrieval(beside):
     """Trajectories and histograms name the networks and what they must beat."""
-    found = of_network(beside, "b")
+    found = select_network(beside, "b")
     medium = group_of(found, "medium")
-    figures = drawn(medium, found)
+    figures = draw_figures(medium, found)
     assert medium.retrieval is not None
     for what in ("trajectories", "histograms"):
         assert ">b<" in figures[what] or ">b (" in figures[what]
         assert medium.retrieval in figures[what]
-    assert drawn(group_of(found, "train"), found) == {}
+    assert draw_figures(group_of(found, "train"), found) == {}
 
 
 LOG = [

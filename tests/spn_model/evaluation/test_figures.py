@@ -90,7 +90,7 @@ def test_what_is_not_drawn_is_counted():
     centers[0], centers[1] = 1e6, np.nan
     one = replace(found, poses=Poses(centers, found.poses.quats_wxyz))
     tree = parsed(figures.trajectories(TRAINING, frames(), [one, shifted([1, 1, 1], "other")]))
-    assert "net (1 outside the picture, 1 without a pose)" in texts(tree)
+    assert "net (1 outside the plot, 1 without a pose)" in texts(tree)
     assert "other" in texts(tree)
     assert len(circles(tree, svg.COLOURS[0])) == 4
     assert len(circles(tree, svg.COLOURS[1])) == 8

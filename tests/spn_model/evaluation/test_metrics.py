@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model.evaluation.calibration import calibrate, is_covariance, sigmas, squared_distances
+from spn_model.evaluation.calibration import calibrate, is_covariance, nees, sigmas
 from spn_model.evaluation.metrics import (
     ENU,
     Estimates,
@@ -124,7 +124,7 @@ def test_an_estimate_that_is_no_rotation_is_refused():
     """A network's quaternion that was not normalised is a mistake of ours, and told."""
     true = poses(np.zeros((1, 3)))
     found = Poses(true.centers, 1.1 * true.quats_wxyz)
-    with pytest.raises(ValueError, match="length one"):
+    with pytest.raises(ValueError, match="not normalised"):
         evaluate(Estimates("net", found), frames_of(true))
 
 
@@ -133,7 +133,7 @@ def test_truth_without_a_pose_is_refused():
     true = poses(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="true pose"):
         frame_errors(Estimates("net", true), without_pose(true, 1))
-    with pytest.raises(ValueError, match="1 estimated poses of 2"):
+    with pytest.raises(ValueError, match="1 estimated poses for 2"):
         frame_errors(Estimates("net", true[:1]), true)
 
 
@@ -179,7 +179,7 @@ def test_distance_to_training_weighs_angle():
 
 def test_an_empty_group_has_no_figures():
     """A group without frames is refused."""
-    with pytest.raises(ValueError, match="holds no frames"):
+    with pytest.raises(ValueError, match="has no frames"):
         evaluate(Estimates("net", poses(np.zeros((0, 3)))), frames_of(poses(np.zeros((0, 3)))))
 
 
@@ -261,7 +261,7 @@ def test_covariances_that_are_none_are_counted():
     stated = np.stack([good, np.full((6, 6), np.nan), negative, flat])
     errors = np.tile([1.0, 0, 0, 0, 0, 0], (4, 1))
     assert is_covariance(stated).tolist() == [True, False, False, False]
-    np.testing.assert_allclose(squared_distances(errors, stated), [1, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(nees(errors, stated), [1, np.nan, np.nan, np.nan])
     np.testing.assert_allclose(sigmas(stated)[0], [np.sqrt(3), np.nan, np.nan, np.nan])
     one = calibrate(errors, stated)
     assert (one.frames, one.unknown, one.unusable) == (1, 1, 2)
@@ -294,7 +294,7 @@ def test_metrics_json_says_all_and_stays_json(tmp_path):
     assert methods["net"]["calibration"]["frames"] == 30
     assert methods["net"]["curve"][0]["frames"] == 30
     assert len(read["paper"]["table_1"]) == 6
-    with pytest.raises(ValueError, match="two evaluations of net"):
+    with pytest.raises(ValueError, match="duplicate evaluation of net"):
         write_metrics(path, [evaluations[0]] * 2, units="m", retrieval={}, facts={})
 
 

@@ -88,7 +88,7 @@ def test_evaluating_says_which_frames_a_network_was_trained_on(field, tmp_path):
         name: load(tmp_path / name / "checkpoint.safetensors") for name in ("all", "held out")
     }
     found = compare(field, networks, ("3-geo",), lambda *_: None, EvaluateOptions(baselines=False))
-    told = [note for note in found.notes if "was trained on validation too" in note]
+    told = [note for note in found.notes if "was also trained on validation" in note]
     assert len(told) == 1
     assert told[0].startswith("all ")
 
