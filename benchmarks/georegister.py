@@ -177,7 +177,7 @@ def judge(fit: GeoFit, model: Model, options: SimulateOptions, calm: Telemetry) 
     sigmas["tilt"] = errors.tilt_deg / stated.tilt_deg
     world = fit.world_from_model.apply(model.poses.centers)
     frame_m = np.linalg.norm(world - true.apply(model.poses.centers), axis=1)
-    radius_m = np.array([radius_sigma(c) for c in stated.of_points(world)])
+    radius_m = np.array([radius_sigma(c) for c in stated.point_covariance(world)])
     return {
         "errors": {name: abs(getattr(errors, name)) for name in FIGURES},
         "oracle": {name: abs(getattr(oracle_errors, name)) for name in FIGURES},

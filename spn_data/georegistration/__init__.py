@@ -1,4 +1,4 @@
-"""Georegistration: a model in its own gauge and telemetry give the model's place in the world, in metres."""
+"""Georegistration: from the gauge of a reconstruction to a metric East-North-Up frame, using telemetry."""
 
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.georegister import georegister

@@ -1,4 +1,4 @@
-"""Errors on fixes that the fit has not seen: whole blocks of time, or whole flights, left out."""
+"""Cross-validation of the georegistration: errors of held-out fixes, by time block or by flight."""
 
 from __future__ import annotations
 
@@ -13,9 +13,18 @@ from spn_data.georegistration.problem import Kind, Problem
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors in metres of fixes left out of the fit; NaN where nothing could be left out.
+    """Errors of held-out fixes in metres; NaN if nothing could be held out.
 
-    folds : how often the fit was repeated; frames : how many fixes were judged, outliers aside.
+    Attributes
+    ----------
+    folds : int
+        Number of refits.
+    frames : int
+        Number of held-out fixes evaluated, outliers excluded.
+    horizontal_rmse_m, horizontal_median_m : float
+        Horizontal error.
+    vertical_rmse_m, vertical_median_m : float
+        Absolute vertical error.
     """
 
     folds: int
@@ -27,7 +36,7 @@ class HeldOut:
 
 
 def time_blocks(flight: np.ndarray, time_s: np.ndarray, length_s: float) -> np.ndarray:
-    """(N,) index of the block of `length_s` seconds of its flight that each frame lies in."""
+    """Return the index (N,) of each frame's time block; blocks last `length_s` seconds within a flight."""
     start = np.array([time_s[flight == f].min() for f in range(flight.max() + 1)])[flight]
     block = np.floor((time_s - start) / length_s).astype(np.int64)
     return np.unique(np.column_stack([flight, block]), axis=0, return_inverse=True)[1].ravel()
@@ -36,10 +45,12 @@ def time_blocks(flight: np.ndarray, time_s: np.ndarray, length_s: float) -> np.n
 def cross_validate(
     problem: Problem, result: Estimate, fold: np.ndarray, inlier: np.ndarray
 ) -> HeldOut:
-    """Each fold (N,) of frames is left out in turn: its fixes and gimbal angles, not its place in the model.
+    """Refit without each fold in turn and evaluate the held-out fixes.
 
-    Noise levels and robust weights are those of the fit of all frames. A flight left out as a whole has lost
-    its vertical offset with it: its heights are judged about their median.
+    `fold` (N,) holds the fold index of each frame. A held-out frame loses its fix and gimbal angles but keeps
+    its pose in the model. Noise levels and robust weights are those of the fit to all frames. If a whole
+    flight is held out, its vertical offset is unknown, so its heights are compared after removing their
+    median.
     """
     horizontal, vertical, folds = [], [], 0
     fixes = problem.fixes
@@ -57,16 +68,16 @@ def cross_validate(
         for _ in range(3):
             linear = part.linearise(state, result.offset_sigma_m, result.bias_weight)
             weights = table[part.kind, part.frame]
-            state = state.moved(solve(part.chains, result.levels, weights, linear).step)
+            state = state.updated(solve(part.chains, result.levels, weights, linear).step)
         error = problem.residuals(state)[:3, left_out & known]
         horizontal.append(np.hypot(error[0], error[1]))
         flight = fixes.flight[left_out & known]
         for f in np.unique(flight):
             up = error[2, flight == f]
             up = up[np.isfinite(up)]
-            gone = fixes.free_heights and not (known & ~left_out & (fixes.flight == f)).any()
+            no_offset = fixes.free_heights and not (known & ~left_out & (fixes.flight == f)).any()
             if len(up):
-                vertical.append(np.abs(up - np.median(up) if gone else up))
+                vertical.append(np.abs(up - np.median(up) if no_offset else up))
         folds += 1
     h, v = (np.concatenate(e) if e else np.full(0, np.nan) for e in (horizontal, vertical))
     return HeldOut(folds, len(h), _rms(h), _median(h), _rms(v), _median(v))

@@ -1,4 +1,4 @@
-"""Second step of georegistration: weighted robust least squares of all observations together."""
+"""Second step of georegistration: robust generalised least squares over all observations."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.georegistration.noise import (
-    Levels,
     LinearSolution,
-    improve_levels,
+    NoiseLevels,
     robust_weights,
     solve,
+    update_levels,
 )
 from spn_data.georegistration.problem import SHARED, FitState, Problem
 
@@ -23,14 +23,15 @@ FIXED_OFFSET_M = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where the rounds ended.
+    """Result of the iterations.
 
-    weights, distance : (M,) robust weights and distances in white sigma; covariance : (P, P) of all
-    parameters; offset_sigma_m : (F,) what was assumed of each flight's vertical offset.
+    weights, distance : (M,) robust weights, and distances in sigma of the white noise; covariance : (P, P) of
+    all parameters; offset_sigma_m : (F,) prior sigma of each flight's vertical offset; bias_weight : (F,)
+    robust weights of the flights' gimbal biases.
     """
 
     state: FitState
-    levels: Levels
+    levels: NoiseLevels
     weights: np.ndarray
     distance: np.ndarray
     covariance: np.ndarray
@@ -39,7 +40,7 @@ class Estimate:
 
 
 def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Inverse (P, P) of an information matrix, very large where nothing is known."""
+    """Invert an information matrix (P, P); undetermined directions get a very large variance."""
     diagonal = np.diag(information)
     size = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(information * size[:, None] * size)
@@ -48,7 +49,7 @@ def covariance_of(information: np.ndarray) -> np.ndarray:
 
 
 def _bias_weights(state: FitState, bias_deg: float, freedom: float = 4.0) -> np.ndarray:
-    """(F,) weights of a Student t distribution on the flights' gimbal biases."""
+    """Return Student t weights (F,) of the flights' gimbal biases."""
     square = (state.gimbal_deg**2).sum(axis=1) / bias_deg**2
     return np.minimum((freedom + 3) / (freedom + square), 1.0)
 
@@ -58,14 +59,14 @@ def iterate(
     state: FitState,
     inlier: np.ndarray,
     offset_sigma_m: np.ndarray,
-    levels: Levels,
+    levels: NoiseLevels,
     *,
     rounds: int = _ROUNDS,
 ) -> Estimate:
-    """Gauss-Newton steps, robust weights and noise levels in turn, from the inliers (N,) of the first step.
+    """Alternate Gauss-Newton steps, robust weights and noise levels, starting from the RANSAC inliers (N,).
 
-    The number of rounds is fixed, and each is a smooth function of its input: what differs by rounding at the
-    start differs by rounding at the end.
+    The number of rounds is fixed and each round is a smooth function of its input, so rounding differences in
+    the input remain rounding differences in the result.
     """
     position = problem.kind < 3
     weights = np.where(position & ~inlier[problem.frame], 1e-4, 1.0)
@@ -75,9 +76,9 @@ def iterate(
     for k in range(rounds):
         linear = problem.linearise(state, offset_sigma_m, bias_weight)
         if k >= 2:
-            levels = improve_levels(problem.chains, levels, weights, linear)
+            levels = update_levels(problem.chains, levels, weights, linear)
         solution = solve(problem.chains, levels, weights, linear)
-        state = state.moved(solution.step)
+        state = state.updated(solution.step)
         weights, distance = robust_weights(problem.chains, levels, solution.white)
         bias_weight = _bias_weights(state, problem.options.gimbal_bias_deg)
     assert solution is not None
@@ -93,13 +94,13 @@ def iterate(
 
 
 def estimate(problem: Problem, state: FitState, inlier: np.ndarray) -> Estimate:
-    """The fit of all frames, with the flights' vertical offsets free or tied as the data say.
+    """Fit all frames, with the flights' vertical offsets free or tied depending on the data.
 
-    A flight whose take-off differs in height from the first flight's by less than its errors explain is taken
-    as having started at the same height, so that all flights together determine the vertical.
+    If a flight's take-off height differs from the first flight's by less than the errors explain, both are
+    assumed to have taken off at the same height, so that all flights together determine the vertical.
     """
     f = len(state.offsets_m)
-    levels = problem.levels()
+    levels = problem.prior_levels()
     first = _first_flight_with_heights(problem)
     fixed = np.full(f, FIXED_OFFSET_M)
     if not problem.fixes.free_heights or f == 1 or not problem.fixes.has_heights:
@@ -127,12 +128,12 @@ def _first_flight_with_heights(problem: Problem) -> int:
 
 
 def _without_offsets(state: FitState) -> FitState:
-    """The same state with the offsets at zero and their mean in the centre's height."""
+    """Return the state with all offsets zero and the first flight's offset moved into the centre's height."""
     return _from_first(state, 0, drop=True)
 
 
 def _from_first(state: FitState, first: int, *, drop: bool = False) -> FitState:
-    """Offsets counted from one flight's, the centre's height moved along."""
+    """Return the state with offsets relative to one flight's, and the centre's height adjusted to match."""
     offsets = np.zeros_like(state.offsets_m) if drop else state.offsets_m - state.offsets_m[first]
     center = state.center - np.array([0.0, 0.0, state.offsets_m[first]])
     return FitState(state.rotation, state.scale, center, offsets, state.gimbal_deg, state.level_deg)

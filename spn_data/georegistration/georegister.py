@@ -1,4 +1,4 @@
-"""Georegistration of a model: from poses and telemetry to the model's place in the world."""
+"""Georegistration of a model from its poses and telemetry."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from spn_data.geometry.pose import Poses, Similarity
 from spn_data.georegistration.cross_validation import HeldOut, cross_validate, time_blocks
 from spn_data.georegistration.fit import FIXED_OFFSET_M, Estimate, estimate
 from spn_data.georegistration.georegister_options import GeoregisterOptions
-from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, level_up
+from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, up_from_level_cameras
 from spn_data.georegistration.observe import Fixes, observe
 from spn_data.georegistration.problem import Kind, Problem
+from spn_data.georegistration.ransac import extent, ransac_similarity
 from spn_data.georegistration.result import FitSummary, GeoFit
-from spn_data.georegistration.start import extent, find_start
 from spn_data.georegistration.uncertainty import Uncertainty, effective_fixes, require_determined
 from spn_data.telemetry.track import Telemetry
 
-# A frame whose fix lies this many sigma of white noise off its neighbours is called an outlier.
+# A fix is an outlier if its residual exceeds this many sigma of the white noise.
 _OUTLIER_SIGMAS = 5.0
-# A flight's gimbal with a constant error above this is worth a word.
+# A constant gimbal error above this many sigma is reported to the user.
 _GIMBAL_BIAS_SIGMAS = 4.0
 
 
@@ -33,20 +33,46 @@ def georegister(
     time_s: np.ndarray,
     options: GeoregisterOptions | None = None,
 ) -> GeoFit:
-    """The place in the world of a model whose cameras' fixes, heights and gimbal angles are known.
+    """Georegister a model from its cameras' fixes, heights and gimbal angles.
 
-    model : N poses in the reconstruction's own gauge; telemetry : N rows, the records at the frames' times
-    (`align_telemetry`); sequence : flight of each frame; time_s : (N,) within the flight.
-    Two steps: the similarity that most fixes agree with, then robust least squares of fixes, heights and
-    gravity together under errors that are correlated in time.
-    Raises GeometryError where fixes and gimbal angles do not determine the answer, with the remedy.
+    Parameters
+    ----------
+    model : Poses
+        N poses in the gauge of the reconstruction.
+    telemetry : Telemetry
+        N rows, interpolated at the frames' times (see `align_telemetry`).
+    sequence : sequence of str
+        Flight of each frame.
+    time_s : ndarray, shape (N,)
+        Time of each frame within its flight, in seconds.
+    options : GeoregisterOptions, optional
+        Noise model, robust estimation and acceptance limits.
+
+    Returns
+    -------
+    GeoFit
+        Similarity to the world with its uncertainty, residuals and cross-validation.
+
+    Raises
+    ------
+    GeometryError
+        If fixes and gimbal angles do not determine the similarity; the message states the remedy.
+    ValueError
+        If `model` and `telemetry` differ in length.
+
+    Notes
+    -----
+    An initial similarity from RANSAC is refined by robust generalised least squares over fixes, heights and
+    gravity, under errors that are correlated in time (Gauss-Markov).
     """
     options = options or GeoregisterOptions()
     if len(model) != len(telemetry):
-        raise ValueError(f"{len(model)} poses and {len(telemetry)} rows of telemetry")
+        raise ValueError(
+            f"{len(model)} poses and {len(telemetry)} telemetry rows must be equal in number"
+        )
     fixes = observe(telemetry, sequence, time_s, options)
     _require_enough(fixes, options)
-    # The fit works on centred coordinates of unit size, whatever the gauge.
+    # Normalise: the fit uses centred coordinates of unit size, independent of the gauge.
     middle = model.centers[fixes.has_fix].mean(axis=0)
     size = float(np.sqrt(((model.centers - middle) ** 2).sum(axis=1).mean()))
     if not size > 0:
@@ -65,16 +91,18 @@ def georegister(
     up_model = gravity.direction
     if up_model is None and not fixes.has_heights:
         up_model = _up_of_level_cameras(rotations)
-    start = find_start(centers, fixes, up_model, options)
-    if start.sigma_factor > 1:
+    initial = ransac_similarity(centers, fixes, up_model, options)
+    if initial.sigma_factor > 1:
         note = (
-            f"Fixes agree with the model at {start.sigma_factor:g} times their stated sigma only."
+            f"Fixes agree with the model only within {initial.sigma_factor:g} times their stated "
+            "sigma."
         )
         fixes = replace(fixes, notes=(*fixes.notes, note))
     problem = Problem.build(centers, rotations, fixes, use_level, options)
-    result = estimate(problem, problem.start(start.world_from_model, start.inlier), start.inlier)
+    state = problem.initial_state(initial.world_from_model, initial.inlier)
+    result = estimate(problem, state, initial.inlier)
     require_determined(problem, result, options)
-    return _fit_of(problem, result, gravity, middle, size)
+    return _geo_fit(problem, result, gravity, middle, size)
 
 
 def _require_enough(fixes: Fixes, options: GeoregisterOptions) -> None:
@@ -85,22 +113,22 @@ def _require_enough(fixes: Fixes, options: GeoregisterOptions) -> None:
     spread = extent(fixes)
     if spread < sigma:
         raise GeometryError(
-            f"the fixes lie within {spread:.2g} m (rms) of one place, their sigma is {sigma:.2g} m: "
-            "a hovering drone fixes neither scale nor heading; fly a leg of at least 20 m"
+            f"the fixes spread over only {spread:.2g} m (RMS) at a sigma of {sigma:.2g} m: a hovering drone "
+            "determines neither scale nor heading; fly a leg of at least 20 m"
         )
 
 
 def _up_of_level_cameras(rotations: np.ndarray) -> np.ndarray:
-    up, determined = level_up(rotations)
+    up, determined = up_from_level_cameras(rotations)
     if determined < 0.05:
         raise GeometryError(
-            "no heights, no gimbal angles, and all cameras look one way: nothing says where up is; "
-            "give heights or gimbal angles"
+            "the direction of up is undetermined: there are no heights and no gimbal angles, and all cameras "
+            "look in the same direction; give heights or gimbal angles"
         )
     return up
 
 
-def _fit_of(
+def _geo_fit(
     problem: Problem, result: Estimate, gravity: Gravity, middle: np.ndarray, size: float
 ) -> GeoFit:
     state, fixes, options = result.state, problem.fixes, problem.options
@@ -112,7 +140,7 @@ def _fit_of(
     distance[problem.kind, problem.frame] = result.distance
     outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
     covariance = result.covariance[:7, :7].copy()
-    # Gravity acts on the cameras' rotations; what the positions are tilted against these no telemetry shows.
+    # Gravity constrains the cameras' rotations; telemetry cannot show how positions are tilted against them.
     covariance[[3, 4], [3, 4]] += np.deg2rad(options.model_bend_deg) ** 2
     if not fixes.has_heights:
         covariance[2, :] = covariance[:, 2] = 0.0
@@ -129,7 +157,7 @@ def _fit_of(
         world_from_model,
         fixes.origin,
         {
-            # The flight that the others count from is held at zero by a tight prior.
+            # A tight prior holds the reference flight at zero.
             name: 0.0 if result.offset_sigma_m[f] <= FIXED_OFFSET_M else float(offset)
             for f, (name, offset) in enumerate(zip(fixes.flights, state.offsets_m, strict=True))
             if np.isfinite(fixes.enu_m[fixes.flight == f, 2]).any()
@@ -144,12 +172,12 @@ def _fit_of(
         held_out[1],
         _summary(problem, result, residuals, outlier),
         _observations(problem, gravity),
-        fixes.notes + _remarks(problem, result, gravity, outlier, held_out[0]),
+        fixes.notes + _notes(problem, result, gravity, outlier, held_out[0]),
     )
 
 
 def _noise(problem: Problem, result: Estimate) -> dict[str, tuple[float, float]]:
-    """(bias, white) sigma in metres of each kind of fix, at its median stated sigma."""
+    """Return sigma (bias, white) in metres of each kind of fix, at its median stated sigma."""
     names = ("horizontal", "vertical", "horizontal_rtk", "vertical_rtk")
     noise = {}
     for g, name in enumerate(names):
@@ -194,43 +222,43 @@ def _observations(problem: Problem, gravity: Gravity) -> tuple[str, ...]:
     return tuple(used)
 
 
-def _remarks(
+def _notes(
     problem: Problem, result: Estimate, gravity: Gravity, outlier: np.ndarray, held_out: HeldOut
 ) -> tuple[str, ...]:
-    """What the user should know of this fit, a sentence each."""
+    """Return sentences on the quality of the fit for the user."""
     fixes, state, options = problem.fixes, result.state, problem.options
     notes = []
     if not gravity.usable.any():
         notes.append(
-            "No gimbal angles: up comes from the fixes, helped by cameras that fly level on average "
-            f"(sigma {options.level_camera_sigma_deg:g} deg)."
+            "No gimbal angles: up is estimated from the fixes and from the assumption that cameras fly level "
+            f"on average (sigma {options.level_camera_sigma_deg:g} deg)."
         )
     for f, name in enumerate(fixes.flights):
         mine = fixes.has_fix & (fixes.flight == f)
         if not mine.any():
-            notes.append(f"{name}: no frame has a fix; its place follows from the other flights.")
+            notes.append(
+                f"{name}: no frame has a fix; it is georegistered through the other flights only."
+            )
         elif np.mean(outlier[mine]) > 0.3:
             notes.append(
-                f"{name}: {np.mean(outlier[mine]):.0%} of its fixes are outliers: "
-                "another flight's telemetry, or its clock is off?"
+                f"{name}: {np.mean(outlier[mine]):.0%} of its fixes are outliers: this may be the "
+                "telemetry of another flight, or its clock may be off."
             )
         if result.offset_sigma_m[f] > 10:
             notes.append(
-                f"{name}: its heights start {state.offsets_m[f]:+.1f} m from the first flight's."
+                f"{name}: its heights are offset by {state.offsets_m[f]:+.1f} m from the first flight's."
             )
         bias = float(np.linalg.norm(state.gimbal_deg[f]))
         if bias > _GIMBAL_BIAS_SIGMAS * options.gimbal_bias_deg:
-            notes.append(f"{name}: its gimbal angles are off by a constant {bias:.1f} deg.")
+            notes.append(f"{name}: its gimbal angles have a constant error of {bias:.1f} deg.")
     for group, name in enumerate(("horizontal", "vertical")):
         level = float(
             np.hypot(*np.exp([result.levels.log_bias[group], result.levels.log_white[group]]))
         )
         if level > 2 and (problem.chains.group == group).any():
-            notes.append(
-                f"The {name} errors of the fixes are {level:.1f} times their stated sigma."
-            )
+            notes.append(f"The {name} errors of the fixes are {level:.1f} times the stated sigma.")
     if held_out.folds == 0:
-        notes.append("Too short for cross-validation by blocks of time.")
+        notes.append("The flights are too short for cross-validation by time blocks.")
     return tuple(notes)
 
 

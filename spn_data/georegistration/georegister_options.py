@@ -1,4 +1,4 @@
-"""What the user may say of a georegistration, and what is assumed of each kind of source."""
+"""Options of the georegistration and default accuracies of the telemetry sources."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
-# Standard deviation (horizontal per axis, vertical) in metres of one fix of a source that states none.
-# Consumer GNSS without correction; heights of photos are as often barometric as not, hence wider.
+# Standard deviation (horizontal per axis, vertical) in metres of one fix if the source states none.
+# Consumer GNSS without corrections; heights in photos are often barometric, hence the larger values.
 DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
     "dji-srt": (1.0, 1.5),
     "gopro": (2.0, 4.0),
@@ -19,50 +19,84 @@ DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
 }
 UNKNOWN_KIND_SIGMA_M = (1.5, 2.5)
 
-# Below this horizontal sigma a fix is one of differential carrier phase (RTK, PPK), whose errors are
-# another process than those of the same receiver without it.
+# A fix with a smaller horizontal sigma is a carrier-phase differential one (RTK, PPK). Its errors follow a
+# different process from those of the same receiver without corrections.
 RTK_SIGMA_M = 0.15
 
 
 class Heights(StrEnum):
-    """Which of a record's heights are used."""
+    """Kind of heights to use from the telemetry."""
 
-    AUTO = "auto"  # above take-off where known, else absolute
+    AUTO = "auto"  # above take-off if known, otherwise absolute
     RELATIVE = "relative"  # above take-off
     ABSOLUTE = "absolute"  # what the source calls absolute
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeoregisterOptions:
-    """How fixes and gimbal angles are believed."""
+    """Noise model, robust estimation and acceptance limits of the georegistration.
 
-    # Sigma of one fix, horizontal per axis and vertical; None: the source's own, else DEFAULT_SIGMA_M.
+    Attributes
+    ----------
+    gnss_sigma_m : tuple of float, optional
+        Sigma of one fix in metres, horizontal per axis and vertical. None: the sigma stated by the source,
+        or `DEFAULT_SIGMA_M` if it states none.
+    correlation_time_s : float
+        Correlation time of the GNSS errors within a flight (first-order Gauss-Markov process).
+    heights : Heights
+        Kind of heights to use.
+    height_reference : HeightReference, optional
+        Reference of absolute heights if the source does not state it.
+    takeoff_alt_m : float, optional
+        Height of the take-off point above `height_reference`.
+    same_takeoff : bool, optional
+        Whether all flights took off at the same height. None: decided by a test on the data.
+    same_takeoff_sigma_m : float
+        Sigma of the height difference between take-offs assumed equal.
+    use_gimbal : bool
+        Whether gimbal angles are used.
+    gimbal_bias_deg : float
+        Sigma of a flight's constant gimbal error in pitch and in roll.
+    gimbal_agreement_deg : float
+        A frame is dropped if its gimbal direction differs by more than this from the rest of its flight.
+    model_bend_deg : float
+        Sigma of the tilt between the model's rotations and its positions.
+    level_camera_sigma_deg : float
+        Sigma of the roll of cameras without gimbal angles, both per flight and per frame.
+    ransac_sigmas : float
+        Inlier threshold of RANSAC in sigma.
+    ransac_samples : int
+        Number of RANSAC samples.
+    seed : int
+        Random seed.
+    min_fixes : int
+        Minimum number of frames with a fix.
+    max_tilt_sigma_deg, max_heading_sigma_deg, max_scale_sigma : float
+        The fit is rejected if tilt, heading or scale (relative) are less certain than this.
+    origin : GeoOrigin, optional
+        Origin to keep, if an existing area is extended.
+    """
+
     gnss_sigma_m: tuple[float, float] | None = None
-    correlation_time_s: float = 60.0  # over which GNSS errors of one flight stay alike
+    correlation_time_s: float = 60.0
     heights: Heights = Heights.AUTO
-    height_reference: HeightReference | None = (
-        None  # of absolute heights, where the source does not say
-    )
-    takeoff_alt_m: float | None = None  # height of the take-off point above `height_reference`
-    same_takeoff: bool | None = None  # all flights took off at one height; None: tested
-    same_takeoff_sigma_m: float = 0.3  # between take-offs that pass as one
+    height_reference: HeightReference | None = None
+    takeoff_alt_m: float | None = None
+    same_takeoff: bool | None = None
+    same_takeoff_sigma_m: float = 0.3
     use_gimbal: bool = True
-    gimbal_bias_deg: float = 0.3  # sigma of a flight's constant error of pitch and of roll
-    gimbal_agreement_deg: float = (
-        5.0  # frames whose gimbal differs by more from the flight's others are dropped
-    )
-    model_bend_deg: float = 0.02  # sigma of the tilt between a model's rotations and its positions
-    level_camera_sigma_deg: float = (
-        6.0  # roll of cameras without gimbal angles: of a flight, and of a frame
-    )
+    gimbal_bias_deg: float = 0.3
+    gimbal_agreement_deg: float = 5.0
+    model_bend_deg: float = 0.02
+    level_camera_sigma_deg: float = 6.0
     ransac_sigmas: float = 3.0
     ransac_samples: int = 600
     seed: int = 0
     min_fixes: int = 6
-    max_tilt_sigma_deg: float = 3.0  # a model whose tilt is known worse than this is refused
+    max_tilt_sigma_deg: float = 3.0
     max_heading_sigma_deg: float = 10.0
-    max_scale_sigma: float = 0.15  # relative
-    origin: GeoOrigin | None = None  # keep this origin (an area that is extended)
+    max_scale_sigma: float = 0.15
+    origin: GeoOrigin | None = None
 
     def __post_init__(self) -> None:
         if self.gnss_sigma_m is not None and not all(
@@ -74,6 +108,6 @@ class GeoregisterOptions:
 
 
 def default_sigma_m(kind: str) -> np.ndarray:
-    """(3,) sigma east, north, up in metres assumed for a kind of source that states none."""
+    """Return the default sigma (3,) east, north, up in metres for a kind of source that states none."""
     horizontal, vertical = DEFAULT_SIGMA_M.get(kind, UNKNOWN_KIND_SIGMA_M)
     return np.array([horizontal, horizontal, vertical])

@@ -1,4 +1,4 @@
-"""The direction of up in the model: from gimbal angles, or from cameras that fly level on average."""
+"""Direction of up in the model, from gimbal angles or from cameras that fly level on average."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 
-# Gimbals hold their angles to a few tenths of a degree; another flight's are degrees off.
+# Gimbals are accurate to a few tenths of a degree; the angles of another flight are off by degrees.
 _FOREIGN_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """Up in the model by the cameras alone.
+    """Direction of up in the model, estimated from the cameras alone.
 
-    direction : (3,) unit, or None where nothing says it; usable : (N,) bool, frames whose gimbal angles agree
-    with the reconstruction; notes : flights whose angles do not.
+    direction : (3,) unit vector, None if undetermined; usable : (N,) bool, frames whose gimbal angles agree
+    with the reconstruction; notes : one sentence per flight whose angles disagree.
     """
 
     direction: np.ndarray | None
@@ -26,7 +26,7 @@ class Gravity:
 
 
 def robust_direction(directions: np.ndarray) -> np.ndarray:
-    """The direction (3,) with the smallest sum of distances to unit directions (K, 3) (Weiszfeld)."""
+    """Return the geometric median (3,) of unit directions (K, 3), by Weiszfeld's algorithm."""
     middle = np.median(directions, axis=0)
     for _ in range(100):
         weight = 1 / np.maximum(np.linalg.norm(directions - middle, axis=1), 1e-9)
@@ -41,11 +41,12 @@ def gravity_from_gimbal(
     flights: tuple[str, ...],
     agreement_deg: float,
 ) -> Gravity:
-    """Up in the model from gimbal angles, each flight's tested against the reconstruction's own rotations.
+    """Estimate up in the model from gimbal angles, after testing each flight against the reconstruction.
 
-    cam_from_model (N, 3, 3); up_cam (N, 3), NaN unknown. A flight is used where at least two thirds of its
-    frames lie within `agreement_deg` of its median direction, and this within it of the other flights'.
-    Raises GeometryError where a flight's angles move, but not as its cameras do: they are another flight's.
+    cam_from_model : (N, 3, 3); up_cam : (N, 3), NaN if unknown. A flight is used if at least two thirds of
+    its frames are within `agreement_deg` of its median direction, and that direction is within
+    `agreement_deg` of the other flights' direction. Raises GeometryError if a flight's gimbal angles change
+    differently from its cameras' orientations, because they then belong to another flight.
     """
     up_model = np.einsum("nji,nj->ni", cam_from_model, up_cam)
     known = np.isfinite(up_model).all(axis=1)
@@ -59,8 +60,8 @@ def gravity_from_gimbal(
         _require_own_telemetry(name, up_cam[mine], float(np.median(angle)))
         if np.mean(angle < agreement_deg) < 2 / 3:
             notes.append(
-                f"{name}: gimbal angles disagree with the model's own rotations "
-                f"(median {np.median(angle):.1f} deg): not used."
+                f"{name}: gimbal angles disagree with the model's rotations "
+                f"(median {np.median(angle):.1f} deg) and are not used."
             )
             continue
         usable[np.flatnonzero(mine)[angle < agreement_deg]] = True
@@ -74,35 +75,39 @@ def gravity_from_gimbal(
         off_deg = float(np.median(angles_deg(up_model[mine], direction)))
         if off_deg > agreement_deg:
             notes.append(
-                f"{name}: gimbal angles disagree with other flights by {off_deg:.1f} deg: not used."
+                f"{name}: gimbal angles disagree with other flights by {off_deg:.1f} deg "
+                "and are not used."
             )
             usable &= ~mine
     return Gravity(direction, usable, tuple(notes))
 
 
 def _require_own_telemetry(name: str, up_cam: np.ndarray, disagreement_deg: float) -> None:
-    """A gimbal that stands still may be one that was never written; one that moves must move rightly."""
+    """Raise GeometryError if gimbal angles change, but not with the camera.
+
+    Constant angles are accepted because they may simply never have been recorded.
+    """
     moved_deg = float(np.median(angles_deg(up_cam, robust_direction(up_cam))))
     if min(moved_deg, disagreement_deg) > _FOREIGN_DEG:
         raise GeometryError(
-            f"{name}: its gimbal angles move by {moved_deg:.1f} deg, but not with its camera "
-            f"(median disagreement {disagreement_deg:.1f} deg): is this telemetry of another flight, or "
-            "its clock off by seconds? Put the right file beside the video, give --time-offset, or "
+            f"{name}: the gimbal angles vary by {moved_deg:.1f} deg, but not with the camera (median "
+            f"disagreement {disagreement_deg:.1f} deg): this may be the telemetry of another flight, or its "
+            "clock may be off by seconds. Put the right file next to the video, or use --time-offset or "
             "--ignore-gimbal"
         )
 
 
 def angles_deg(directions: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Angles (K,) in degrees between unit directions (K, 3) and one (3,)."""
+    """Return the angles (K,) in degrees between unit directions (K, 3) and one direction (3,)."""
     sine = np.linalg.norm(np.cross(directions, direction), axis=1)
     return np.rad2deg(np.arctan2(sine, directions @ direction))
 
 
-def level_up(cam_from_model: np.ndarray) -> tuple[np.ndarray, float]:
-    """Up in the model if cameras fly level, and how well that is determined (0 no, 1 perfectly).
+def up_from_level_cameras(cam_from_model: np.ndarray) -> tuple[np.ndarray, float]:
+    """Estimate up in the model assuming level cameras; also return how well it is determined (0 to 1).
 
-    The image's right side is then horizontal in every frame: up is the direction most across all of them,
-    which needs cameras that look in different directions. Its sign is that of the image's top.
+    For a level camera the image x axis is horizontal, so up is the direction most orthogonal to the x axes of
+    all frames. This requires cameras that look in different directions. The sign follows the image's top.
     """
     right, top = cam_from_model[:, 0], -cam_from_model[:, 1]
     values, vectors = np.linalg.eigh(right.T @ right / len(right))

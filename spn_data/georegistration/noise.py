@@ -1,8 +1,8 @@
-"""Errors that are correlated in time: Gauss-Markov chains, their likelihood and least squares under them.
+"""Generalised least squares and likelihood for errors correlated in time (Gauss-Markov chains).
 
-An observation's error is the sum of a slowly changing bias, a first-order Gauss-Markov (Ornstein-Uhlenbeck)
-process along its chain, and of white noise. The inverse covariance of such a process is tridiagonal, so that
-least squares under it costs time in proportion to the number of observations (Woodbury's identity).
+An observation error is the sum of a slowly changing bias, modelled as a first-order Gauss-Markov
+(Ornstein-Uhlenbeck) process along its chain, and white noise. The inverse covariance of such a process is
+tridiagonal, so the cost of least squares is linear in the number of observations (Woodbury identity).
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-# Two observations of one chain are never treated as closer than this part of the correlation time.
+# Lower limit of the time between two observations of a chain, as a fraction of the correlation time.
 _MIN_STEP = 1e-3
-# White errors that are no part of the normal distribution: their share, and how far they reach in sigma.
+# Contaminated normal distribution of the white noise: share of outliers, and their range in sigma.
 _OUTLIERS = 0.03
 _OUTLIER_WIDTH = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Which of M observations share a chain, in the order of chain and time.
+    """Chains of M observations, sorted by chain and time.
 
-    group : (M,) index of the noise level; unit : (M,) sigma that the group's factors multiply, in the
-    observation's unit; twin : (M,) index of the set whose members are outliers together;
-    precision : (2, M) tridiagonal inverse covariance of the unit-variance processes (row 0 above the
-    diagonal, as scipy has it); log_innovation : (M,) logarithm of their variance given what came before.
+    group : (M,) index of the noise level; unit : (M,) sigma, in the observation's unit, that the group's
+    factors multiply; twin : (M,) index of the set of observations that are outliers together; twin_sizes :
+    size of each set; precision : (2, M) tridiagonal inverse covariance of the unit-variance processes (row 0
+    above the diagonal, as in scipy); log_innovation : (M,) logarithm of their variance given the predecessor.
     """
 
     group: np.ndarray
@@ -46,7 +46,7 @@ class Chains:
         unit: np.ndarray,
         twin: np.ndarray,
     ) -> tuple[Chains, np.ndarray]:
-        """Chains of observations in any order, and the order (M,) that they have to be brought into."""
+        """Build chains from observations in any order; also return the sorting order (M,)."""
         order = np.lexsort((time_s, chain))
         chain, time_s, correlation_s = chain[order], time_s[order], correlation_s[order]
         same = chain[1:] == chain[:-1]
@@ -63,7 +63,7 @@ class Chains:
         return cls(group[order], unit[order], twin, sizes, precision, np.log(innovation)), order
 
     def part(self, mask: np.ndarray) -> Chains:
-        """Some whole chains, by a mask (M,) of their observations; twins keep their numbers."""
+        """Select whole chains by a mask (M,) of their observations; twin indices are kept."""
         return replace(
             self,
             group=self.group[mask],
@@ -75,11 +75,11 @@ class Chains:
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class NoiseLevels:
     """Noise levels of G groups, as factors of the observations' own sigma.
 
-    log_bias, log_white : (G,) natural logarithms; *_center, *_spread : (G,) what they are believed to be
-    before the data, a spread of 0 being fixed.
+    log_bias, log_white : (G,) natural logarithms; *_center, *_spread : (G,) mean and sigma of their priors; a
+    spread of 0 fixes the level.
     """
 
     log_bias: np.ndarray
@@ -90,21 +90,21 @@ class Levels:
     white_spread: np.ndarray
 
     @classmethod
-    def from_table(cls, table: list[tuple[float, float, float, float]]) -> Levels:
-        """From (bias, its spread in log, white, its spread in log) of each group."""
+    def from_table(cls, table: list[tuple[float, float, float, float]]) -> NoiseLevels:
+        """Build from one row (bias, spread of its logarithm, white, spread of its logarithm) per group."""
         bias, bias_spread, white, white_spread = np.array(table, dtype=np.float64).T
         return cls(
             np.log(bias), np.log(white), np.log(bias), bias_spread, np.log(white), white_spread
         )
 
-    def moved(self, name: str, group: int, delta: float) -> Levels:
-        """The same levels with one of `log_bias` or `log_white` changed."""
+    def moved(self, name: str, group: int, delta: float) -> NoiseLevels:
+        """Return the levels with one element of `log_bias` or `log_white` changed by `delta`."""
         values = getattr(self, name).copy()
         values[group] += delta
         return replace(self, **{name: values})
 
     def log_prior(self) -> float:
-        """Logarithm of the density of the free levels, up to a constant."""
+        """Return the log prior density of the free levels, up to a constant."""
         total = 0.0
         for value, center, spread in (
             (self.log_bias, self.bias_center, self.bias_spread),
@@ -114,8 +114,8 @@ class Levels:
             total -= 0.5 * float((((value - center)[free] / spread[free]) ** 2).sum())
         return total
 
-    def at_least(self, bias: np.ndarray, white: np.ndarray) -> Levels:
-        """The same levels with lower limits (G,) of the factors."""
+    def at_least(self, bias: np.ndarray, white: np.ndarray) -> NoiseLevels:
+        """Return the levels with lower limits (G,) applied to the factors."""
         return replace(
             self,
             log_bias=np.log(np.maximum(np.exp(self.log_bias), bias)),
@@ -123,12 +123,12 @@ class Levels:
         )
 
 
-def inverse_times(
-    chains: Chains, levels: Levels, weights: np.ndarray, columns: np.ndarray
+def apply_inverse_covariance(
+    chains: Chains, levels: NoiseLevels, weights: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Inverse covariance of the observations times columns (M, K), and the covariance's log determinant.
+    """Multiply columns (M, K) by the inverse covariance; also return the covariance's log determinant.
 
-    weights : (M,) robust weights, that divide the variance of the white part.
+    weights : (M,) robust weights, which divide the variance of the white noise.
     """
     white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
     amplitude = np.exp(levels.log_bias)[chains.group] * chains.unit
@@ -142,10 +142,11 @@ def inverse_times(
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """Observations linearised: ``residual = jacobian @ step + noise``, and what is known of the parameters.
+class LinearSystem:
+    """Linearised observations ``residual = jacobian @ step + noise`` with a prior on the parameters.
 
-    residual (M,), jacobian (M, P); prior_precision (P,) about the value 0 of parameters now at `value` (P,).
+    residual : (M,); jacobian : (M, P); prior_precision : (P,) of a zero-mean prior; value : (P,) current
+    values.
     """
 
     residual: np.ndarray
@@ -156,15 +157,15 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class LinearSolution:
-    """Of the linear problem: step (P,), information (P, P), residuals' white part (M,) after the step."""
+    """Solution of the linear problem: step (P,), information (P, P), white residuals (M,) after the step."""
 
     step: np.ndarray
     information: np.ndarray
     white: np.ndarray
 
 
-def _normal(matrix: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray, float]:
-    """Information (P, P), gradient (P,) and squared residual of observations and prior together.
+def _normal(matrix: np.ndarray, linear: LinearSystem) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return information (P, P), gradient (P,) and squared residual, prior included (normal equations).
 
     matrix : (P + 1, P + 1) products of (jacobian, residual) under the inverse covariance.
     """
@@ -178,18 +179,20 @@ def _normal(matrix: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray,
 
 
 def _step(information: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least-squares step (P,) and the information's log determinant."""
-    # Parameters of very different units: the scaling keeps the factorisation well conditioned.
+    """Return the least-squares step (P,) and the information's log determinant."""
+    # The parameters have very different units; scaling keeps the factorisation well conditioned.
     size = 1 / np.sqrt(np.diag(information))
     scaled = information * size[:, None] * size
     step = size * np.linalg.solve(scaled, size * gradient)
     return step, float(np.linalg.slogdet(scaled)[1] - 2 * np.log(size).sum())
 
 
-def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -> LinearSolution:
-    """Generalised least squares under the chains' covariance."""
+def solve(
+    chains: Chains, levels: NoiseLevels, weights: np.ndarray, linear: LinearSystem
+) -> LinearSolution:
+    """Solve generalised least squares under the chains' covariance."""
     columns = np.column_stack([linear.jacobian, linear.residual])
-    inverse, _ = inverse_times(chains, levels, weights, columns)
+    inverse, _ = apply_inverse_covariance(chains, levels, weights, columns)
     information, gradient, _ = _normal(columns.T @ inverse, linear)
     step, _ = _step(information, gradient)
     white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
@@ -197,65 +200,73 @@ def solve(chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear) -
 
 
 def robust_weights(
-    chains: Chains, levels: Levels, white: np.ndarray
+    chains: Chains, levels: NoiseLevels, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (M,) of the white parts (M,) under a contaminated normal, and their distances in sigma (M,).
+    """Return robust weights (M,) of white residuals (M,) and their distances in sigma (M,).
 
-    A white error is normal, or, in a share `_OUTLIERS`, anything up to `_OUTLIER_WIDTH` sigma (Tukey 1960);
-    each outlier has a variance of its own, so that it says nothing of the others'. Twins (east and north of
-    one fix) are judged by their common distance, the root of their mean square.
+    White noise is a contaminated normal (Tukey 1960): a share `_OUTLIERS` can be anything up to
+    `_OUTLIER_WIDTH` sigma. Each outlier has its own variance, so it carries no information about the others.
+    Twins (east and north of one fix) are weighted together by the root mean square of their distances.
     """
     square = _squares(chains, levels, white)
-    # A huge distance is as sure an outlier as one of 50 sigma.
+    # Distances are capped at 50 sigma: anything beyond is equally certain to be an outlier.
     normal = np.exp(-np.minimum(square, 2500.0) / 2)
     good = normal / (normal + _OUTLIERS * _OUTLIER_WIDTH**-chains.twin_sizes)
     weights = good + (1 - good) * chains.twin_sizes / (chains.twin_sizes + square)
     return weights[chains.twin], np.sqrt(square / chains.twin_sizes)[chains.twin]
 
 
-def robust_cost(chains: Chains, levels: Levels, residual: np.ndarray, weights: np.ndarray) -> float:
-    """Negative logarithm of the density of residuals (M,) under a contaminated normal, at its weights (M,).
+def robust_cost(
+    chains: Chains, levels: NoiseLevels, residual: np.ndarray, weights: np.ndarray
+) -> float:
+    """Return the negative log density of residuals (M,) under a contaminated normal, given its weights (M,).
 
-    The bias is at its most probable course rather than integrated out: good for comparing fits of one flight.
+    The bias is set to its most probable values instead of being integrated out, which is sufficient for
+    comparing fits of one flight.
     """
-    inverse, _ = inverse_times(chains, levels, weights, residual[:, None])
+    inverse, _ = apply_inverse_covariance(chains, levels, weights, residual[:, None])
     sigma = np.exp(levels.log_white)[chains.group] * chains.unit
     white = sigma**2 / weights * inverse[:, 0]
     bias_cost = residual @ inverse[:, 0] - (weights * (white / sigma) ** 2).sum()
     square = _squares(chains, levels, white)
     tails = -np.log(np.exp(-square / 2) + _OUTLIERS * _OUTLIER_WIDTH**-chains.twin_sizes)
-    _, log_det = inverse_times(chains, levels, np.ones_like(weights), residual[:, None])
+    _, log_det = apply_inverse_covariance(chains, levels, np.ones_like(weights), residual[:, None])
     return float(0.5 * bias_cost + tails.sum() + 0.5 * log_det)
 
 
-def _squares(chains: Chains, levels: Levels, white: np.ndarray) -> np.ndarray:
-    """Squared distances in sigma of each set of twins."""
+def _squares(chains: Chains, levels: NoiseLevels, white: np.ndarray) -> np.ndarray:
+    """Return the squared distance in sigma of each set of twins."""
     standard = white / (np.exp(levels.log_white)[chains.group] * chains.unit)
     return np.bincount(chains.twin, standard**2, minlength=len(chains.twin_sizes))
 
 
-def improve_levels(
-    chains: Chains, levels: Levels, weights: np.ndarray, linear: Linear, *, max_step: float = 0.7
-) -> Levels:
-    """One Newton step of each free level towards the most probable one.
+def update_levels(
+    chains: Chains,
+    levels: NoiseLevels,
+    weights: np.ndarray,
+    linear: LinearSystem,
+    *,
+    max_step: float = 0.7,
+) -> NoiseLevels:
+    """Take one Newton step of each free level towards the maximum of the posterior.
 
-    Probability is the restricted likelihood (Harville 1977: parameters integrated out) times the prior.
-    Every step is a smooth function of its input, so that rounding in the observations stays rounding.
+    The posterior is the restricted likelihood (Harville 1977: parameters integrated out) times the prior.
+    Each step is a smooth function of its input, so rounding differences in the observations remain small.
     """
     columns = np.column_stack([linear.jacobian, linear.residual])
     groups = [g for g in range(len(levels.log_bias)) if (chains.group == g).any()]
     rows = {g: chains.group == g for g in groups}
     parts = {g: chains.part(rows[g]) for g in groups}
 
-    def products(g: int, candidate: Levels) -> tuple[np.ndarray, float]:
+    def products(g: int, candidate: NoiseLevels) -> tuple[np.ndarray, float]:
         mine = columns[rows[g]]
-        inverse, log_det = inverse_times(parts[g], candidate, weights[rows[g]], mine)
+        inverse, log_det = apply_inverse_covariance(parts[g], candidate, weights[rows[g]], mine)
         return mine.T @ inverse, log_det
 
-    # Groups have chains of their own: only that whose level moves is computed anew.
+    # No chain belongs to two groups, so only the group whose level changes is recomputed.
     current = {g: products(g, levels) for g in groups}
 
-    def objective(g: int, candidate: Levels, own: tuple[np.ndarray, float]) -> float:
+    def objective(g: int, candidate: NoiseLevels, own: tuple[np.ndarray, float]) -> float:
         all_products = [own if k == g else current[k] for k in groups]
         matrix = np.sum(np.stack([p[0] for p in all_products]), axis=0)
         information, gradient, quadratic = _normal(matrix, linear)
@@ -273,7 +284,7 @@ def improve_levels(
                 values.append(objective(g, candidate, own))
             slope = (values[2] - values[0]) / (2 * h)
             curvature = -(values[2] - 2 * values[1] + values[0]) / h**2
-            # Where the likelihood is not concave the prior's curvature sets the step.
+            # If the likelihood is not concave, the prior's curvature determines the step.
             curvature = max(curvature, 1 / spread[g] ** 2)
             levels = levels.moved(name, g, float(np.clip(slope / curvature, -max_step, max_step)))
             current[g] = products(g, levels)

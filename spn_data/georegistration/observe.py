@@ -1,4 +1,4 @@
-"""What telemetry says of each frame, in local metres: fixes, their sigma, and the direction of up."""
+"""Telemetry observations of each frame in local metres: fixes, their sigma, and the direction of up."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spn_data.georegistration.georegister_options import (
 )
 from spn_data.telemetry.track import Telemetry
 
-# Finer than any fix, coarse enough to be read aloud: 6 decimals are 0.1 m.
+# Decimals of the origin's latitude and longitude in degrees; 6 decimals correspond to 0.1 m.
 _ORIGIN_DECIMALS = 6
 
 
@@ -26,10 +26,11 @@ _ORIGIN_DECIMALS = 6
 class Fixes:
     """Observations of N frames in the local frame of `origin`.
 
-    enu_m : (N, 3) NaN where unknown (up apart from east and north); sigma_m : (N, 3); up_cam : (N, 3) unit
-    direction of up in camera axes by the gimbal, NaN where unknown; attitude : (N, 3, 3) cam_from_world by
-    the gimbal, heading included, NaN where it is not to be used; flight : (N,) index into `flights`;
-    time_s : (N,) within the flight; relative : (F,) bool, the flight's heights are above its take-off.
+    enu_m : (N, 3), NaN if unknown (up independently of east and north); sigma_m : (N, 3); up_cam : (N, 3)
+    unit direction of up in camera axes according to the gimbal, NaN if unknown; attitude : (N, 3, 3)
+    cam_from_world according to the gimbal, including heading, NaN if not used; flight : (N,) index into
+    `flights`; time_s : (N,) within the flight; relative : (F,) bool, whether the flight's heights are above
+    its take-off.
     """
 
     enu_m: np.ndarray
@@ -42,21 +43,21 @@ class Fixes:
     relative: np.ndarray
     origin: GeoOrigin
     has_heights: bool
-    free_heights: bool  # each flight's heights may be off by a constant
+    free_heights: bool  # each flight's heights may have a constant offset
     notes: tuple[str, ...]
 
     @property
     def has_fix(self) -> np.ndarray:
-        """(N,) bool: east and north are known."""
+        """Mask (N,) of frames whose east and north are known."""
         return np.isfinite(self.enu_m[:, :2]).all(axis=1)
 
     @property
     def is_rtk(self) -> np.ndarray:
-        """(N,) bool: the fix is one of differential carrier phase."""
+        """Mask (N,) of carrier-phase differential fixes (RTK, PPK)."""
         return self.sigma_m[:, :2].max(axis=1) < RTK_SIGMA_M
 
     def only(self, mask: np.ndarray) -> Fixes:
-        """The same frames with observations only where the mask (N,) is set."""
+        """Return the same frames without the observations of frames outside the mask (N,)."""
         return replace(
             self,
             enu_m=np.where(mask[:, None], self.enu_m, np.nan),
@@ -72,10 +73,24 @@ def align_telemetry(
     *,
     max_gap_s: float = 2.5,
 ) -> Telemetry:
-    """One row per frame from each flight's own telemetry, interpolated at the frames' times (N,).
+    """Interpolate each flight's telemetry at the times of its frames.
 
-    Where a source states no sigma, that of its kind is filled in, so that flights of different kinds can be
-    fitted together. Frames of a sequence without telemetry have NaN throughout.
+    Parameters
+    ----------
+    telemetry : mapping of str to Telemetry
+        Telemetry by flight.
+    sequence : sequence of str
+        Flight of each of the N frames.
+    time_s : ndarray, shape (N,)
+        Time of each frame within its flight, in seconds.
+    max_gap_s : float
+        Longest gap between records, in seconds, that is interpolated across.
+
+    Returns
+    -------
+    Telemetry
+        One row per frame. If a source states no sigma, the default of its kind is filled in, so that flights
+        with different kinds of telemetry can be fitted together. Rows of a flight without telemetry are NaN.
     """
     time_s = np.asarray(time_s, dtype=np.float64)
     names = np.asarray(sequence)
@@ -106,7 +121,7 @@ def align_telemetry(
 
 
 def _sigma(telemetry: Telemetry, options: GeoregisterOptions) -> np.ndarray:
-    """(N, 3) sigma east, north, up of each fix: the user's, the source's own, or that of its kind."""
+    """Return sigma (N, 3) east, north, up of each fix: the user's, the source's, or its kind's default."""
     if options.gnss_sigma_m is not None:
         horizontal, vertical = options.gnss_sigma_m
         return np.tile([horizontal, horizontal, vertical], (len(telemetry), 1))
@@ -117,7 +132,7 @@ def _sigma(telemetry: Telemetry, options: GeoregisterOptions) -> np.ndarray:
 def _heights(
     telemetry: Telemetry, flight: np.ndarray, n_flights: int, options: GeoregisterOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (N,) as their source gives them, and which flights' (F,) are above take-off."""
+    """Return the source's heights (N,) and a mask (F,) of flights whose heights are above take-off."""
     heights = np.full(len(telemetry), np.nan)
     relative = np.zeros(n_flights, dtype=bool)
     for f in range(n_flights):
@@ -125,7 +140,7 @@ def _heights(
         n_relative = int(np.isfinite(telemetry.rel_alt_m[mine]).sum())
         n_absolute = int(np.isfinite(telemetry.abs_alt_m[mine]).sum())
         if options.heights is Heights.AUTO:
-            # A few heights above take-off are worth less than a full column of absolute ones.
+            # Prefer a full column of absolute heights to a few heights above take-off.
             relative[f] = n_relative > 0 and 2 * n_relative >= n_absolute
         else:
             relative[f] = options.heights is Heights.RELATIVE
@@ -140,13 +155,15 @@ def observe(
     time_s: np.ndarray,
     options: GeoregisterOptions,
 ) -> Fixes:
-    """Fixes of N frames from their rows of telemetry.
+    """Convert the telemetry rows of N frames to observations in a local frame.
 
-    Raises GeometryError where no frame has a fix, or where heights cannot be brought to a kept origin.
+    Raises GeometryError if no frame has a fix, or if the heights cannot be converted to the origin to keep.
     """
     n = len(telemetry)
     if len(sequence) != n or len(time_s) != n:
-        raise ValueError(f"{n} rows of telemetry, {len(sequence)} names and {len(time_s)} times")
+        raise ValueError(
+            f"{n} telemetry rows, {len(sequence)} names and {len(time_s)} times must be equal in number"
+        )
     if not telemetry.has_fix.any():
         raise GeometryError(
             f"none of {n} frames has a fix: georegistration needs telemetry with positions"
@@ -163,22 +180,24 @@ def observe(
     use_relative = bool(relative[with_height].any())
     reference = options.height_reference or telemetry.abs_reference
     origin = options.origin or _new_origin(telemetry, heights, use_relative, reference, options)
-    # Metres between the zero of the heights and the zero of the local frame.
+    # Metres from the zero of the local frame to the zero of the heights.
     zero = _zero_of_heights(origin, use_relative, reference, options) if known.any() else 0.0
     up = heights + zero
     if mixed:
-        # The other kind starts from the same place and is then left free.
+        # Start the other kind at the same median height; its offset is a free parameter afterwards.
         offset = np.nanmedian(up[known & relative[flight]]) - np.nanmedian(
             heights[known & ~relative[flight]]
         )
         up = np.where(relative[flight], up, heights + offset)
     if not known.any():
         notes.append(
-            "No heights are known: the mean camera height is set to 0 and up is not determined."
+            "No heights are known: the mean camera height is set to 0 and the vertical position is "
+            "undetermined."
         )
     elif not use_relative and reference is HeightReference.UNKNOWN:
         notes.append(
-            "Heights are absolute of unknown reference: good for shape, the vertical zero is unknown."
+            "Heights are absolute with an unknown reference: they constrain the shape, but the "
+            "vertical zero is unknown."
         )
     flat = np.where(known, up, 0.0)
     enu = origin.enu_from_wgs84(np.column_stack([telemetry.lat_lon_deg, origin.alt_m + flat]))
@@ -189,8 +208,8 @@ def observe(
         up_cam = np.full_like(up_cam, np.nan)
     time_s = np.asarray(time_s, dtype=np.float64)
     if not np.isfinite(time_s).all():
-        notes.append("Frames without a time share their flight's whole GNSS error.")
-    # Frames without a time: as if at one instant, so that their errors count as one.
+        notes.append("Frames without a time are assumed to share one GNSS error per flight.")
+    # Frames without a time are placed at one instant, so their errors are fully correlated.
     return Fixes(
         enu,
         _sigma(telemetry, options),
@@ -214,9 +233,9 @@ def _new_origin(
     reference: HeightReference,
     options: GeoregisterOptions,
 ) -> GeoOrigin:
-    """The middle of the fixes; zero height at take-off, or at the metre next to the mean absolute height."""
+    """Return an origin at the median of the fixes, at take-off or the rounded median absolute height."""
     lat_lon = telemetry.lat_lon_deg[telemetry.has_fix]
-    # Longitudes on both sides of 180 degrees are averaged where they do not jump.
+    # Longitudes are averaged relative to the first one, to avoid the jump at 180 degrees.
     lon_0 = lat_lon[0, 1]
     lon = lon_0 + np.median((lat_lon[:, 1] - lon_0 + 180) % 360 - 180)
     lat = round(float(np.median(lat_lon[:, 0])), _ORIGIN_DECIMALS)
@@ -237,19 +256,19 @@ def _zero_of_heights(
     reference: HeightReference,
     options: GeoregisterOptions,
 ) -> float:
-    """Up coordinate in metres of height zero."""
+    """Return the up coordinate in metres of height zero."""
     if not use_relative:
         if origin.height_reference is not reference:
             raise GeometryError(
-                f"the area's heights are '{origin.height_reference}', these are '{reference}': "
-                "say what absolute heights refer to, or use heights above take-off"
+                f"the area's height reference is '{origin.height_reference}', that of the telemetry is "
+                f"'{reference}': specify the reference of absolute heights, or use heights above take-off"
             )
         return -origin.alt_m
     if origin.height_reference is HeightReference.TAKEOFF:
         return 0.0
     if options.takeoff_alt_m is None:
         raise GeometryError(
-            f"the area's heights are '{origin.height_reference}' and the flight's are above take-off: "
-            "give the height of the take-off point"
+            f"the area's height reference is '{origin.height_reference}', but the flight's heights are "
+            "above take-off: specify the height of the take-off point"
         )
     return options.takeoff_alt_m - origin.alt_m

@@ -1,4 +1,4 @@
-"""The offset between a flight's telemetry and its video, from the model's own motion."""
+"""Time offset between a flight's telemetry and its video, estimated from the camera motion in the model."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotation
 from spn_data.georegistration.fit import covariance_of
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import (
-    Linear,
-    improve_levels,
+    LinearSystem,
     robust_cost,
     robust_weights,
     solve,
+    update_levels,
 )
 from spn_data.georegistration.observe import Fixes, observe
 from spn_data.georegistration.problem import FitState, Kind, Problem
@@ -24,29 +24,50 @@ from spn_data.telemetry.track import Telemetry
 _MIN_FRAMES = 12
 _ROUNDS = 20
 _STARTS = 4
-_NO_OFFSET_M = 1e-4  # a flight alone has no vertical offset to another
-_WEAK_PRECISION = 1e-4  # of the time offset: keeps the equations solvable where nothing tells it
-# Two offsets whose costs differ by less than this are both possible (nine is three sigma).
+_NO_OFFSET_M = 1e-4  # sigma that fixes the vertical offset, which a single flight does not have
+_WEAK_PRECISION = (
+    1e-4  # of the time offset: keeps the normal equations regular if it is undetermined
+)
+# Two offsets are ambiguous if their costs differ by less than this (9 is three sigma).
 _AMBIGUOUS_COST = 9.0
 _LARGE_SIGMAS = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetOptions:
-    """Where an offset is looked for, and when it counts as found."""
+    """Search range and acceptance limits of the time offset.
+
+    Attributes
+    ----------
+    max_offset_s : float
+        Search range, on both sides of zero.
+    max_sigma_s : float
+        An offset with a larger sigma is undetermined.
+    large_sigma_s : float
+        Limit used instead of `max_sigma_s` for an offset more than eight sigma from zero, for which an
+        uncertain correction is better than none.
+    step_s : float
+        Step of the grid search.
+    """
 
     max_offset_s: float = 5.0
-    max_sigma_s: float = 0.1  # an offset known worse than this is called undetermined,
-    large_sigma_s: float = 0.3  # or than this where it is eight sigma from zero: better than none
-    step_s: float = 0.1  # of the first search
+    max_sigma_s: float = 0.1
+    large_sigma_s: float = 0.3
+    step_s: float = 0.1
 
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """What has to be added to telemetry's times to get the video's (`Telemetry.shifted`).
+    """Offset to add to telemetry times to obtain video times (see `Telemetry.shifted`).
 
-    offset_s : None where the flight cannot tell; sigma_s : infinite where nothing was estimated;
-    reason : why it is undetermined, empty where it is not.
+    Attributes
+    ----------
+    offset_s : float or None
+        Offset in seconds, None if undetermined.
+    sigma_s : float
+        Its sigma in seconds, infinite if nothing was estimated.
+    reason : str
+        Why the offset is undetermined; empty if it is determined.
     """
 
     offset_s: float | None
@@ -55,11 +76,11 @@ class TimeOffset:
 
     @property
     def applied_s(self) -> float:
-        """The offset, or zero where it is undetermined."""
+        """The offset in seconds, or zero if undetermined."""
         return 0.0 if self.offset_s is None else self.offset_s
 
-    def tell(self, name: str) -> str:
-        """One sentence for the user."""
+    def describe(self, name: str) -> str:
+        """Return a sentence on the offset of flight `name` for the user."""
         if self.offset_s is None:
             return (
                 f"{name}: time offset of the telemetry undetermined ({self.reason}); 0 s is used."
@@ -74,55 +95,76 @@ def estimate_time_offset(
     options: GeoregisterOptions | None = None,
     search: OffsetOptions | None = None,
 ) -> TimeOffset:
-    """The offset of one flight, from poses of its frames (N), their times (N,) and its telemetry as read.
+    """Estimate the time offset between the telemetry and the video of one flight.
 
-    Positions and, where known, gimbal angles are fitted together with the offset as one more unknown, under
-    errors that are correlated in time: what a drifting GNSS bias could as well explain does not count as
-    information. The result is undetermined where that leaves more than `max_sigma_s`, and where two offsets
-    fit alike. Offsets of up to a quarter of the flight are looked for.
+    Parameters
+    ----------
+    model : Poses
+        Poses of the flight's N frames in the model.
+    time_s : ndarray, shape (N,)
+        Times of the frames in seconds.
+    telemetry : Telemetry
+        The flight's telemetry as read, not yet interpolated.
+    options : GeoregisterOptions, optional
+        Noise model of the observations.
+    search : OffsetOptions, optional
+        Search range and acceptance limits.
+
+    Returns
+    -------
+    TimeOffset
+        Undetermined if its sigma exceeds the limit in `search`, or if two offsets fit equally well.
+
+    Notes ----- Positions and, if known, gimbal angles are fitted with the offset as an additional unknown,
+    under errors correlated in time. Motion that a drifting GNSS bias could also explain therefore carries no
+    information on the offset. The search range is at most a quarter of the flight's duration.
     """
     options = options or GeoregisterOptions()
     search = search or OffsetOptions()
     order = np.argsort(time_s, kind="stable")
     model, time_s = model[order], np.asarray(time_s, dtype=np.float64)[order]
     if len(model) < _MIN_FRAMES or not telemetry.has_fix.any():
-        return _undetermined(f"{len(model)} frames, {int(telemetry.has_fix.sum())} fixes")
+        return _undetermined(
+            f"{len(model)} frames and {int(telemetry.has_fix.sum())} fixes are too few"
+        )
     window_s = min(search.max_offset_s, float(time_s[-1] - time_s[0]) / 4)
     if window_s < search.step_s:
-        return _undetermined(f"the flight lasts {time_s[-1] - time_s[0]:.1f} s")
+        return _undetermined(f"the flight lasts only {time_s[-1] - time_s[0]:.1f} s")
     origin = observe(telemetry, [""] * len(telemetry), telemetry.time_s, options).origin
     flight = _Flight(model, time_s, telemetry, replace(options, origin=origin, same_takeoff=True))
     steps = int(window_s / search.step_s)
     grid = np.arange(-steps, steps + 1) * search.step_s
     flight = flight.only(flight.known_at(grid))
     if len(flight.time_s) < _MIN_FRAMES:
-        return _undetermined(f"{len(flight.time_s)} frames have a fix at all offsets")
+        return _undetermined(f"only {len(flight.time_s)} frames have a fix at all offsets")
     try:
-        rough = [flight.rough(offset_s) for offset_s in grid]
+        coarse = [flight.coarse_fit(offset_s) for offset_s in grid]
     except GeometryError as error:
         return _undetermined(str(error))
-    cost = np.array([r[0] for r in rough])
+    cost = np.array([c[0] for c in coarse])
     padded = np.concatenate([[np.inf], cost, [np.inf]])
     minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
     minima = minima[np.argsort(cost[minima], kind="stable")][:_STARTS]
     limit_s = window_s + search.step_s
-    refined = [flight.refine(rough[k][1], float(grid[k]), limit_s) for k in minima]
-    found = [f for f in refined if f is not None]
-    if not found:
-        return _undetermined(f"the best one lies outside {window_s:.1f} s")
-    best = min(found, key=lambda f: f.cost)
+    refined = [flight.refine(coarse[k][1], float(grid[k]), limit_s) for k in minima]
+    candidates = [candidate for candidate in refined if candidate is not None]
+    if not candidates:
+        return _undetermined(f"the best offset is outside the search range of {window_s:.1f} s")
+    best = min(candidates, key=lambda candidate: candidate.cost)
     large = abs(best.offset_s) > _LARGE_SIGMAS * best.sigma_s
     if best.sigma_s > (search.large_sigma_s if large else search.max_sigma_s):
         return TimeOffset(
-            None, best.sigma_s, "the flight's motion is too even, or too small against its errors"
+            None,
+            best.sigma_s,
+            "the flight's motion is too uniform, or too small compared with its errors",
         )
-    for other in found:
+    for other in candidates:
         far = abs(other.offset_s - best.offset_s) > 5 * best.sigma_s + search.step_s
         if far and other.cost - best.cost < _AMBIGUOUS_COST:
             return TimeOffset(
                 None,
                 best.sigma_s,
-                f"{best.offset_s:+.2f} s and {other.offset_s:+.2f} s fit alike",
+                f"{best.offset_s:+.2f} s and {other.offset_s:+.2f} s fit equally well",
             )
     return TimeOffset(best.offset_s, best.sigma_s)
 
@@ -132,7 +174,7 @@ def _undetermined(reason: str) -> TimeOffset:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Candidate:
     offset_s: float
     sigma_s: float
     cost: float
@@ -140,7 +182,7 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Flight:
-    """One flight's frames in the order of time, and its telemetry."""
+    """One flight's frames, sorted by time, and its telemetry."""
 
     model: Poses
     time_s: np.ndarray
@@ -151,7 +193,7 @@ class _Flight:
         return replace(self, model=self.model[mask], time_s=self.time_s[mask])
 
     def fixes(self, offset_s: float) -> Fixes:
-        """Observations of the frames under an offset, the gimbal's heading among them."""
+        """Return the frames' observations for a given offset, including the gimbal's heading."""
         rows = self.telemetry.shifted(offset_s).at(self.time_s)
         fixes = observe(rows, [""] * len(rows), self.time_s, self.options)
         if not self.options.use_gimbal:
@@ -159,7 +201,7 @@ class _Flight:
         return replace(fixes, attitude=rotations_from_angles(rows.gimbal_deg))
 
     def known_at(self, grid: np.ndarray) -> np.ndarray:
-        """(N,) bool: the frame has a fix, and gimbal angles where the flight has any, at all offsets."""
+        """Return a mask (N,) of frames with a fix (and gimbal angles, if mostly available) at all offsets."""
         known = np.ones(len(self.time_s), dtype=bool)
         gimbal = known.copy()
         for offset_s in grid[:: max(1, len(grid) // 20)]:
@@ -172,8 +214,8 @@ class _Flight:
         centers = self.model.centers - self.model.centers.mean(axis=0)
         return centers / np.sqrt((centers**2).sum(axis=1).mean())
 
-    def rough(self, offset_s: float) -> tuple[float, Similarity]:
-        """Robust cost of an offset and the similarity that goes with it, quickly."""
+    def coarse_fit(self, offset_s: float) -> tuple[float, Similarity]:
+        """Return the approximate robust cost of an offset and the corresponding similarity."""
         fixes, centers = self.fixes(offset_s), self._centred()
         rotations = self.model.rotations
         gimbal = np.isfinite(fixes.attitude).all(axis=(1, 2))
@@ -197,24 +239,24 @@ class _Flight:
             weights = 1 / (1 + square)
         return cost + float(np.log1p(square).sum()), similarity
 
-    def refine(self, similarity: Similarity, offset_s: float, limit_s: float) -> _Found | None:
-        """Similarity, biases and offset together, from a rough start; None where it runs off."""
+    def refine(self, similarity: Similarity, offset_s: float, limit_s: float) -> _Candidate | None:
+        """Refine similarity, biases and offset jointly from a coarse fit; None if it leaves the range."""
         centers, rotations = self._centred(), self.model.rotations
         level = np.zeros(len(centers), dtype=bool)
         problem = Problem.build(centers, rotations, self.fixes(offset_s), level, self.options)
-        state = replace(problem.start(similarity, ~level), offsets_m=np.zeros(1))
-        levels = problem.levels()
-        # By kind and frame: which observations there are changes with the offset.
+        state = replace(problem.initial_state(similarity, ~level), offsets_m=np.zeros(1))
+        levels = problem.prior_levels()
+        # Indexed by kind and frame, because the set of observations changes with the offset.
         weight = np.ones((len(Kind), len(centers)))
         for k in range(_ROUNDS):
             linear = self._linear(problem, state)
             weights = weight[problem.kind, problem.frame]
             if k >= 4:
-                levels = improve_levels(problem.chains, levels, weights, linear)
+                levels = update_levels(problem.chains, levels, weights, linear)
             solution = solve(problem.chains, levels, weights, linear)
             weights, _ = robust_weights(problem.chains, levels, solution.white)
             weight[problem.kind, problem.frame] = weights
-            state = state.moved(solution.step[:-1])
+            state = state.updated(solution.step[:-1])
             offset_s += float(np.clip(solution.step[-1], -1.0, 1.0))
             if not abs(offset_s) <= limit_s:
                 return None
@@ -222,26 +264,27 @@ class _Flight:
         linear = self._linear(problem, state)
         weights = weight[problem.kind, problem.frame]
         cost = robust_cost(problem.chains, levels, linear.residual, weights)
-        careful = solve(problem.chains, problem.conservative(levels), weights, linear)
-        return _Found(offset_s, float(np.sqrt(covariance_of(careful.information)[-1, -1])), cost)
+        solution = solve(problem.chains, problem.conservative_levels(levels), weights, linear)
+        sigma_s = float(np.sqrt(covariance_of(solution.information)[-1, -1]))
+        return _Candidate(offset_s, sigma_s, cost)
 
-    def _linear(self, problem: Problem, state: FitState) -> Linear:
-        """The fit's linear problem with the offset as its last parameter."""
+    def _linear(self, problem: Problem, state: FitState) -> LinearSystem:
+        """Return the linearised fit with the time offset as the last parameter."""
         linear = problem.linearise(state, np.full(1, _NO_OFFSET_M), np.ones(1))
-        return Linear(
+        return LinearSystem(
             linear.residual,
-            np.column_stack([linear.jacobian, -self._rate(problem, state)]),
+            np.column_stack([linear.jacobian, -self._residual_rates(problem, state)]),
             np.append(linear.prior_precision, _WEAK_PRECISION),
             np.append(linear.value, 0.0),
         )
 
-    def _rate(self, problem: Problem, state: FitState) -> np.ndarray:
-        """(M,) change of each residual by a second of offset, by the model's motion between its neighbours.
+    def _residual_rates(self, problem: Problem, state: FitState) -> np.ndarray:
+        """Return the change (M,) of each residual per second of offset, by finite differences of the model.
 
-        Not by the telemetry's own: its noise would pass for motion.
+        The telemetry is not used for this, because its noise would be taken for motion.
         """
         n = len(self.time_s)
-        # Two frames to each side: noise of the model, too, passes for motion, the less the wider the step.
+        # Differences over two frames to each side reduce the effect of the model's noise.
         after, before = np.minimum(np.arange(n) + 2, n - 1), np.maximum(np.arange(n) - 2, 0)
         moved = []
         for index in (after, before):
@@ -256,7 +299,7 @@ class _Flight:
 
 
 def _mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Robust mean (3, 3) of rotations (N, 3, 3) and their angles (N,) in degrees from it."""
+    """Return the robust mean (3, 3) of rotations (N, 3, 3) and their angles (N,) in degrees from it."""
     weights = np.ones(len(rotations))
     for _ in range(8):
         u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))
@@ -269,10 +312,10 @@ def _mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _scale_and_shift(
     turned: np.ndarray, rotation: np.ndarray, enu: np.ndarray, weights: np.ndarray
 ) -> Similarity:
-    """Weighted least-squares scale and translation where the rotation is known."""
+    """Fit scale and translation to a known rotation by weighted least squares."""
     w = weights / weights.sum()
     a, b = turned - w @ turned, enu - w @ enu
     scale = float((w @ (a * b).sum(axis=1)) / (w @ (a * a).sum(axis=1)))
-    # A start that mirrors the flight is none: the offset is far off.
+    # A negative scale would mirror the flight; it occurs if the offset is far off.
     scale = max(scale, 1e-3 * float(np.sqrt((b * b).sum() / (a * a).sum())))
     return Similarity(scale, rotation, w @ enu - scale * w @ turned)

@@ -1,4 +1,4 @@
-"""The observations of georegistration as residuals of a similarity, linearised."""
+"""Residuals and Jacobian of the georegistration: all observations as functions of a similarity."""
 
 from __future__ import annotations
 
@@ -9,31 +9,33 @@ import numpy as np
 
 from spn_data.geometry.pose import Similarity, quats_from_rotations, rotations_from_vectors
 from spn_data.georegistration.georegister_options import GeoregisterOptions
-from spn_data.georegistration.noise import Chains, Levels, Linear
+from spn_data.georegistration.noise import Chains, LinearSystem, NoiseLevels
 from spn_data.georegistration.observe import Fixes
 
 SHARED = 7  # parameters: centre (3), rotation vector in the world (3), logarithm of scale
-_FREE_HEIGHT_M = 1e3  # sigma of a height that nothing is known of
-# Of rotation and scale about their present values: pulls nowhere, keeps a straight line's equations solvable.
+_FREE_HEIGHT_M = 1e3  # sigma of an unknown height
+# Prior on rotation and scale about their current values. It introduces no bias, and keeps the normal
+# equations of a straight line regular.
 _WEAK_PRECISION = 1e-2
 
 
 class Kind(IntEnum):
-    """What an observation is of; the first axis of residuals."""
+    """Kind of an observation; index along the first axis of the residuals."""
 
     EAST = 0
     NORTH = 1
     UP = 2
-    PITCH = 3  # rotation in degrees about the image's right
-    ROLL = 4  # about what is across both that and up
-    LEVEL = 5  # of the image's right above the horizon
+    PITCH = 3  # rotation in degrees about the image's x axis (right)
+    ROLL = 4  # rotation in degrees about the axis orthogonal to that and to up
+    LEVEL = 5  # elevation in degrees of the image's x axis above the horizon
     HEADING = 6  # rotation in degrees about up
 
 
-# Noise levels: (bias, spread of its logarithm, white, spread of its logarithm), in the observation's sigma.
-# Consumer GNSS: nearly all of the stated sigma is slow bias, and its short-term noise a tenth to a half.
-# Differential fixes: mostly white. Gimbal, in degrees: drift beside the flight's constant bias, and noise.
-_TABLE = [
+# Prior noise levels: (bias, spread of its logarithm, white, spread of its logarithm), in the observation's
+# sigma. Consumer GNSS: nearly all of the stated sigma is a slow bias; short-term noise is a tenth to a half
+# of it. Differential fixes: mostly white. Gimbal, in degrees: drift in addition to the constant bias, and
+# noise.
+_NOISE_PRIOR = [
     (0.97, 0.4, 0.1, 1.0),  # horizontal
     (0.97, 0.4, 0.1, 1.0),  # vertical
     (0.4, 1.0, 0.8, 0.6),  # horizontal, differential
@@ -43,16 +45,17 @@ _TABLE = [
     (5.0, 0.0, 0.2, 0.8),  # heading of the gimbal, in degrees
 ]
 _HORIZONTAL, _VERTICAL, _RTK, _GIMBAL, _LEVEL, _HEADING = 0, 1, 2, 4, 5, 6
-# A compass is off by degrees for as long as a flight lasts, and changes slowly.
+# The error of a compass is several degrees over a whole flight and changes slowly.
 _HEADING_TIME_S = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
 class FitState:
-    """Current values: ``x_world = scale * rotation @ x_model + center`` on centred model coordinates.
+    """Current parameters: ``x_world = scale * rotation @ x_model + center`` in centred model coordinates.
 
-    offsets_m : (F,) height of each flight's zero above the first's; gimbal_deg : (F, 3) constant error
-    of each flight's gimbal about the camera's axes; level_deg : (F,) mean roll where no gimbal angles are.
+    offsets_m : (F,) height of each flight's zero above the first flight's; gimbal_deg : (F, 3) constant
+    gimbal error of each flight about the camera's axes; level_deg : (F,) mean roll of frames without gimbal
+    angles.
     """
 
     rotation: np.ndarray
@@ -62,8 +65,8 @@ class FitState:
     gimbal_deg: np.ndarray
     level_deg: np.ndarray
 
-    def moved(self, step: np.ndarray) -> FitState:
-        """After a step (P,) of all parameters."""
+    def updated(self, step: np.ndarray) -> FitState:
+        """Apply a step (P,) of all parameters."""
         f = len(self.offsets_m)
         return FitState(
             rotations_from_vectors(step[3:6]) @ self.rotation,
@@ -76,16 +79,17 @@ class FitState:
 
     @property
     def nuisance(self) -> np.ndarray:
-        """(5 F,) parameters beside the similarity."""
+        """Parameters (5 F,) other than the similarity."""
         return np.concatenate([self.offsets_m, self.gimbal_deg.ravel(), self.level_deg])
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Frames, what was observed of them, and which observation has which noise.
+    """Frames, their observations, and the noise model of each observation.
 
-    model : (N, 3) camera centres, centred and of unit size; cam_from_model : (N, 3, 3);
-    kind, frame : (M,) what each observation is, in the order of `chains`.
+    model : (N, 3) camera centres, centred and scaled to unit size; cam_from_model : (N, 3, 3); use_level :
+    (N,) bool, frames whose roll is observed as zero; kind, frame : (M,) kind and frame index of each
+    observation, in the order of `chains`.
     """
 
     model: np.ndarray
@@ -106,7 +110,7 @@ class Problem:
         use_level: np.ndarray,
         options: GeoregisterOptions,
     ) -> Problem:
-        """From centred model coordinates; use_level (N,) bool: frames whose roll is taken as about zero."""
+        """Collect the observations; see the class for the arguments."""
         gimbal = np.isfinite(fixes.up_cam).all(axis=1)
         heading = np.isfinite(fixes.attitude).all(axis=(1, 2))
         present = np.stack([*np.isfinite(fixes.enu_m).T, gimbal, gimbal, use_level, heading])
@@ -120,7 +124,7 @@ class Problem:
         group = np.where(kind == Kind.LEVEL, _LEVEL, group)
         group = np.where(kind == Kind.HEADING, _HEADING, group)
         chain = (kind * len(fixes.flights) + fixes.flight[frame]) * 2 + (rtk & (kind <= Kind.UP))
-        # East and north, and the gimbal's two angles, are outliers together; a height on its own.
+        # East and north are outliers together, as are the two gimbal angles; a height is one on its own.
         twin = np.array([0, 0, 1, 2, 2, 3, 4])[kind] * len(model) + frame
         tau = np.where(kind == Kind.HEADING, _HEADING_TIME_S, options.correlation_time_s)
         chains, order = Chains.build(chain, fixes.time_s[frame], tau, group, unit, twin)
@@ -128,18 +132,21 @@ class Problem:
             model, cam_from_model, fixes, use_level, options, chains, kind[order], frame[order]
         )
 
-    def levels(self) -> Levels:
-        """Noise levels before the data."""
-        return Levels.from_table(_TABLE)
+    def prior_levels(self) -> NoiseLevels:
+        """Return the prior noise levels."""
+        return NoiseLevels.from_table(_NOISE_PRIOR)
 
-    def conservative(self, levels: Levels) -> Levels:
-        """Levels for deciding what the data determine: fixes may agree by luck or by filtering."""
+    def conservative_levels(self, levels: NoiseLevels) -> NoiseLevels:
+        """Apply lower limits to noise levels, for deciding which parameters the data determine.
+
+        Without them, fixes that agree by chance or because they were filtered would look too accurate.
+        """
         floor_bias = np.array([0.5, 0.5, 0.2, 0.2, 0.0, 0.0, 0.0])
         floor_white = np.array([0.3, 0.3, 0.7, 0.7, 0.2, 0.0, 0.2])
         return levels.at_least(floor_bias, floor_white)
 
-    def start(self, world_from_model: Similarity, inlier: np.ndarray) -> FitState:
-        """State of a first similarity; vertical offsets from its inliers' (N,) median heights."""
+    def initial_state(self, world_from_model: Similarity, inlier: np.ndarray) -> FitState:
+        """Return the state of an initial similarity; vertical offsets are medians over its inliers (N,)."""
         f = len(self.fixes.flights)
         offsets = np.zeros(f)
         up = world_from_model.apply(self.model)[:, 2] - self.fixes.enu_m[:, 2]
@@ -158,13 +165,13 @@ class Problem:
 
     def linearise(
         self, state: FitState, offset_sigma_m: np.ndarray, bias_weight: np.ndarray
-    ) -> Linear:
-        """Residuals and Jacobian at a state.
+    ) -> LinearSystem:
+        """Linearise all observations at a state.
 
-        offset_sigma_m : (F,) of the vertical offsets about zero; bias_weight : (F,) robust weights of the
-        flights' gimbal biases.
+        offset_sigma_m : (F,) prior sigma of the vertical offsets about zero; bias_weight : (F,) robust
+        weights of the flights' gimbal biases.
         """
-        residual, jacobian = self._all_rows(state)
+        residual, jacobian = self._dense_residuals(state)
         f = len(self.fixes.flights)
         bias = np.sqrt(1 / bias_weight) * self.options.gimbal_bias_deg
         precision = np.concatenate(
@@ -179,10 +186,10 @@ class Problem:
         if not self.fixes.has_heights:
             precision[2], value[2] = 1 / _FREE_HEIGHT_M**2, state.center[2]
         rows = self.kind, self.frame
-        return Linear(residual[rows], jacobian[rows], precision, value)
+        return LinearSystem(residual[rows], jacobian[rows], precision, value)
 
-    def _all_rows(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (7, N) and their Jacobian (7, N, P), NaN where nothing was observed."""
+    def _dense_residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (7, N) and their Jacobian (7, N, P); NaN for missing observations."""
         n, f = len(self.model), len(self.fixes.flights)
         flight, every = self.fixes.flight, np.arange(n)
         residual: np.ndarray = np.full((len(Kind), n), np.nan)
@@ -202,7 +209,7 @@ class Problem:
 
         cam_from_world = self.cam_from_model @ state.rotation.T
         up = cam_from_world[:, :, 2]
-        # Rotation in degrees, about the camera's axes, from where up is to where the gimbal has it.
+        # Rotation in degrees, about the camera's axes, from the model's up to the gimbal's up.
         cross = np.cross(up, self.fixes.up_cam)
         sine = np.linalg.norm(cross, axis=1)
         cosine = np.einsum("ni,ni->n", up, self.fixes.up_cam)
@@ -227,13 +234,13 @@ class Problem:
         return residual, jacobian
 
     def residuals(self, state: FitState) -> np.ndarray:
-        """(7, N) residuals of all kinds; NaN where nothing was observed."""
-        residual = self._all_rows(state)[0]
+        """Return the residuals (7, N) of all kinds; NaN for missing observations."""
+        residual = self._dense_residuals(state)[0]
         residual[Kind.LEVEL] = np.where(self.use_level, residual[Kind.LEVEL], np.nan)
         return residual
 
     def without_level(self) -> Problem:
-        """The same problem on measurements alone."""
+        """Return the problem without the level-camera assumption, using measurements only."""
         return self.build(
             self.model,
             self.cam_from_model,
@@ -243,7 +250,7 @@ class Problem:
         )
 
     def on_frames(self, mask: np.ndarray) -> Problem:
-        """The same problem on the observations of some frames (N,) bool."""
+        """Return the problem restricted to observations of the frames in a mask (N,)."""
         return self.build(
             self.model,
             self.cam_from_model,
@@ -254,8 +261,8 @@ class Problem:
 
 
 def _tilt_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit axes (N, 3) across the directions of up (N, 3) in camera axes: pitch's and roll's."""
-    # A camera on its side has up along its x axis: z then takes its place.
+    """Return the pitch and roll axes (N, 3 each), unit and orthogonal to up (N, 3), in camera axes."""
+    # If the camera is rolled onto its side, up is along its x axis, so the z axis is used instead.
     sideways = np.abs(up[:, :1]) > 0.9
     axis = np.where(sideways, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = axis - np.einsum("ni,ni->n", axis, up)[:, None] * up
@@ -264,11 +271,11 @@ def _tilt_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turn_about_up_deg(attitude: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-    """Degrees (N,) about up by which the world would have to turn for cam_from_world to be the attitude."""
+    """Return the world's rotation (N,) about up, in degrees, that aligns cam_from_world with the attitude."""
     known = np.isfinite(attitude).all(axis=(1, 2))
     turn = np.full(len(attitude), np.nan)
     quats = quats_from_rotations(attitude[known].transpose(0, 2, 1) @ cam_from_world[known])
-    # The twist about z of a rotation that may tilt a little too.
+    # Twist about z of a rotation that may also contain a small tilt.
     angle = np.rad2deg(2 * np.arctan2(quats[:, 3], quats[:, 0]))
     turn[known] = (angle + 180.0) % 360.0 - 180.0
     return turn

@@ -1,4 +1,4 @@
-"""What a georegistration hands on, and its form in geo.json."""
+"""Result of a georegistration, and its JSON form (geo.json)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class FitSummary:
-    """Figures of a georegistration; lengths in metres.
+    """Summary statistics of a georegistration, in metres.
 
-    Root mean squares are over inliers; CE90 and LE90, the radius and height that hold nine of ten residuals,
-    over all fixes.
+    RMSE are over inliers. CE90 and LE90 (radius and height that contain 90 % of the residuals) are over all
+    fixes.
     """
 
     frames: int
@@ -39,16 +39,37 @@ class FitSummary:
 
 @dataclass(frozen=True, eq=False)
 class GeoFit:
-    """A model's place in the world.
+    """Georegistration of a model.
 
-    world_from_model : metres East-North-Up at `origin` from the model's gauge.
-    vertical_offsets_m : by flight, what its heights lack to be up coordinates; for heights above take-off,
-        the height of its take-off point above the zero (the first flight's, where theirs differ).
-    residuals_m : (N, 3) fix minus fitted centre, east north up; NaN where unknown.
-    outlier : (N,) bool; gravity_deg : (N, 2) gimbal minus fit, about the image's right and about the view.
-    gimbal_bias_deg : by flight, constant error of the gimbal about the camera's x, y, z axes.
-    noise_m : by kind of fix, (bias, white) sigma that the data showed.
-    observations : which kinds were used: "fixes", "heights", "gimbal", "level cameras".
+    Attributes
+    ----------
+    world_from_model : Similarity
+        From the model's gauge to East-North-Up metres at `origin`.
+    origin : GeoOrigin
+        Origin of the world.
+    vertical_offsets_m : dict of str to float
+        By flight: what to add to its heights to obtain up coordinates. For heights above take-off this is the
+        height of the take-off point above the zero (the first flight's, if the take-offs differ).
+    residuals_m : ndarray, shape (N, 3)
+        Fix minus fitted centre, east, north, up; NaN if unknown.
+    outlier : ndarray of bool, shape (N,)
+        Frames whose fix is an outlier.
+    gravity_deg : ndarray, shape (N, 2)
+        Gimbal minus fit, about the image's x axis (right) and about the viewing direction.
+    gimbal_bias_deg : dict of str to tuple of float
+        By flight: constant gimbal error about the camera's x, y, z axes.
+    noise_m : dict of str to tuple of float
+        By kind of fix: estimated sigma of (bias, white noise).
+    uncertainty : Uncertainty
+        Uncertainty of the georegistration.
+    held_out_blocks, held_out_flights : HeldOut
+        Cross-validation by time block and by flight.
+    summary : FitSummary
+        Summary statistics.
+    observations : tuple of str
+        Kinds of observations used: "fixes", "heights", "gimbal", "level cameras".
+    notes : tuple of str
+        Sentences for the user.
     """
 
     world_from_model: Similarity
@@ -68,11 +89,14 @@ class GeoFit:
 
     @property
     def height_reference(self) -> HeightReference:
-        """What the origin's height is above."""
+        """Reference surface of the origin's height."""
         return self.origin.height_reference
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for json.dumps; NaN and infinity as null. Fields as in docs/georegistration.md."""
+        """Convert to plain values for json.dumps; NaN and infinity become null.
+
+        The fields are described in docs/georegistration.md.
+        """
         uncertainty = self.uncertainty
         value = {
             "version": VERSION,
@@ -107,11 +131,14 @@ class GeoFit:
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> GeoFit:
-        """From what to_json gave. Raises FormatError for a newer version or a missing field."""
+        """Restore from the output of `to_json`.
+
+        Raises FormatError for another version, or for missing or malformed fields.
+        """
         version = value.get("version")
         if version != VERSION:
             raise FormatError(
-                f"georegistration of version {version!r}, this program reads {VERSION}"
+                f"georegistration has format version {version!r}; this program reads version {VERSION}"
             )
         try:
             origin, similarity = value["origin"], value["world_from_model"]

@@ -1,4 +1,4 @@
-"""How far a georegistration is to be trusted, and how far it is from a known truth."""
+"""Uncertainty of a georegistration, and its errors against ground truth."""
 
 from __future__ import annotations
 
@@ -11,18 +11,35 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Similarity, rotation_vectors
 from spn_data.georegistration.fit import Estimate, covariance_of
 from spn_data.georegistration.georegister_options import GeoregisterOptions
-from spn_data.georegistration.noise import inverse_times, solve
+from spn_data.georegistration.noise import apply_inverse_covariance, solve
 from spn_data.georegistration.problem import Kind, Problem
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Twice each value contains the truth in 95 % of cases, if the errors are as assumed.
+    """Standard uncertainties; twice each value contains the truth in 95 % of cases.
 
-    horizontal_m : of the area's middle, radius; vertical_m : of its height, infinite where no heights
-    are known; tilt_deg : of the vertical, in any direction; heading_deg : about the vertical; scale :
-    relative; covariance : (7, 7) of the middle (east, north, up in metres), the world's rotation vector
-    (radians) and the logarithm of scale; middle_m : (3,) where the middle lies.
+    Attributes
+    ----------
+    horizontal_m : float
+        Radius, at the middle of the area.
+    vertical_m : float
+        Height, at the middle of the area; infinite if no heights are known.
+    tilt_deg : float
+        Tilt of the vertical, in any direction.
+    heading_deg : float
+        Rotation about the vertical.
+    scale : float
+        Relative error of scale.
+    covariance : ndarray, shape (7, 7)
+        Of the middle (east, north, up in metres), the world's rotation vector (radians) and the logarithm of
+        scale.
+    middle_m : ndarray, shape (3,)
+        Position of the middle of the area in the world.
+
+    Notes
+    -----
+    The 95 % hold if the errors follow the noise model of the fit.
     """
 
     horizontal_m: float
@@ -35,6 +52,7 @@ class Uncertainty:
 
     @classmethod
     def from_covariance(cls, covariance: np.ndarray, middle_m: np.ndarray) -> Uncertainty:
+        """Derive the values from the covariance (7, 7) at the middle (3,)."""
         sigma = np.sqrt(np.diag(covariance))
         return cls(
             radius_sigma(covariance[:2, :2]),
@@ -46,8 +64,8 @@ class Uncertainty:
             middle_m,
         )
 
-    def of_points(self, points_m: np.ndarray) -> np.ndarray:
-        """Covariances (N, 3, 3) of the places of points (N, 3) of the world by the georegistration alone."""
+    def point_covariance(self, points_m: np.ndarray) -> np.ndarray:
+        """Propagate the covariance to world points (N, 3); return (N, 3, 3), due to georegistration alone."""
         lever = np.asarray(points_m) - self.middle_m
         jacobian = np.zeros((len(lever), 3, 7))
         jacobian[:, :, :3] = np.eye(3)
@@ -60,25 +78,25 @@ class Uncertainty:
 
 
 def radius_sigma(covariance: np.ndarray) -> float:
-    """Half of the radius that contains a centred normal vector (K,) in 95 % of cases.
+    """Return half of the radius that contains a zero-mean normal vector (K,) in 95 % of cases.
 
-    Satterthwaite's scaled chi-square, which is exact on a line and for a round distribution.
+    Uses Satterthwaite's scaled chi-square, which is exact in one dimension and for an isotropic distribution.
     """
     values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     if values.sum() == 0:
         return 0.0
     freedom = values.sum() ** 2 / (values**2).sum()
-    # 0.9545 is within two sigma in one dimension.
+    # 0.9545 is the probability within two sigma in one dimension.
     square = 2 * gammaincinv(freedom / 2, 0.9544997361) * values.sum() / freedom
     return float(np.sqrt(square) / 2)
 
 
 def require_determined(problem: Problem, result: Estimate, options: GeoregisterOptions) -> None:
-    """Raise GeometryError where fixes and gimbal angles alone leave a direction or the scale open."""
+    """Raise GeometryError if fixes and gimbal angles alone leave tilt, heading or scale undetermined."""
     data = problem.without_level()
     linear = data.linearise(result.state, result.offset_sigma_m, result.bias_weight)
     weights = _weights_of(data, problem, result)
-    solution = solve(data.chains, problem.conservative(result.levels), weights, linear)
+    solution = solve(data.chains, problem.conservative_levels(result.levels), weights, linear)
     information = solution.information
     covariance = covariance_of(information + np.diag(np.diag(information)) * 1e-12)[:7, :7]
     values, axes = np.linalg.eigh(covariance[3:5, 3:5])
@@ -87,20 +105,20 @@ def require_determined(problem: Problem, result: Estimate, options: GeoregisterO
     scale = float(np.sqrt(covariance[6, 6]))
     if scale > options.max_scale_sigma:
         raise GeometryError(
-            f"the scale is known to {_percent(scale)} only: the flight's extent is too small against the "
-            "noise of its fixes; fly further across the area"
+            f"the scale is known only to {_percent(scale)}: the extent of the flight is too small compared "
+            "with the noise of its fixes; fly further across the area"
         )
     if tilt > options.max_tilt_sigma_deg:
         east, north = axes[:, -1]
         azimuth = np.rad2deg(np.arctan2(east, north)) % 180
         raise GeometryError(
-            f"the tilt about the line of azimuth {azimuth:.0f} deg is known to {_degrees(tilt)} only "
+            f"the tilt about the line of azimuth {azimuth:.0f} deg is known only to {_degrees(tilt)} "
             f"(limit {options.max_tilt_sigma_deg:g}): fly a cross leg of at least 20 m, "
             "or give gimbal angles"
         )
     if heading > options.max_heading_sigma_deg:
         raise GeometryError(
-            f"the heading is known to {_degrees(heading)} only: fly a horizontal leg of at least 20 m"
+            f"the heading is known only to {_degrees(heading)}: fly a horizontal leg of at least 20 m"
         )
 
 
@@ -113,19 +131,19 @@ def _degrees(angle: float) -> str:
 
 
 def _weights_of(part: Problem, problem: Problem, result: Estimate) -> np.ndarray:
-    """The weights of a problem's observations, in the order of another's that holds a part of them."""
+    """Return the result's weights in the order of `part`, a problem with a subset of the observations."""
     table = np.ones((len(Kind), len(problem.model)))
     table[problem.kind, problem.frame] = result.weights
     return table[part.kind, part.frame]
 
 
 def effective_fixes(problem: Problem, result: Estimate) -> float:
-    """How many independent fixes would determine the middle's east and north as well."""
+    """Return how many independent fixes would determine the middle's east and north equally well."""
     counts = []
     for kind in (Kind.EAST, Kind.NORTH):
         mine = problem.kind == kind
-        # Bias levels of differential and other fixes differ: the median observation stands for all.
-        inverse, _ = inverse_times(
+        # Bias levels of differential and other fixes differ; the median represents them all.
+        inverse, _ = apply_inverse_covariance(
             problem.chains, result.levels, result.weights, mine[:, None].astype(np.float64)
         )
         group = problem.chains.group[mine]
@@ -139,9 +157,9 @@ def effective_fixes(problem: Problem, result: Estimate) -> float:
 
 @dataclass(frozen=True)
 class GeoErrors:
-    """Errors of a georegistration against the truth; nothing is aligned."""
+    """Errors of a georegistration against ground truth, without any alignment."""
 
-    position_m: float  # root mean square over the points
+    position_m: float  # RMS over the points
     horizontal_m: float  # of the points' mean
     vertical_m: float  # of the points' mean, signed
     tilt_deg: float
@@ -152,7 +170,7 @@ class GeoErrors:
 def georegistration_errors(
     estimated: Similarity, true: Similarity, points: np.ndarray
 ) -> GeoErrors:
-    """Errors of a world_from_model against the true one on points (N, 3) of the model."""
+    """Compare world_from_model with ground truth on points (N, 3) of the model."""
     difference = estimated.apply(points) - true.apply(points)
     mean = difference.mean(axis=0)
     turn = np.rad2deg(rotation_vectors(estimated.rotation @ true.rotation.T))

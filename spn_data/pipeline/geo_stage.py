@@ -122,7 +122,7 @@ def _georegister(
         counts=_counts(result),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
-        notes=(*(o.tell(name) for name, o in offsets.items()), *result.notes),
+        notes=(*(o.describe(name) for name, o in offsets.items()), *result.notes),
     )
 
 

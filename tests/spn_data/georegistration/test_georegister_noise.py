@@ -8,15 +8,15 @@ import pytest
 from spn_data.geometry.pose import Similarity, rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration import georegistration_errors
 from spn_data.georegistration.cross_validation import time_blocks
-from spn_data.georegistration.gravity import level_up, robust_direction
+from spn_data.georegistration.gravity import robust_direction, up_from_level_cameras
 from spn_data.georegistration.noise import (
     Chains,
-    Levels,
-    Linear,
-    improve_levels,
-    inverse_times,
+    LinearSystem,
+    NoiseLevels,
+    apply_inverse_covariance,
     robust_weights,
     solve,
+    update_levels,
 )
 from spn_data.georegistration.uncertainty import Uncertainty, radius_sigma
 
@@ -46,7 +46,9 @@ def test_the_banded_inverse_is_the_dense_covariance_s():
     white = np.array([0.1, 0.2])[chains.group] * chains.unit
     covariance = covariance + np.diag(white**2 / weights)
     columns = rng.standard_normal((40, 3))
-    inverse, log_det = inverse_times(chains, Levels.from_table(TABLE), weights, columns)
+    inverse, log_det = apply_inverse_covariance(
+        chains, NoiseLevels.from_table(TABLE), weights, columns
+    )
     assert inverse == pytest.approx(np.linalg.solve(covariance, columns), rel=1e-9, abs=1e-9)
     assert log_det == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-12)
 
@@ -60,7 +62,10 @@ def test_the_step_is_generalised_least_squares():
     jacobian, residual = rng.standard_normal((40, 2)), rng.standard_normal(40)
     prior, value = np.array([0.0, 4.0]), np.array([0.0, 0.5])
     solution = solve(
-        chains, Levels.from_table(TABLE), np.ones(40), Linear(residual, jacobian, prior, value)
+        chains,
+        NoiseLevels.from_table(TABLE),
+        np.ones(40),
+        LinearSystem(residual, jacobian, prior, value),
     )
     information = jacobian.T @ precision @ jacobian + np.diag(prior)
     step = np.linalg.solve(information, jacobian.T @ precision @ residual - prior * value)
@@ -75,8 +80,8 @@ def test_times_at_one_instant_share_their_error_and_break_nothing():
     time_s = np.zeros(30)
     ids = np.zeros(30, dtype=np.int64)
     chains, _ = Chains.build(ids, time_s, np.full(30, 60.0), ids, np.ones(30), np.arange(30))
-    levels = Levels.from_table([(1.0, 0.0, 0.1, 0.0)])
-    inverse, _ = inverse_times(chains, levels, np.ones(30), np.ones((30, 1)))
+    levels = NoiseLevels.from_table([(1.0, 0.0, 0.1, 0.0)])
+    inverse, _ = apply_inverse_covariance(chains, levels, np.ones(30), np.ones((30, 1)))
     assert inverse.sum() == pytest.approx(1.0, abs=0.05)
 
 
@@ -90,10 +95,10 @@ def test_noise_levels_are_estimated_two_sidedly():
     error += 0.08 * rng.standard_normal(m)
     ids = np.zeros(m, dtype=np.int64)
     chains, _ = Chains.build(ids, time_s, np.full(m, 60.0), ids, np.ones(m), np.arange(m))
-    levels = Levels.from_table([(2.0, 2.0, 0.5, 2.0)])
-    linear = Linear(error, np.ones((m, 1)), np.zeros(1), np.zeros(1))
+    levels = NoiseLevels.from_table([(2.0, 2.0, 0.5, 2.0)])
+    linear = LinearSystem(error, np.ones((m, 1)), np.zeros(1), np.zeros(1))
     for _ in range(20):
-        levels = improve_levels(chains, levels, np.ones(m), linear)
+        levels = update_levels(chains, levels, np.ones(m), linear)
     assert 0.5 < np.exp(levels.log_bias[0]) < 0.95
     assert 0.06 < np.exp(levels.log_white[0]) < 0.1
 
@@ -104,7 +109,7 @@ def test_outliers_lose_their_weight_and_others_keep_theirs():
     chains, _ = Chains.build(
         np.arange(4), np.zeros(4), np.ones(4), ids, np.ones(4), np.array([0, 0, 1, 2])
     )
-    levels = Levels.from_table([(1.0, 0.0, 0.1, 0.0)])
+    levels = NoiseLevels.from_table([(1.0, 0.0, 0.1, 0.0)])
     weights, distance = robust_weights(chains, levels, np.array([1.0, 0.0, 0.2, -1.0]))
     assert weights[0] == weights[1] < 0.03
     assert weights[2] > 0.9
@@ -126,7 +131,7 @@ def test_uncertainty_grows_away_from_the_middle():
     """At 100 m from the middle 1 mrad of heading is 0.1 m across, and 1 % of scale 1 m along."""
     covariance = np.diag([0.04, 0.04, 0.09, 0.0, 0.0, 1e-6, 1e-4])
     stated = Uncertainty.from_covariance(covariance, np.array([10.0, 0.0, 0.0]))
-    here, there = stated.of_points(np.array([[10.0, 0.0, 0.0], [110.0, 0.0, 0.0]]))
+    here, there = stated.point_covariance(np.array([[10.0, 0.0, 0.0], [110.0, 0.0, 0.0]]))
     assert here == pytest.approx(np.diag([0.04, 0.04, 0.09]))
     assert there == pytest.approx(np.diag([0.04 + 1.0, 0.04 + 0.01, 0.09]))
 
@@ -158,11 +163,11 @@ def test_blocks_of_time_do_not_cross_flights():
 def test_level_cameras_of_many_headings_show_up_and_of_one_do_not():
     """Up is across the right sides of all images, if these differ."""
     angles = np.column_stack([np.arange(0, 360, 30.0), np.full(12, 5.0), np.zeros(12)])
-    up, determined = level_up(rotations_from_angles(angles))
+    up, determined = up_from_level_cameras(rotations_from_angles(angles))
     assert up == pytest.approx([0, 0, 1], abs=1e-12)
     assert determined > 0.4
     angles[:, 0] = 40.0
-    assert level_up(rotations_from_angles(angles))[1] < 1e-9
+    assert up_from_level_cameras(rotations_from_angles(angles))[1] < 1e-9
 
 
 def test_a_robust_direction_is_not_moved_by_a_quarter_of_nonsense():

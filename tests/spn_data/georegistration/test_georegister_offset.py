@@ -96,7 +96,7 @@ def test_a_hover_and_an_even_line_leave_the_offset_undetermined(speed_m_s):
     found = estimate_time_offset(*_even_flight(speed_m_s))
     assert found.offset_s is None
     assert found.applied_s == 0.0
-    assert "undetermined" in found.tell("flight1")
+    assert "undetermined" in found.describe("flight1")
 
 
 def test_a_straight_line_without_gimbal_angles_leaves_it_undetermined():
@@ -118,5 +118,5 @@ def test_too_little_telemetry_leaves_it_undetermined(path):
 
 def test_an_offset_is_told_with_its_sigma():
     """One sentence, in seconds, with the sign of what is added to the telemetry's times."""
-    told = TimeOffset(0.4, 0.02).tell("flight1")
-    assert told == "flight1: time offset of the telemetry +0.40 s (sigma 0.02 s)."
+    sentence = TimeOffset(0.4, 0.02).describe("flight1")
+    assert sentence == "flight1: time offset of the telemetry +0.40 s (sigma 0.02 s)."

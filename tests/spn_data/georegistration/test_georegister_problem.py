@@ -77,7 +77,10 @@ def test_the_jacobian_is_the_residuals_derivative():
     for k in range(SHARED + 10):
         step = np.zeros(SHARED + 10)
         step[k] = h
-        after, before = problem.residuals(state.moved(step)), problem.residuals(state.moved(-step))
+        after, before = (
+            problem.residuals(state.updated(step)),
+            problem.residuals(state.updated(-step)),
+        )
         slope = ((after - before) / (2 * h))[problem.kind, problem.frame]
         # To first order in the gimbal's disagreement, which the shake makes 1e-4.
         assert -slope == pytest.approx(linear.jacobian[:, k], abs=0.02), k

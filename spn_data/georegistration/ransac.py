@@ -1,4 +1,4 @@
-"""First step of georegistration: the similarity that most fixes agree with, from random samples."""
+"""First step of georegistration: RANSAC for an initial similarity."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from spn_data.georegistration.observe import Fixes
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """world_from_model of the best sample and which frames (N,) agree with it."""
+class RansacResult:
+    """Similarity of the best sample and its inlier frames (N,)."""
 
     world_from_model: Similarity
     inlier: np.ndarray
-    sigma_factor: float  # by which the stated sigmas were widened to find agreement
+    sigma_factor: float  # factor by which the stated sigmas were enlarged to find a consensus
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) that takes the direction a (3,) to b (3,)."""
+    """Return the smallest rotation (3, 3) that maps direction a (3,) to direction b (3,)."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        # Half a turn about any axis across a.
+        # Rotate by 180 degrees about any axis orthogonal to a.
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
         sine = float(np.linalg.norm(axis))
     return rotations_from_vectors(axis / sine * np.arctan2(np.linalg.norm(np.cross(a, b)), cosine))
 
 
 def _distances(fixes: Fixes, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal and vertical distances (S, N) in sigma of S hypotheses' centres (S, N, 3); NaN unknown.
+    """Return horizontal and vertical distances (S, N), in sigma, of S hypotheses' centres (S, N, 3).
 
-    Heights count from their flight's median, for a flight's vertical offset is not known yet.
+    Unknown distances are NaN. Vertical distances are relative to their flight's median if each flight has an
+    unknown vertical offset.
     """
     difference = fixes.enu_m - predicted
     horizontal = np.linalg.norm(difference[..., :2] / fixes.sigma_m[:, :2], axis=-1)
@@ -53,7 +54,7 @@ def _distances(fixes: Fixes, predicted: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _sample_pairs(
     rng: np.random.Generator, points: np.ndarray, candidates: np.ndarray, samples: int
 ) -> np.ndarray:
-    """Pairs (S, 2) of candidates, those further apart horizontally than half of all pairs."""
+    """Sample pairs (S, 2) of candidates, keeping the half with the larger horizontal distances."""
     pairs = rng.choice(candidates, size=(2 * samples, 2))
     length = np.linalg.norm(points[pairs[:, 0], :2] - points[pairs[:, 1], :2], axis=1)
     return pairs[length >= max(float(np.median(length)), 1e-6)][:samples]
@@ -62,7 +63,7 @@ def _sample_pairs(
 def _with_gravity(
     model: np.ndarray, fixes: Fixes, up_model: np.ndarray, samples: int, rng: np.random.Generator
 ) -> list[Similarity]:
-    """Hypotheses of two fixes each, where up is known: heading, scale and place."""
+    """Compute hypotheses (heading, scale, translation) from two fixes each, given the direction of up."""
     level_from_model = rotation_between(up_model, np.array([0.0, 0.0, 1.0]))
     level = model @ level_from_model.T
     candidates = np.flatnonzero(fixes.has_fix)
@@ -87,7 +88,7 @@ def _with_gravity(
 def _without_gravity(
     model: np.ndarray, fixes: Fixes, samples: int, rng: np.random.Generator
 ) -> list[Similarity]:
-    """Hypotheses of three fixes of one flight each, wide triangles only."""
+    """Compute hypotheses from three fixes of one flight each, using only wide triangles."""
     known = np.isfinite(fixes.enu_m).all(axis=1)
     counts = np.bincount(fixes.flight[known], minlength=len(fixes.flights))
     triples = []
@@ -96,14 +97,14 @@ def _without_gravity(
         triples.append(rng.choice(mine, size=(int(4 * samples * counts[f] / counts.sum()) + 4, 3)))
     if not triples:
         raise GeometryError(
-            "no flight has three fixes with heights, and no gimbal angles are known"
+            "no flight has three fixes with heights, and there are no gimbal angles"
         )
     all_triples = np.concatenate(triples)
     p, q, r = (fixes.enu_m[all_triples[:, k]] for k in range(3))
     longest = np.maximum.reduce([np.linalg.norm(d, axis=1) for d in (p - q, q - r, r - p)])
     area = np.linalg.norm(np.cross(q - p, r - p), axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        # The smallest height of the triangle says how well it fixes the rotation about its long side.
+        # The smallest altitude of the triangle measures how well it determines rotation about its long side.
         width = np.where(longest > 0, area / longest, 0.0)
     wide = np.argsort(-width, kind="stable")[:samples]
     wide = wide[width[wide] > 1e-3]
@@ -116,15 +117,14 @@ def _without_gravity(
     return hypotheses
 
 
-def find_start(
+def ransac_similarity(
     model: np.ndarray, fixes: Fixes, up_model: np.ndarray | None, options: GeoregisterOptions
-) -> Start:
-    """The sampled similarity with the smallest truncated distances, by RANSAC (Torr & Zisserman 2000, MSAC).
+) -> RansacResult:
+    """Find the sampled similarity with the smallest truncated cost (MSAC, Torr & Zisserman 2000).
 
-    model : (N, 3) centres; up_model : (3,) direction of up in the model where known. The sigmas are
-    widened up to fourfold where fewer than half of the fixes agree, as long as they stay well below the
-    flight's extent.
-    Raises GeometryError where no half of the fixes agrees with any similarity.
+    model : (N, 3) camera centres; up_model : (3,) direction of up in the model if known. If fewer than half
+    of the fixes are inliers, the sigmas are enlarged up to fourfold, as long as they stay well below the
+    extent of the flight. Raises GeometryError if no similarity has at least half of the fixes as inliers.
     """
     rng = np.random.default_rng(options.seed)
     if up_model is not None:
@@ -133,7 +133,7 @@ def find_start(
         hypotheses = _without_gravity(model, fixes, options.ransac_samples, rng)
     if not hypotheses:
         raise GeometryError(
-            "the fixes coincide or lie on one line: fly a cross leg of at least 20 m, "
+            "the fixes coincide or are collinear: fly a cross leg of at least 20 m, "
             "or give gimbal angles"
         )
     has_fix = fixes.has_fix
@@ -157,18 +157,18 @@ def find_start(
         inlier = has_fix & (horizontal[best] < limit) & (vertical[best] < limit)
         best_share = inlier.sum() / has_fix.sum()
         if best_share >= 0.5:
-            return Start(hypotheses[best], inlier, factor)
+            return RansacResult(hypotheses[best], inlier, factor)
     raise GeometryError(
         f"only {best_share:.0%} of {has_fix.sum()} fixes agree with the model's shape "
-        f"within {options.ransac_sigmas:g} sigma ({sigma:.2g} m each): is it the telemetry of another "
-        "flight, or is its clock off?"
+        f"within {options.ransac_sigmas:g} sigma ({sigma:.2g} m each): this may be the telemetry of another "
+        "flight, or its clock may be off"
     )
 
 
 def extent(fixes: Fixes) -> float:
-    """Root mean square distance in metres of the fixes from their middle, outliers aside."""
+    """Return the RMS distance in metres of the fixes from their median, without the farthest tenth."""
     points = fixes.enu_m[fixes.has_fix]
     points = points[:, :2] if not np.isfinite(points).all() else points
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    # Bursts are rare: nine tenths of the fixes show the flight's extent.
+    # Bursts of outliers are rare, so 90 % of the fixes show the extent of the flight.
     return float(np.sqrt(np.mean(np.sort(distance)[: max(1, int(0.9 * len(distance)))] ** 2)))
