@@ -1,4 +1,4 @@
-"""Where to fly again: few poses from which new mapping frames would cover what is covered badly."""
+"""Reflight planning: a small set of poses at which new mapping frames would cover poorly covered queries."""
 
 from __future__ import annotations
 
@@ -14,27 +14,41 @@ from spn_data.geometry.pose import (
     rotations_from_angles,
 )
 
-_ALIKE = 0.25  # of the limits: queries within it of a candidate make no candidate of their own
-_MAX_PASSES = 20  # of shortening the path
-_MAX_SHORTENED = 400  # stops; a longer path stays as the nearest stop was chosen each time
+_ALIKE = 0.25  # share of the limits within which a query is represented by another candidate
+_MAX_PASSES = 20  # of 2-opt
+_MAX_SHORTENED = 400  # stops; longer paths keep the nearest-neighbour order without 2-opt
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReflyOptions:
-    """What the new frames should reach."""
+    """Target coverage of the new frames.
 
-    wanted: Stratum = Stratum.HIGH  # or MEDIUM: what each query should reach
-    # Share of the limits that is planned with: what is left is for the error of flying there.
+    Attributes
+    ----------
+    wanted : Stratum
+        Stratum each query should reach, HIGH or MEDIUM.
+    margin : float
+        Share of the stratum's limits used for planning; the rest allows for the error of flying there.
+    """
+
+    wanted: Stratum = Stratum.HIGH
     margin: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class FlyAgain:
-    """K poses to take mapping frames from, in the order of a short path.
+class ReflightPlan:
+    """Stops at which to take new mapping frames, in the order of a short path.
 
-    poses : East-North-Up; angles_deg : (K, 3) heading, pitch and roll of the same; serves : (K,) int,
-    queries for which each is the nearest of them; query_stop : (N,) int, which of them serves each query,
-    -1 for one that needs none.
+    Attributes
+    ----------
+    poses : Poses
+        Poses of the K stops, East-North-Up.
+    angles_deg : ndarray, shape (K, 3)
+        Heading, pitch and roll of the stops in degrees.
+    serves : ndarray of int, shape (K,)
+        Number of queries for which each stop is the nearest.
+    query_stop : ndarray of int, shape (N,)
+        Stop that serves each query; -1 for queries that need none.
     """
 
     poses: Poses
@@ -46,44 +60,60 @@ class FlyAgain:
         return len(self.poses)
 
 
-def where_to_fly_again(
+def plan_reflight(
     queries: Poses,
     strata: np.ndarray,
     options: CoverageOptions | None = None,
     refly: ReflyOptions | None = None,
-) -> FlyAgain:
-    """Poses such that a mapping frame at each brings every one of N queries to the stratum wanted.
+) -> ReflightPlan:
+    """Plan poses at which mapping frames bring every query to the wanted stratum.
 
-    queries : finite, in an East-North-Up frame; strata : (N,) what they have. The new poses are such of
-    the queries themselves, with the camera level, or rolled as the query where it is rolled by more than
-    a small part of the limit. Chosen one by one, each time that which covers most of what is left
-    (greedy set cover, Chvatal 1979), then those that became superfluous are left out.
+    Parameters
+    ----------
+    queries : Poses
+        N query poses, finite, in an East-North-Up frame.
+    strata : ndarray of str, shape (N,)
+        Current strata of the queries.
+    options : CoverageOptions, optional
+        Limits of the strata and the metric.
+    refly : ReflyOptions, optional
+        Target coverage.
+
+    Returns
+    -------
+    ReflightPlan
+        Stops and their assignment to the queries; no stops if all queries are covered.
+
+    Notes
+    -----
+    Candidates are poses of the queries, with the roll removed unless it exceeds a small part of the limit.
+    They are chosen by greedy set cover (Chvatal 1979), after which redundant stops are removed.
     """
     options, refly = options or CoverageOptions(), refly or ReflyOptions()
     limit, limit_deg = (refly.margin * value for value in options.limits(refly.wanted))
     enough = {Stratum.HIGH.value} | (
         {Stratum.MEDIUM.value} if refly.wanted is Stratum.MEDIUM else set()
     )
-    needy = np.flatnonzero(~np.isin(strata, list(enough)))
-    left = queries[needy]
-    candidates = _level(left[_leaders(left, _ALIKE * limit, _ALIKE * limit_deg)], limit_deg)
-    chosen = candidates[_cover(_within(candidates, left, limit, limit_deg))]
+    uncovered = np.flatnonzero(~np.isin(strata, list(enough)))
+    left = queries[uncovered]
+    candidates = _level(left[_thin_out(left, _ALIKE * limit, _ALIKE * limit_deg)], limit_deg)
+    chosen = candidates[_set_cover(_within(candidates, left, limit, limit_deg))]
     chosen = chosen[_path(chosen, options.deg_per_m)]
     stop = np.full(len(queries), -1, dtype=np.int64)
     if len(chosen):
         within = _within(chosen, left, limit, limit_deg)
         cost = np.where(within, _costs(chosen, left, options.deg_per_m), np.inf)
-        stop[needy] = cost.argmin(axis=0)
-    return FlyAgain(
+        stop[uncovered] = cost.argmin(axis=0)
+    return ReflightPlan(
         poses=chosen,
         angles_deg=angles_from_rotations(chosen.rotations),
-        serves=np.bincount(stop[needy], minlength=len(chosen)),
+        serves=np.bincount(stop[uncovered], minlength=len(chosen)),
         query_stop=stop,
     )
 
 
-def _leaders(poses: Poses, limit: float, limit_deg: float) -> np.ndarray:
-    """Rows such that every pose lies within the limits of one of them."""
+def _thin_out(poses: Poses, limit: float, limit_deg: float) -> np.ndarray:
+    """Select rows such that every pose is within the limits of a selected one."""
     rows: list[int] = []
     free = np.ones(len(poses), dtype=bool)
     for k in range(len(poses)):
@@ -97,7 +127,7 @@ def _leaders(poses: Poses, limit: float, limit_deg: float) -> np.ndarray:
 
 
 def _level(poses: Poses, limit_deg: float) -> Poses:
-    """The poses without roll, where leaving it out turns them by little."""
+    """Remove the roll of poses that this rotates only slightly."""
     angles = angles_from_rotations(poses.rotations)
     level = Poses.from_rotations(
         poses.centers, rotations_from_angles(angles * np.array([1.0, 1.0, 0.0]))
@@ -107,31 +137,31 @@ def _level(poses: Poses, limit_deg: float) -> Poses:
 
 
 def _within(stops: Poses, queries: Poses, limit: float, limit_deg: float) -> np.ndarray:
-    """(K, N) bool: a frame at the stop covers the query."""
+    """Return a mask (K, N) of queries covered by a frame at each stop."""
     distance, angle = distances_and_angles(stops, queries)
     return (distance <= limit) & (angle <= limit_deg)
 
 
 def _costs(stops: Poses, queries: Poses, deg_per_m: float) -> np.ndarray:
-    """(K, N) distance plus angle, in the unit of length."""
+    """Return the combined distance and angle (K, N), in the unit of length."""
     distance, angle = distances_and_angles(stops, queries)
     return distance + angle / deg_per_m
 
 
-def _cover(covers: np.ndarray) -> np.ndarray:
-    """Rows of covers (K, N) that together cover every column, few of them."""
+def _set_cover(covers: np.ndarray) -> np.ndarray:
+    """Select few rows of `covers` (K, N) that together cover every column, by greedy set cover."""
     rows: list[int] = []
     open_columns = np.ones(covers.shape[1], dtype=bool)
     gains = covers.sum(axis=1)
     while open_columns.any():
         best = int(gains.argmax())
-        assert gains[best] > 0, "every query lies near a candidate"
+        assert gains[best] > 0, "every query must be near a candidate"
         newly = covers[best] & open_columns
         rows.append(best)
         open_columns &= ~newly
         gains = gains - covers[:, newly].sum(axis=1)
     counts = covers[rows].sum(axis=0)
-    for row in list(rows):  # the first were chosen blind to those that came later
+    for row in list(rows):  # rows chosen early may have become redundant
         if (counts[covers[row]] > 1).all():
             counts = counts - covers[row]
             rows.remove(row)
@@ -139,7 +169,7 @@ def _cover(covers: np.ndarray) -> np.ndarray:
 
 
 def _path(stops: Poses, deg_per_m: float) -> np.ndarray:
-    """An order (K,) in which little is flown and turned: nearest next stop, then 2-opt, ends free."""
+    """Order the stops (K,) along a short open path with little turning: nearest neighbour, then 2-opt."""
     n = len(stops)
     if n < 3:
         return np.arange(n)
@@ -156,9 +186,9 @@ def _path(stops: Poses, deg_per_m: float) -> np.ndarray:
 
 
 def _two_opt(path: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Turn stretches of the path round while that makes it shorter."""
+    """Shorten an open path by 2-opt."""
     n = len(path)
-    # A stop that is nowhere, before the first and after the last, leaves the ends free.
+    # A dummy stop at distance zero from all others, before the first and after the last, frees the ends.
     cost = np.pad(cost, (0, 1))
     path = np.concatenate([[n], path, [n]])
     for _ in range(_MAX_PASSES):

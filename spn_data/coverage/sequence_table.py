@@ -1,4 +1,4 @@
-"""Coverage of a whole sequence, frames without a pose included: its figures, coverage.csv."""
+"""Coverage of a whole sequence, including frames without a pose: summary, notes and coverage.csv."""
 
 from __future__ import annotations
 
@@ -9,15 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.coverage.nearest_frame import CoverageOptions, Stratum, above_range, nearest_frames
+from spn_data.coverage.nearest_frame import (
+    CoverageOptions,
+    Stratum,
+    height_outside_range,
+    nearest_frames,
+)
 from spn_data.coverage.view_share import SeenMap, view_shares
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.storage.files import read_csv, write_csv
 from spn_data.work.timing import Progress
 
-_TELLING_M = 0.05  # less beyond the range of heights is not worth a sentence
-_FAR_M = 1000.0  # from the map: nobody plans that
+_MIN_BEYOND_M = 0.05  # smaller excesses over the range of mapping heights are not reported
+_FAR_M = 1000.0  # median distance to the map above which coordinates are probably wrong
 
 COLUMNS = (
     *("name", "status", "stratum", "nearest", "distance", "angle_deg", "height", "above_mapping"),
@@ -27,10 +32,18 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """N poses whose coverage is asked for, of one sequence or plan.
+    """Query frames of one sequence or flight plan.
 
-    names : (N,) str; poses : NaN where there is none; cameras : N, one a pose; reason : (N,) str, why
-    there is no pose.
+    Attributes
+    ----------
+    names : ndarray of str, shape (N,)
+        Names of the frames.
+    poses : Poses
+        N poses; NaN if a frame has none.
+    cameras : sequence of Camera
+        N cameras, one per pose.
+    reason : ndarray of str, shape (N,)
+        Why a frame has no pose.
     """
 
     names: np.ndarray
@@ -40,15 +53,24 @@ class Queries:
 
     @property
     def known(self) -> np.ndarray:
-        """(N,) bool: has a pose."""
+        """Mask (N,) of frames with a pose."""
         return np.asarray(np.isfinite(self.poses.centers).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class MappingFrames:
-    """What covers: M frames with a pose, and the points that they saw.
+    """Mapping frames with a pose, and the map points they observed.
 
-    has_up : the third axis points up, so that it measures heights.
+    Attributes
+    ----------
+    names : ndarray of str, shape (M,)
+        Names of the frames.
+    poses : Poses
+        M poses.
+    seen : SeenMap
+        Map points and their sightings.
+    has_up : bool
+        Whether the third axis points up, so that heights are meaningful.
     """
 
     names: np.ndarray
@@ -59,13 +81,29 @@ class MappingFrames:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What covers each of N queries; NaN and "" where a query has no pose. Lengths in the map's unit.
+    """Coverage of N queries; NaN or "" if a query has no pose. Lengths in the unit of the map.
 
-    stratum : (N,) str; nearest : (N,) str, name of the nearest mapping frame; distance, angle_deg : (N,)
-    to it; height : (N,) of the query above it; above_mapping : (N,) above the highest of all mapping
-    frames, negative below the lowest, 0 between; both NaN where no axis points up. view_share : (N,) share
-    of the view for which the map has points. answer_distance, answer_angle_deg : (N,) errors of the best
-    nearest-neighbour answer.
+    Attributes
+    ----------
+    queries : Queries
+        The query frames.
+    mapping_heights : tuple of float
+        Lowest and highest mapping frame.
+    stratum : ndarray of str, shape (N,)
+        Stratum, empty if the unit of the map is unknown.
+    nearest : ndarray of str, shape (N,)
+        Name of the nearest mapping frame.
+    distance, angle_deg : ndarray, shape (N,)
+        Distance and angle to the nearest mapping frame.
+    height : ndarray, shape (N,)
+        Height of the query above the nearest mapping frame; NaN if no axis points up.
+    above_mapping : ndarray, shape (N,)
+        Height above the highest mapping frame, negative below the lowest, 0 in between; NaN if no axis points
+        up.
+    view_share : ndarray, shape (N,)
+        Share of the view for which the map has points.
+    answer_distance, answer_angle_deg : ndarray, shape (N,)
+        Errors of the best nearest-neighbour answer.
     """
 
     queries: Queries
@@ -81,7 +119,7 @@ class Coverage:
     answer_angle_deg: np.ndarray
 
     def summary(self) -> dict[str, Any]:
-        """Counts, and medians over the queries with a pose; NaN where none has."""
+        """Return counts, and medians over the queries with a pose (NaN if none has one)."""
         known = self.queries.known
         heights = self.queries.poses.centers[known, 2]
         beyond = self.above_mapping[known]
@@ -109,16 +147,34 @@ class Coverage:
         }
 
 
-def cover(
+def assess_coverage(
     queries: Queries,
     mapping: MappingFrames,
     options: CoverageOptions | None,
     progress: Progress | None = None,
 ) -> Coverage:
-    """How mapping frames cover the queries.
+    """Assess how well mapping frames cover the queries.
 
-    options : None where the map's unit is not known: nothing is put into strata then.
-    Raises GeometryError where there is no mapping frame.
+    Parameters
+    ----------
+    queries : Queries
+        N query frames.
+    mapping : MappingFrames
+        Mapping frames and map points.
+    options : CoverageOptions or None
+        Limits of the strata. None if the unit of the map is unknown; strata are then left empty.
+    progress : Progress, optional
+        Progress callback.
+
+    Returns
+    -------
+    Coverage
+        Coverage of the N queries.
+
+    Raises
+    ------
+    GeometryError
+        If there is no mapping frame.
     """
     known = queries.known
     chosen = options or CoverageOptions()
@@ -145,22 +201,22 @@ def cover(
         distance=spread(found.distance),
         angle_deg=spread(found.angle_deg),
         height=spread(found.height + up),
-        above_mapping=spread(above_range(queries.poses.centers[known, 2], heights) + up),
+        above_mapping=spread(height_outside_range(queries.poses.centers[known, 2], heights) + up),
         view_share=spread(shares),
         answer_distance=spread(found.answer_distance),
         answer_angle_deg=spread(found.answer_angle_deg),
     )
 
 
-def remarks(name: str, coverage: Coverage) -> list[str]:
-    """What the user should know of one sequence or plan, a sentence each."""
+def coverage_notes(name: str, coverage: Coverage) -> list[str]:
+    """Return sentences for the user on one sequence or flight plan called `name`."""
     summary = coverage.summary()
     known = summary["frames"] - summary["failed"]
     notes = []
     if summary["failed"]:
         notes.append(
-            f"{name}: {summary['failed']} of {summary['frames']} frames failed: without a pose, what "
-            "covers them is not known."
+            f"{name}: {summary['failed']} of {summary['frames']} frames failed; their coverage is unknown "
+            "because they have no pose."
         )
     heights = summary["heights"]
     if heights is None or known == 0:
@@ -170,22 +226,22 @@ def remarks(name: str, coverage: Coverage) -> list[str]:
         (heights["above"], "above the highest", heights["highest_above"]),
         (heights["below"], "below the lowest", -heights["lowest_below"]),
     ):
-        if by >= _TELLING_M:
+        if by >= _MIN_BEYOND_M:
             notes.append(
-                f"{name}: {count} of {known} lie {side} mapping frame, by up to {by:.1f} m "
-                f"(mapping heights {low:.1f} to {high:.1f} m): what is trained on the map has "
-                "seen no such height."
+                f"{name}: {count} of {known} are {side} mapping frame, by up to {by:.1f} m "
+                f"(mapping heights {low:.1f} to {high:.1f} m): a network trained on the map has "
+                "never seen such heights."
             )
     if summary["median"]["distance"] > _FAR_M:
         notes.append(
-            f"{name}: the map is {summary['median']['distance'] / 1000:.0f} km away: are latitude, "
-            "longitude and their signs right?"
+            f"{name}: the map is {summary['median']['distance'] / 1000:.0f} km away: check latitude, "
+            "longitude and their signs."
         )
     return notes
 
 
 def write_coverage(path: Path, coverage: Coverage) -> None:
-    """As coverage CSV (docs/coverage.md): one row a query, also for those without a pose."""
+    """Write coverage CSV (docs/coverage.md): one row per query, including those without a pose."""
     queries = coverage.queries
     centers = queries.poses.centers
     status = np.where(queries.known, "registered", "failed")
@@ -208,7 +264,7 @@ def write_coverage(path: Path, coverage: Coverage) -> None:
 
 
 def read_strata(path: Path) -> dict[str, str]:
-    """Of coverage CSV: stratum by name. Raises InputError where it is not what `write_coverage` writes."""
+    """Read the stratum by frame name from coverage CSV; raise InputError for any other file."""
     return {row["name"]: row["stratum"] for _, row in read_csv(path, COLUMNS)}
 
 

@@ -1,4 +1,4 @@
-"""How much of a camera's view a map has points for that it could be matched with."""
+"""View share: the share of a camera's view for which the map has points that could be matched."""
 
 from __future__ import annotations
 
@@ -14,32 +14,44 @@ from spn_data.geometry.pose import Poses
 from spn_data.work.timing import Progress
 
 _BORDER_STEPS = 17
-_BLOCK = 64  # points that are ruled out together where none of them is in view
-_FIRST = 4  # points of a cell that are looked at before the others
+_BLOCK = 64  # points that are culled together by their bounding sphere
+_FIRST = 4  # points of a cell that are tested before the others
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewShareOptions:
-    """What counts as a view that the map has points for."""
+    """Image grid and visibility criteria of the view share.
+
+    A point looks similar from two places only if both view it from about the same direction
+    (`max_turn_deg`) and distance (`max_range_factor`). A point is occluded if at least `occluders` points of
+    its grid cell are nearer than `occluder_ratio` times its distance.
+    """
 
     columns: int = 16  # of the grid over the image
     rows: int = 9
-    # A point looks alike from two places only if they see it from about the same side,
     max_turn_deg: float = 40.0
-    max_range_factor: float = 2.0  # and from about the same distance.
-    # A point is hidden if as many points of its cell
+    max_range_factor: float = 2.0
     occluders: int = 3
-    occluder_ratio: float = 0.75  # lie nearer than this share of its distance.
+    occluder_ratio: float = 0.75
 
 
 @dataclass(frozen=True, eq=False)
 class SeenMap:
-    """P points, and from where mapping frames saw each.
+    """Map points, and the directions and distances from which mapping frames observed them.
 
-    xyz : (P, 3), in an order of their own: each _BLOCK of them are neighbours, so that one test can rule
-    all of them out. block_center, block_radius : (B, 3), (B,), spheres around the blocks.
-    Sightings lie sorted by point: those of point p from starts[p] to starts[p + 1];
-    directions : (S, 3) unit vectors from the point to the frame; ranges : (S,) their distances.
+    Attributes
+    ----------
+    xyz : ndarray, shape (P, 3)
+        Points, reordered so that each block of `_BLOCK` consecutive points is compact and can be culled by
+        one test.
+    block_center, block_radius : ndarray, shapes (B, 3) and (B,)
+        Bounding spheres of the blocks.
+    starts : ndarray of int, shape (P + 1,)
+        Sightings are sorted by point; those of point p are ``starts[p]`` to ``starts[p + 1]``.
+    directions : ndarray, shape (S, 3)
+        Unit vectors from the point to the frame, by sighting.
+    ranges : ndarray, shape (S,)
+        Distances between point and frame, by sighting.
     """
 
     xyz: np.ndarray
@@ -50,10 +62,10 @@ class SeenMap:
     ranges: np.ndarray
 
     @classmethod
-    def of(
+    def build(
         cls, xyz: np.ndarray, centers: np.ndarray, frame_idx: np.ndarray, point_idx: np.ndarray
     ) -> SeenMap:
-        """From points (P, 3), centres of frames (M, 3), and which frame (S,) saw which point (S,)."""
+        """Build from points (P, 3), frame centres (M, 3), and frame and point index of each sighting (S,)."""
         near_order = cKDTree(xyz).indices if len(xyz) else np.zeros(0, np.int64)
         xyz = np.asarray(xyz, np.float64)[near_order]
         new_idx = np.empty(len(xyz), dtype=np.int64)
@@ -63,7 +75,7 @@ class SeenMap:
         point_idx, frame_idx = point_idx[order], frame_idx[order]
         rays = centers[frame_idx] - xyz[point_idx]
         ranges = np.linalg.norm(rays, axis=1)
-        known = ranges > 0  # NaN, of a frame without a pose, is not
+        known = ranges > 0  # excludes NaN of frames without a pose
         point_idx, rays, ranges = point_idx[known], rays[known], ranges[known]
         starts = np.searchsorted(point_idx, np.arange(len(xyz) + 1))
         directions = (rays / ranges[:, None]).astype(np.float32)
@@ -72,7 +84,7 @@ class SeenMap:
 
 
 def _blocks(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres around every _BLOCK points: centres (B, 3), radii (B,)."""
+    """Return bounding spheres of each block of `_BLOCK` points: centres (B, 3), radii (B,)."""
     first = np.arange(0, len(xyz), _BLOCK)
     if len(first) == 0:
         return np.zeros((0, 3)), np.zeros(0)
@@ -89,11 +101,11 @@ def view_shares(
     options: ViewShareOptions | None = None,
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Share (N,) of the cells of a grid over each image that hold a point which is visible and known.
+    """Return the share (N,) of grid cells of each image that contain a visible and matchable map point.
 
-    cameras : one a pose. Visible: in front, inside the image, and not hidden behind nearer points. Known:
-    a mapping frame saw it from a direction within `max_turn_deg`, and from a distance within
-    `max_range_factor`, of those from which the pose sees it.
+    cameras : one per pose. A point is visible if it is in front of the camera, inside the image, and not
+    occluded by nearer points. It is matchable if a mapping frame observed it from a direction within
+    `max_turn_deg` and a distance within `max_range_factor` of the pose's own.
     """
     options = options or ViewShareOptions()
     rotations = poses.rotations
@@ -124,25 +136,25 @@ def _share(
     free = ~_hidden(cells, ranges, count, options)
     points, ranges, cells = points[free], ranges[free], cells[free]
     covered = np.zeros(count, dtype=bool)
-    # One known point covers a cell, and one of the first few mostly is: the rest is seldom looked at.
+    # One matchable point covers a cell. It is usually among the first few, so the rest are rarely tested.
     is_first = rank_within_group(cells, count) < _FIRST
     for wanted in (is_first, ~is_first):
         part = np.flatnonzero(wanted & ~covered[cells])
-        covered[cells[part][_known(center, points[part], ranges[part], seen, options)]] = True
+        covered[cells[part][_matchable(center, points[part], ranges[part], seen, options)]] = True
     return float(covered.mean())
 
 
 def _border(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest normalised (x, y) inside the image.
+    """Return the smallest and largest normalised (x, y) inside the image.
 
-    Far outside it, the polynomial of a lens can lead back in: such points are no part of the view.
+    Far outside the image, the distortion polynomial can fold back into it; such points are not in the view.
     """
     steps = np.linspace(0, 1, _BORDER_STEPS)
     zero, one = np.zeros(_BORDER_STEPS), np.ones(_BORDER_STEPS)
     sides = [(steps, zero), (steps, one), (zero, steps), (one, steps)]
     pixels = np.concatenate([np.stack(side, axis=1) for side in sides])
-    found = camera.unproject(pixels * [camera.width, camera.height])
-    return found.min(axis=0), found.max(axis=0)
+    rays = camera.unproject(pixels * [camera.width, camera.height])
+    return rays.min(axis=0), rays.max(axis=0)
 
 
 def _in_view(
@@ -152,7 +164,7 @@ def _in_view(
     border: tuple[np.ndarray, np.ndarray],
     seen: SeenMap,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points (K,) in the image, their pixels x and y (K,), and distances from the camera (K,)."""
+    """Return the points (K,) in the image, their pixels x and y (K,), and their distances (K,)."""
     near = _inside((seen.block_center - center) @ rotation.T, border, seen.block_radius)
     points = (near[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
     points = points[points < len(seen.xyz)]
@@ -168,7 +180,7 @@ def _in_view(
 def _inside(
     rays: np.ndarray, border: tuple[np.ndarray, np.ndarray], radius: np.ndarray
 ) -> np.ndarray:
-    """Rows of points (N, 3) in the camera frame of which a sphere of that radius reaches into the view."""
+    """Return rows of points (N, 3), in the camera frame, whose sphere of given radius intersects the view."""
     x, y, z = rays.T
     (left, top), (right, bottom) = border
     inside = [z > -radius]
@@ -181,27 +193,27 @@ def _inside(
 def _hidden(
     cells: np.ndarray, ranges: np.ndarray, count: int, options: ViewShareOptions
 ) -> np.ndarray:
-    """(K,) bool: `occluders` points of the same cell are nearer than `occluder_ratio` of its distance."""
+    """Return a mask (K,) of points that are occluded by `occluders` nearer points of their cell."""
     if len(ranges) == 0:
         return np.zeros(0, dtype=bool)
-    # Cell and distance as one number, so that one sort does both.
+    # Encode cell and distance in one number, so that a single sort orders by both.
     scale = 1.0 / (ranges.max() * 1.001)
     ordered = np.sort(cells + ranges * scale)
     starts = np.searchsorted(ordered, np.arange(count + 1))
-    wall = np.full(count, np.inf)
+    occluder_range = np.full(count, np.inf)
     full = np.flatnonzero(np.diff(starts) >= options.occluders)
-    wall[full] = (ordered[starts[full] + options.occluders - 1] - full) / scale
-    return np.asarray(wall[cells] < options.occluder_ratio * ranges)
+    occluder_range[full] = (ordered[starts[full] + options.occluders - 1] - full) / scale
+    return np.asarray(occluder_range[cells] < options.occluder_ratio * ranges)
 
 
-def _known(
+def _matchable(
     center: np.ndarray,
     points: np.ndarray,
     ranges: np.ndarray,
     seen: SeenMap,
     options: ViewShareOptions,
 ) -> np.ndarray:
-    """(K,) bool: some sighting of the point is alike in direction and distance."""
+    """Return a mask (K,) of points with a sighting of similar direction and distance."""
     first, counts = seen.starts[points], np.diff(seen.starts)[points]
     last = np.cumsum(counts)
     owner = np.repeat(np.arange(len(points)), counts)

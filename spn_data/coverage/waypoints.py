@@ -1,4 +1,4 @@
-"""Planned waypoints as a CSV file: where a camera is to be and where it is to look."""
+"""Planned waypoints in CSV: position and viewing direction of the camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spn_data.telemetry.textfile import csv_rows, read_text
 
 MAX_WAYPOINTS = 100_000
 _MAX_BYTES = 50_000_000
-_AGREE_M = 0.5  # between positions that one row states in two ways
+_AGREE_M = 0.5  # tolerance between two positions stated in one row
 _KEY = re.compile(r"[\w.\- ]{1,100}")
 
 _ENU = ("x_m", "y_m", "z_m")
@@ -25,7 +25,7 @@ _HEIGHTS = {
     "alt_amsl_m": HeightReference.AMSL,
     "height_takeoff_m": HeightReference.TAKEOFF,
 }
-# Least and greatest value of each column of numbers.
+# Smallest and largest value of each numeric column.
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(_ENU, (-1e6, 1e6)),
     "lat_deg": (-90, 90),
@@ -42,31 +42,42 @@ _UNKNOWN = {"", "nan", "n/a", "na", "null", "none", "-"}
 
 @dataclass(frozen=True, eq=False)
 class WaypointFrame:
-    """Where an area lies, as far as waypoints need it.
+    """Georeference of an area, as needed for waypoints.
 
-    origin : of its East-North-Up frame. takeoff_up_m : up coordinate of the point from which heights above
-    take-off count; None where that is not known.
+    Attributes
+    ----------
+    origin : GeoOrigin
+        Origin of the East-North-Up frame.
+    takeoff_up_m : float, optional
+        Up coordinate of the take-off point; None if unknown.
     """
 
     origin: GeoOrigin
     takeoff_up_m: float | None = None
 
-    def zero_of(self, reference: HeightReference) -> float | None:
-        """What to add to heights of a reference to get those of the origin; None where that is not known."""
+    def height_offset(self, reference: HeightReference) -> float | None:
+        """Return what to add to heights above `reference` to obtain those of the origin; None if unknown."""
         if reference is HeightReference.TAKEOFF and self.takeoff_up_m is not None:
             return self.origin.alt_m + self.takeoff_up_m
         return 0.0 if reference is self.origin.height_reference else None
 
     def columns(self) -> dict[str, HeightReference]:
-        """The columns of heights that can be used here."""
-        return {name: ref for name, ref in _HEIGHTS.items() if self.zero_of(ref) is not None}
+        """Return the height columns that can be used in this area."""
+        return {name: ref for name, ref in _HEIGHTS.items() if self.height_offset(ref) is not None}
 
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """N planned poses in an area's East-North-Up frame.
+    """Planned poses in an area's East-North-Up frame.
 
-    lines : (N,) int, of the file; poses; cameras : (N,) str, key of the lens, "" where none is named.
+    Attributes
+    ----------
+    lines : ndarray of int, shape (N,)
+        Line number in the file.
+    poses : Poses
+        N planned poses.
+    cameras : ndarray of str, shape (N,)
+        Key of the camera, empty if the file names none.
     """
 
     lines: np.ndarray
@@ -78,10 +89,25 @@ class Waypoints:
 
 
 def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
-    """From a CSV with a header row; columns as in docs/coverage.md, those of other names are passed over.
+    """Read waypoints from CSV with a header row.
 
-    Raises InputError, with the line, for a value that is missing, is no number or out of bounds; for
-    heights that count from something else than the area's; for positions stated in two ways that differ.
+    Parameters
+    ----------
+    path : path-like
+        CSV file with the columns described in docs/coverage.md; other columns are ignored.
+    place : WaypointFrame
+        Georeference of the area.
+
+    Returns
+    -------
+    Waypoints
+        One pose per row.
+
+    Raises
+    ------
+    InputError
+        With the line number, for values that are missing, not a number or out of bounds, for heights with a
+        reference the area does not know, and for rows whose two positions disagree.
     """
     rows = csv_rows(read_text(path, max_bytes=_MAX_BYTES), path, "waypoint")
     header_line, header = next(rows, (1, []))
@@ -107,7 +133,7 @@ def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
         raise InputError("a header and no rows", path=path, line=header_line)
     table = {name: np.array([row[name] for row in values]) for name in values[0]}
     for name in ("heading_deg", "pitch_deg"):
-        _refuse(np.isnan(table[name]), f"{name} is missing", lines, path)
+        _reject(np.isnan(table[name]), f"{name} is missing", lines, path)
     angles = np.stack(
         [table["heading_deg"], table["pitch_deg"], np.nan_to_num(_column(table, "roll_deg"))],
         axis=1,
@@ -123,9 +149,21 @@ def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
 def waypoint_columns(
     centers: np.ndarray, angles_deg: np.ndarray, place: WaypointFrame
 ) -> dict[str, list[str]]:
-    """Cells by column of positions (N, 3) and heading, pitch, roll (N, 3), as `read_waypoints` reads them.
+    """Format waypoints as CSV columns that `read_waypoints` can read.
 
-    Metres to 3 decimals, degrees of position to 9 and of direction to 3.
+    Parameters
+    ----------
+    centers : ndarray, shape (N, 3)
+        Positions in the area's East-North-Up frame.
+    angles_deg : ndarray, shape (N, 3)
+        Heading, pitch and roll in degrees.
+    place : WaypointFrame
+        Georeference of the area.
+
+    Returns
+    -------
+    dict of str to list of str
+        Cells by column: metres with 3 decimals, latitude and longitude with 9, angles with 3.
     """
     geodetic = place.origin.wgs84_from_enu(centers)
     columns = {
@@ -133,11 +171,11 @@ def waypoint_columns(
         "lon_deg": [f"{v:.9f}" for v in geodetic[:, 1]],
     }
     for name, reference in place.columns().items():
-        zero = place.zero_of(reference)
-        columns[name] = [f"{v:.3f}" for v in geodetic[:, 2] - (zero or 0.0)]
+        offset = place.height_offset(reference)
+        columns[name] = [f"{v:.3f}" for v in geodetic[:, 2] - (offset or 0.0)]
     for k, name in enumerate(_ENU):
         columns[name] = [f"{v:.3f}" for v in centers[:, k]]
-    # 359.9996 would be printed as 360.000, a roll of -1e-14 as -0.000.
+    # Round first: otherwise 359.9996 would be printed as 360.000, and a roll of -1e-14 as -0.000.
     angles = np.round(angles_deg, 3) + 0.0
     columns["heading_deg"] = [f"{v % 360:.3f}" for v in angles[:, 0]]
     columns["pitch_deg"] = [f"{v:.3f}" for v in angles[:, 1]]
@@ -146,7 +184,7 @@ def waypoint_columns(
 
 
 def _columns(header: list[str], line: int, path: Path | str) -> dict[str, int]:
-    """Positions of the columns that are known, by name."""
+    """Return the index of each known column."""
     names = [_ALIASES.get(cell.lower(), cell.lower()) for cell in header]
     known = {name: names.index(name) for name in (*_BOUNDS, "camera") if name in names}
     twice = [name for name in known if names.count(name) > 1]
@@ -159,7 +197,7 @@ def _columns(header: list[str], line: int, path: Path | str) -> dict[str, int]:
         missing.insert(0, f"a position (lat_deg, lon_deg and {' or '.join(_HEIGHTS)}; or x, y, z)")
     if missing:
         raise InputError(
-            f"has no column for {' and '.join(missing)}: "
+            f"has no column for {' and '.join(missing)}; "
             f"found {', '.join(header)[:300] or 'none'} (see docs/coverage.md)",
             path=path,
             line=line,
@@ -170,15 +208,15 @@ def _columns(header: list[str], line: int, path: Path | str) -> dict[str, int]:
 def _usable_heights(
     columns: dict[str, int], place: WaypointFrame, line: int, path: Path | str
 ) -> list[str]:
-    """Columns of heights that the area knows the zero of."""
+    """Return the height columns whose reference the area knows."""
     if not columns.keys() >= {"lat_deg", "lon_deg"}:
         return []
     usable = [name for name in place.columns() if name in columns]
     if not usable and not columns.keys() >= set(_ENU):
         found = ", ".join(name for name in _HEIGHTS if name in columns)
-        expected = " or ".join(place.columns()) or "x, y, z: it knows no zero of heights"
+        expected = " or ".join(place.columns()) or "x, y, z (its height reference is unknown)"
         raise InputError(
-            f"has heights as {found}, the area needs {expected}; no geoid model is built in",
+            f"has heights as {found}, but the area needs {expected}; no geoid model is built in",
             path=path,
             line=line,
         )
@@ -186,11 +224,11 @@ def _usable_heights(
 
 
 def _number(name: str, cell: str) -> float:
-    """NaN for an empty cell. Raises ValueError for what is no number within the column's bounds."""
+    """Parse a cell; NaN if empty. Raises ValueError if it is not a number within the column's bounds."""
     if cell.lower() in _UNKNOWN:
         return math.nan
     try:
-        value = math.inf if "_" in cell else float(cell)  # Python reads 1_0 as 10
+        value = math.inf if "_" in cell else float(cell)  # Python would accept 1_0 as 10
     except ValueError:
         value = math.inf
     if not math.isfinite(value):
@@ -203,7 +241,7 @@ def _number(name: str, cell: str) -> float:
 
 def _key(cell: str) -> str:
     if cell and not _KEY.fullmatch(cell):
-        raise ValueError(f"camera is {cell[:40]!r}, no key of a camera")
+        raise ValueError(f"camera is {cell[:40]!r}, which is not a valid camera key")
     return cell
 
 
@@ -214,39 +252,39 @@ def _centers(
     lines: list[int],
     path: Path | str,
 ) -> np.ndarray:
-    """Positions (N, 3) of the rows: the first statement counts, the others must agree with it."""
+    """Return the positions (N, 3); the first one stated in a row is used, the others must agree with it."""
     stated = [np.stack([_column(table, name) for name in _ENU], axis=1)]
     for name in heights:
-        zero = place.zero_of(_HEIGHTS[name])
-        alt = table[name] + (zero or 0.0)
+        offset = place.height_offset(_HEIGHTS[name])
+        alt = table[name] + (offset or 0.0)
         lat_lon_alt = np.stack([table["lat_deg"], table["lon_deg"], alt], axis=1)
         stated.append(place.origin.enu_from_wgs84(lat_lon_alt))
     centers = stated[0]
     unknown = np.isnan(centers)
     half = unknown.any(axis=1) & ~unknown.all(axis=1)
-    _refuse(half, "has no position: only a part of x, y, z", lines, path)
+    _reject(half, "has no position: x, y, z are incomplete", lines, path)
     for other in stated[1:]:
         apart = np.linalg.norm(other - centers, axis=1)
-        _refuse(
+        _reject(
             apart > _AGREE_M,
-            "its positions differ: x, y, z and latitude, longitude, height are not of one area's "
-            "origin, or one was edited and not the other",
+            "its two positions differ: x, y, z and latitude, longitude, height do not refer to the same "
+            "origin, or only one of them was edited",
             lines,
             path,
         )
         centers = np.where(np.isnan(centers).any(axis=1, keepdims=True), other, centers)
-    _refuse(np.isnan(centers).any(axis=1), "has no position", lines, path)
+    _reject(np.isnan(centers).any(axis=1), "has no position", lines, path)
     return centers
 
 
 def _column(table: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """(N,), NaN where there is no such column."""
+    """Return a column (N,); NaN if it is missing."""
     some = next(iter(table.values()))
     return table.get(name, np.full(len(some), np.nan))
 
 
-def _refuse(bad: np.ndarray, why: str, lines: list[int], path: Path | str) -> None:
-    """Raises InputError naming the first bad row."""
+def _reject(bad: np.ndarray, why: str, lines: list[int], path: Path | str) -> None:
+    """Raise InputError for the first bad row, if there is one."""
     rows = np.flatnonzero(bad)
     if len(rows):
         raise InputError(why, path=path, line=lines[rows[0]])

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from spn_data.capture.photos import load_mask
-from spn_data.coverage.nearest_frame import strata_of
+from spn_data.coverage.nearest_frame import coverage_strata
 from spn_data.dataset.hdf5_schema import DatasetFrame
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import (
@@ -63,7 +63,7 @@ def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
     if labelled.units == "m":
         others = group != TRAIN
         training = labels.poses[(group == TRAIN) & ~labels.tracked]
-        strata[others] = strata_of(labels.poses[others], training)
+        strata[others] = coverage_strata(labels.poses[others], training)
     return GivenFrames(
         labels,
         group,

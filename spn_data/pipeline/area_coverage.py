@@ -12,13 +12,13 @@ import numpy as np
 
 from spn_data.area.area import EVALUATION, GEO, MODEL, TRACKED, Area
 from spn_data.coverage.nearest_frame import CoverageOptions
-from spn_data.coverage.refly import FlyAgain, ReflyOptions, where_to_fly_again
+from spn_data.coverage.refly import ReflightPlan, ReflyOptions, plan_reflight
 from spn_data.coverage.sequence_table import (
     Coverage,
     MappingFrames,
     Queries,
-    cover,
-    remarks,
+    assess_coverage,
+    coverage_notes,
     write_coverage,
 )
 from spn_data.coverage.view_share import SeenMap
@@ -62,7 +62,7 @@ class AreaCoverage:
     units: str
     options: CoverageOptions | None
     by_name: dict[str, Coverage]
-    fly_again: FlyAgain | None
+    fly_again: ReflightPlan | None
     stops: dict[str, list[str]]
     notes: tuple[str, ...]
 
@@ -153,15 +153,19 @@ def _measured(
     is_metric = labelled.units == "m"
     chosen = options.coverage or (CoverageOptions() if is_metric else None)
     mapping = _mapping(labelled, has_up=is_metric)
-    by_name = {name: cover(each, mapping, chosen, progress) for name, each in queries.items()}
+    by_name = {
+        name: assess_coverage(each, mapping, chosen, progress) for name, each in queries.items()
+    }
     fly_again, stops = None, {}
     if place is not None and chosen is not None:
         poses, strata = _together(by_name)
-        fly_again = where_to_fly_again(poses, strata, chosen, options.refly)
+        fly_again = plan_reflight(poses, strata, chosen, options.refly)
         stops = waypoint_columns(fly_again.poses.centers, fly_again.angles_deg, place)
         numbers = {"stop": [str(k + 1) for k in range(len(fly_again))]}
         stops = {**numbers, **stops, "serves": [str(n) for n in fly_again.serves]}
-    notes = tuple(sentence for name, each in by_name.items() for sentence in remarks(name, each))
+    notes = tuple(
+        sentence for name, each in by_name.items() for sentence in coverage_notes(name, each)
+    )
     if not is_metric:
         notes = (
             "The map is in units of the model: lengths are no metres, no axis points up"
@@ -183,7 +187,7 @@ def _mapping(labelled: LabelledArea, *, has_up: bool) -> MappingFrames:
     return MappingFrames(
         labels.names[known],
         labels.poses[known],
-        SeenMap.of(labelled.points.xyz, centers, seen.frame_idx, rows),
+        SeenMap.build(labelled.points.xyz, centers, seen.frame_idx, rows),
         has_up,
     )
 

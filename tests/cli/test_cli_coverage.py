@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from spn_cli.data import main
 
 from spn_data.area.area import EVALUATION, FRAMES, GEO, Area
-from spn_data.coverage.nearest_frame import CoverageOptions, strata_of
+from spn_data.coverage.nearest_frame import CoverageOptions, coverage_strata
 from spn_data.coverage.sequence_table import COLUMNS
 from spn_data.coverage.waypoints import WaypointFrame, read_waypoints
 from spn_data.geometry.camera import Camera
@@ -125,12 +125,12 @@ def test_places_to_fly_again_close_the_gaps(area, labelled, tmp_path):
     away = Poses(base.centers + np.array([0.0, 0.0, 12.0]), base.quats_wxyz)
     register(Area(area), "away", away, ["registered"] * 6)
     shown = run("--area", area, "--fly-again", tmp_path / "again.csv")
-    assert "away: 6 of 6 lie above the highest mapping frame" in shown
+    assert "away: 6 of 6 are above the highest mapping frame" in shown
     assert "would bring 6 frames to high coverage" in shown
     stops = read_waypoints(tmp_path / "again.csv", WaypointFrame(labelled.origin, 0.0))
     assert 1 <= len(stops) < 6
-    assert set(strata_of(away, labelled.mapping.poses).tolist()) == {"low"}
-    assert set(strata_of(away, stops.poses).tolist()) == {"high"}
+    assert set(coverage_strata(away, labelled.mapping.poses).tolist()) == {"low"}
+    assert set(coverage_strata(away, stops.poses).tolist()) == {"high"}
     serves = [int(row["serves"]) for row in rows_of(tmp_path / "again.csv")]
     assert sum(serves) == 6
     listed = read_coverage(Area(area))["fly_again"]

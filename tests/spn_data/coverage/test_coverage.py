@@ -10,17 +10,17 @@ import pytest
 from spn_data.coverage.nearest_frame import (
     CoverageOptions,
     Stratum,
-    above_range,
+    coverage_strata,
+    height_outside_range,
     nearest_frames,
-    strata_of,
 )
-from spn_data.coverage.refly import ReflyOptions, where_to_fly_again
+from spn_data.coverage.refly import ReflyOptions, plan_reflight
 from spn_data.coverage.sequence_table import (
     COLUMNS,
     MappingFrames,
     Queries,
-    cover,
-    remarks,
+    assess_coverage,
+    coverage_notes,
     write_coverage,
 )
 from spn_data.coverage.view_share import SeenMap, ViewShareOptions, view_shares
@@ -67,12 +67,14 @@ class TestNearest:
             (0, 0, 4.9, 0, -39.9), (0, 0, 1, 0, 0, 41),
         )  # fmt: skip
         expected = ["high", *["medium", "high", "medium"], *["medium", "low"] * 3]
-        assert strata_of(queries, looking((0, 0, 0))).tolist() == expected
+        assert coverage_strata(queries, looking((0, 0, 0))).tolist() == expected
 
     def test_the_limits_are_options(self):
         """Other limits give other strata."""
         options = CoverageOptions(high_m=3.0, high_deg=20.0, medium_m=3.5, medium_deg=20.0)
-        found = strata_of(looking((2.9, 0, 0), (3.4, 0, 0), (3.6, 0, 0)), looking(NORTH), options)
+        found = coverage_strata(
+            looking((2.9, 0, 0), (3.4, 0, 0), (3.6, 0, 0)), looking(NORTH), options
+        )
         assert found.tolist() == ["high", "medium", "low"]
 
     def test_limits_of_high_lie_within_those_of_medium(self):
@@ -121,7 +123,7 @@ class TestNearest:
         queries, mapping = looking((1, 0, 0), (9, 0, 0)), looking((0, 0, 0), (9, 0, 0))
         queries.centers[0], queries.quats_wxyz[0] = np.nan, np.nan
         mapping.centers[1], mapping.quats_wxyz[1] = np.nan, np.nan
-        assert strata_of(queries, mapping).tolist() == ["", "low"]
+        assert coverage_strata(queries, mapping).tolist() == ["", "low"]
 
     def test_without_mapping_frames_there_is_no_answer(self):
         """Nothing to compare with is an error, not infinity."""
@@ -134,7 +136,7 @@ class TestNearest:
 
     def test_heights_beyond_the_mapping_frames(self):
         """Above the highest counts up, below the lowest down, between is zero."""
-        found = above_range(np.array([-1.0, 2.0, 5.0, 8.5]), np.array([2.0, 7.0, 3.0]))
+        found = height_outside_range(np.array([-1.0, 2.0, 5.0, 8.5]), np.array([2.0, 7.0, 3.0]))
         assert found.tolist() == [-3.0, 0.0, 0.0, 1.5]
 
     def test_the_best_answer_on_shop_facade(self, shared_data):
@@ -153,11 +155,11 @@ class TestNearest:
     def test_simulated_flights_are_what_their_names_say(self, flights):
         """`medium` is mostly within 5 m and 40 degrees; `low` never is, and flies above all of the map."""
         for mapping, evaluation in flights.values():
-            medium = strata_of(evaluation["medium"], mapping)
+            medium = coverage_strata(evaluation["medium"], mapping)
             assert np.mean(medium != Stratum.LOW) > 0.7
             low = evaluation["low"]
-            assert set(strata_of(low, mapping).tolist()) == {Stratum.LOW.value}
-            above = above_range(low.centers[:, 2], mapping.centers[:, 2])
+            assert set(coverage_strata(low, mapping).tolist()) == {Stratum.LOW.value}
+            above = height_outside_range(low.centers[:, 2], mapping.centers[:, 2])
             assert above.min() > 2.0
 
 
@@ -170,7 +172,7 @@ def wall(y: float, step: float = 0.25, half: float = 6.0) -> np.ndarray:
 def seen_from(xyz: np.ndarray, *centers: tuple[float, float, float]) -> SeenMap:
     """All points seen by each of some frames."""
     places, points = np.array(centers, dtype=np.float64), np.arange(len(xyz))
-    return SeenMap.of(
+    return SeenMap.build(
         xyz,
         places,
         np.repeat(np.arange(len(places)), len(xyz)),
@@ -224,9 +226,9 @@ class TestViews:
         xyz = np.concatenate([near, beyond])
         frames = np.array([[0.0, 8.0, 0.0]])  # between both walls
         rows = np.arange(len(near), len(xyz))
-        seen = SeenMap.of(xyz, frames, np.zeros(len(rows), np.int64), rows)
+        seen = SeenMap.build(xyz, frames, np.zeros(len(rows), np.int64), rows)
         assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
-        open_view = SeenMap.of(beyond, frames, np.zeros(len(rows), np.int64), rows - len(near))
+        open_view = SeenMap.build(beyond, frames, np.zeros(len(rows), np.int64), rows - len(near))
         assert view_shares(looking((0, 0, 0)), [CAMERA], open_view)[0] > 0.9
 
     def test_two_stray_points_hide_nothing(self):
@@ -238,7 +240,7 @@ class TestViews:
             found = view_shares(
                 looking((0, 0, 0)),
                 [CAMERA],
-                SeenMap.of(
+                SeenMap.build(
                     xyz, np.zeros((1, 3)), np.zeros(len(beyond), int), np.arange(len(beyond))
                 ),
                 ViewShareOptions(columns=8, rows=4),
@@ -266,7 +268,7 @@ class TestViews:
     def test_sightings_of_frames_without_a_pose_do_not_count(self):
         """A frame whose centre is unknown saw from nowhere."""
         point = np.array([[0.0, 10.0, 0.0]])
-        seen = SeenMap.of(point, np.full((1, 3), np.nan), np.zeros(1, int), np.zeros(1, int))
+        seen = SeenMap.build(point, np.full((1, 3), np.nan), np.zeros(1, int), np.zeros(1, int))
         assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
 
     def test_what_is_skipped_for_speed_changes_nothing(self, monkeypatch):
@@ -277,25 +279,25 @@ class TestViews:
         sightings = rng.integers(0, 40, 9000), rng.integers(0, len(xyz), 9000)
         rows = rng.uniform((-9, -9, -2, 0, -80, -20), (9, 9, 9, 360, 30, 20), (40, 6))
         poses = looking(*rows)
-        quick = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
+        quick = view_shares(poses, [CAMERA] * 40, SeenMap.build(xyz, frames, *sightings))
         monkeypatch.setattr("spn_data.coverage.view_share._BLOCK", 10_000)
         monkeypatch.setattr("spn_data.coverage.view_share._FIRST", 10_000)
-        slow = view_shares(poses, [CAMERA] * 40, SeenMap.of(xyz, frames, *sightings))
+        slow = view_shares(poses, [CAMERA] * 40, SeenMap.build(xyz, frames, *sightings))
         np.testing.assert_array_equal(quick, slow)
         assert 0.1 < quick.mean() < 0.9
 
 
-class TestFlyAgain:
+class TestReflightPlan:
     @pytest.mark.parametrize("wanted", [Stratum.HIGH, Stratum.MEDIUM])
     def test_frames_at_the_stops_close_all_gaps(self, flights, wanted):
         """With mapping frames added at the stops, no frame stays below what is wanted, on all seeds."""
         enough = {"high"} if wanted is Stratum.HIGH else {"high", "medium"}
         for mapping, evaluation in flights.values():
             queries = both(evaluation["medium"], evaluation["low"])
-            before = strata_of(queries, mapping)
+            before = coverage_strata(queries, mapping)
             needy = ~np.isin(before, list(enough))
-            found = where_to_fly_again(queries, before, refly=ReflyOptions(wanted=wanted))
-            after = strata_of(queries, both(mapping, found.poses))
+            found = plan_reflight(queries, before, refly=ReflyOptions(wanted=wanted))
+            after = coverage_strata(queries, both(mapping, found.poses))
             assert set(after.tolist()) <= enough
             assert needy.sum() > 200
             assert len(found) < needy.sum() / 5
@@ -307,44 +309,44 @@ class TestFlyAgain:
         """Each frame lies within 0.7 of the limits of the stop that serves it."""
         mapping, evaluation = flights[1]
         queries = evaluation["low"]
-        found = where_to_fly_again(queries, strata_of(queries, mapping))
+        found = plan_reflight(queries, coverage_strata(queries, mapping))
         options = CoverageOptions(high_m=1.4001, high_deg=10.501)
         served = found.poses[found.query_stop]
         for k in range(len(queries)):
-            assert strata_of(queries[k : k + 1], served[k : k + 1], options)[0] == "high"
+            assert coverage_strata(queries[k : k + 1], served[k : k + 1], options)[0] == "high"
 
     def test_one_stop_serves_a_cluster(self):
         """Ten frames within half a metre need one stop; one far away needs its own."""
         rows = [(0.05 * k, 0.0, 3.0, 90.0 + 0.2 * k, -10.0) for k in range(10)]
         queries = looking(*rows, (30, 0, 3, 90, -10))
-        found = where_to_fly_again(queries, np.full(11, "low"))
+        found = plan_reflight(queries, np.full(11, "low"))
         assert sorted(found.serves.tolist()) == [1, 10]
         np.testing.assert_allclose(found.angles_deg[:, 1:], [[-10, 0]] * 2, atol=1e-9)
 
     def test_stops_that_became_superfluous_are_left_out(self):
         """The stop in the middle serves most and is taken first; the two beside it make it needless."""
         queries = looking(*[(x, 0, 3) for x in (0.0, -1.3, 1.3, -0.9, 0.9, -2.5, 2.5)])
-        found = where_to_fly_again(queries, np.full(7, "low"))
+        found = plan_reflight(queries, np.full(7, "low"))
         assert sorted(found.poses.centers[:, 0].tolist()) == [-1.3, 1.3]
 
     def test_what_is_covered_needs_no_stop(self):
         """Frames of the wanted stratum are not served; none left gives no stop."""
-        found = where_to_fly_again(looking((0, 0, 0), (50, 0, 0)), np.array(["high", "high"]))
+        found = plan_reflight(looking((0, 0, 0), (50, 0, 0)), np.array(["high", "high"]))
         assert len(found) == 0
         assert found.query_stop.tolist() == [-1, -1]
 
     def test_a_camera_is_level_unless_the_frame_is_much_rolled(self):
         """A roll of 2 degrees is left out, one of 90 degrees (an upright phone) is kept."""
         queries = looking((0, 0, 0, 10, -5, 2), (20, 0, 0, 10, -5, 90))
-        found = where_to_fly_again(queries, np.array(["low", "low"]))
+        found = plan_reflight(queries, np.array(["low", "low"]))
         assert sorted(np.round(found.angles_deg[:, 2], 6).tolist()) == [0.0, 90.0]
-        assert set(strata_of(queries, found.poses).tolist()) == {"high"}
+        assert set(coverage_strata(queries, found.poses).tolist()) == {"high"}
 
     def test_the_order_is_a_short_path(self):
         """Stops along a shuffled line come back in their order along it, from one end to the other."""
         order = np.random.default_rng(3).permutation(30)
         queries = looking(*[(5.0 * k, 0.0, 3.0) for k in order])
-        found = where_to_fly_again(queries, np.full(30, "low"))
+        found = plan_reflight(queries, np.full(30, "low"))
         steps = np.diff(found.poses.centers[:, 0])
         np.testing.assert_allclose(np.abs(steps), 5.0)
         assert len(set(np.sign(steps))) == 1
@@ -356,7 +358,7 @@ class TestFlyAgain:
         ways = []
         for limit in (400, 0):
             monkeypatch.setattr("spn_data.coverage.refly._MAX_SHORTENED", limit)
-            centers = where_to_fly_again(queries, np.full(60, "low")).poses.centers
+            centers = plan_reflight(queries, np.full(60, "low")).poses.centers
             ways.append(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
         assert ways[0] < 0.9 * ways[1]
 
@@ -366,7 +368,7 @@ class TestFlyAgain:
         rng = np.random.default_rng(0)
         radius = 20 + rng.uniform(-1.5, 1.5, 40)
         rows = [(r * np.sin(a), r * np.cos(a), 5.0) for r, a in zip(radius, angle, strict=True)]
-        found = where_to_fly_again(looking(*rows), np.full(40, "low"))
+        found = plan_reflight(looking(*rows), np.full(40, "low"))
         flown = np.linalg.norm(np.diff(found.poses.centers, axis=0), axis=1).sum()
         loop = np.linalg.norm(np.diff(np.array(rows), axis=0), axis=1).sum()
         assert flown <= loop * 1.001
@@ -383,7 +385,7 @@ class TestTable:
             has_up,
         )
         names, reason = np.array(["e/1.jpg", "e/2.jpg", "e/3.jpg"]), np.array(["", "", "ambiguous"])
-        return cover(Queries(names, queries, [CAMERA] * 3, reason), mapping, options)
+        return assess_coverage(Queries(names, queries, [CAMERA] * 3, reason), mapping, options)
 
     def test_failed_frames_are_counted_and_have_a_row(self, tmp_path):
         """Three frames, one of them failed, are three rows and a count; medians are over the two others."""
@@ -401,10 +403,10 @@ class TestTable:
 
     def test_heights_that_were_never_mapped_are_told(self):
         """A frame 3 m above the highest mapping frame is named with that figure."""
-        sentences = remarks("e", self.table(options=CoverageOptions()))
+        sentences = coverage_notes("e", self.table(options=CoverageOptions()))
         assert any("1 of 3 frames failed" in s for s in sentences)
         assert any(
-            "1 of 2 lie above the highest mapping frame, by up to 3.0 m" in s for s in sentences
+            "1 of 2 are above the highest mapping frame, by up to 3.0 m" in s for s in sentences
         )
 
     def test_without_metres_there_are_no_strata_and_no_heights(self):
@@ -414,10 +416,10 @@ class TestTable:
         assert np.isnan(found.height).all()
         assert found.distance[1] == pytest.approx(3)
         assert found.summary()["heights"] is None
-        assert not any("lie above" in s for s in remarks("e", found))
+        assert not any("are above" in s for s in coverage_notes("e", found))
 
     def test_a_plan_of_another_place_is_told(self):
         """Frames kilometres away are rather a wrong sign than a plan."""
         found = self.table(options=CoverageOptions())
         far = replace(found, distance=found.distance + 7000.0)
-        assert any("7 km away" in s for s in remarks("e", far))
+        assert any("7 km away" in s for s in coverage_notes("e", far))
