@@ -1,4 +1,4 @@
-"""Simulated flights over a courtyard, with exact truth: for the demo, the tests, and what-if questions."""
+"""Simulated flights in a courtyard with exact ground truth, for the demo, tests and what-if studies."""
 
 from spn_data.simulate.flight import (
     FlightPath,

@@ -1,4 +1,4 @@
-"""Paints brick facades: identical windows that reflect, weathering, and a few things found only once."""
+"""Painting of brick facades: identical reflecting windows, weathering, and a few unique details."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from spn_data.simulate.textures import (
 BRICK_M = (0.25, 0.0833)
 WINDOW_M = (1.5, 2.0)
 WINDOW_PITCH_M = (3.25, 3.4)
-WINDOW_SILL_M = 1.3  # of the lowest row, above the ground
-GLASS_REFLECTS = 0.62
+WINDOW_SILL_M = 1.3  # height of the lowest sills above the ground
+GLASS_REFLECTANCE = 0.62
 
 
 def window_sprite(canvas: Canvas) -> np.ndarray:
-    """One window (h, w, 4) uint8, the same everywhere; the fourth channel is the glass's reflection."""
+    """Paint the window (h, w, 4) uint8 used everywhere; the fourth channel is the glass's reflectance."""
     width, height = canvas.texel(WINDOW_M[0]), canvas.texel(WINDOW_M[1])
     sprite = np.zeros((height, width, 4), np.uint8)
     sprite[:, :, :3] = (226, 224, 216)  # frame
@@ -37,12 +37,12 @@ def window_sprite(canvas: Canvas) -> np.ndarray:
         r0, r1 = frame + round(t0 * inner_h) + bar // 2, frame + round(t1 * inner_h) - bar // 2
         depth = np.linspace(34, 62, r1 - r0)[:, None]
         sprite[r0:r1, c0:c1, :3] = (depth[:, :, None] * (0.9, 1.0, 1.08)).astype(np.uint8)
-        sprite[r0:r1, c0:c1, 3] = round(255 * GLASS_REFLECTS)
+        sprite[r0:r1, c0:c1, 3] = round(255 * GLASS_REFLECTANCE)
     return sprite
 
 
 def window_corners_m(width_m: float, height_m: float) -> np.ndarray:
-    """Upper-left corners (N, 2) of the windows of a facade, metres right of and below its upper left."""
+    """Return upper-left corners (N, 2) of the windows, metres right of and below the facade's upper left."""
     columns = int((width_m - 1.0) // WINDOW_PITCH_M[0])
     left = (width_m - (columns - 1) * WINDOW_PITCH_M[0] - WINDOW_M[0]) / 2
     rows = int((height_m - WINDOW_SILL_M - WINDOW_M[1]) // WINDOW_PITCH_M[1]) + 1
@@ -58,20 +58,20 @@ def window_corners_m(width_m: float, height_m: float) -> np.ndarray:
 
 
 def target_texel(canvas: Canvas) -> tuple[int, int]:
-    """Row and column of the texel corner at the centre of the facade's survey target."""
+    """Return row and column of the texel corner at the centre of the facade's survey target."""
     pier = window_corners_m(*canvas.size_m)[0, 0] + (WINDOW_M[0] + WINDOW_PITCH_M[0]) / 2
     return canvas.shape[0] - canvas.texel(4.2), canvas.texel(pier)
 
 
 def paint_facade(canvas: Canvas) -> np.ndarray:
-    """Brick wall (H, W, 4) with the identical window grid, weathering, and a few things found only here."""
+    """Paint a brick wall (H, W, 4) with the common window grid, weathering, and details of its own."""
     rng = canvas.rng
     palette = palette_around(rng, (150, 88, 68), 0.14)
     image = masonry(canvas, rng, palette, BRICK_M)
     rows, columns = canvas.shape
     weather = clouds(rng, canvas, largest_m=9.0, smallest_m=0.12)
     factor = 1.0 + 0.085 * weather + grain(rng, canvas.shape, 0.035)
-    # Rain streaks: dark bands that run down, wide ones few and thin ones many.
+    # Rain streaks: dark vertical bands, few wide ones and many thin ones.
     streak = cv2.resize(rng.standard_normal((5, columns // 5), dtype=np.float32), (columns, rows))
     factor -= 0.05 * np.clip(streak, 0, 2.5)
     damp = np.linspace(0, canvas.size_m[1], rows, dtype=np.float32)[:, None]
@@ -100,19 +100,19 @@ def paint_facade(canvas: Canvas) -> np.ndarray:
         ] //= 2
         image[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, :3]
         alpha[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, 3]
-    _unique_things(image, alpha, canvas, rng)
+    _paint_unique_details(image, alpha, canvas, rng)
     return np.dstack([image, alpha])
 
 
-def _unique_things(
+def _paint_unique_details(
     image: np.ndarray, alpha: np.ndarray, canvas: Canvas, rng: np.random.Generator
 ) -> None:
-    """Door, posters, sign, pipe and cables, in place, between the windows."""
+    """Paint a door, posters, pipes, the survey target and a sign between the windows, in place."""
     rows = len(alpha)
     corners = window_corners_m(*canvas.size_m)
     gaps_m = np.unique(corners[:, 0])[:-1] + WINDOW_M[0]  # left ends of the piers between windows
     pier_m = WINDOW_PITCH_M[0] - WINDOW_M[0]
-    picks = 1 + rng.permutation(len(gaps_m) - 1)  # the first pier bears the survey target
+    picks = 1 + rng.permutation(len(gaps_m) - 1)  # the first pier carries the survey target
 
     def paste(part: np.ndarray, x_m: float, y_m: float) -> None:
         r, c = canvas.texel(y_m), canvas.texel(x_m)

@@ -1,4 +1,4 @@
-"""Surfaces of a scene: flat polygons with mip-mapped textures."""
+"""Surfaces of a scene: planar polygons with mip-mapped textures."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _UNIT_SQUARE_EDGES = np.array([[1.0, 0, 0], [-1, 0, 1], [0, 1, 0], [0, -1, 1]])
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image (H, W, 3 or 4) uint8 RGB and its mip levels; a fourth channel is how much mirrors."""
+    """Mip levels of an image (H, W, 3 or 4) uint8 RGB; a fourth channel is the reflectance."""
 
     levels: tuple[np.ndarray, ...]
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> Texture:
-        """Each level is the area mean of the one before, at half its size (rounded down)."""
+        """Build the mip levels: each is the area mean of the previous one at half its size (rounded down)."""
         levels = [np.ascontiguousarray(image)]
         while min(levels[-1].shape[:2]) > 8:
             height, width = levels[-1].shape[:2]
@@ -31,16 +31,16 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A parallelogram, or a convex polygon in its plane, with a texture on its front.
+    """Parallelogram, or a convex polygon in its plane, with a texture on its front.
 
-    origin, u_edge, v_edge : (3,) metres; where the texture's upper-left corner lies, and its upper and
+    origin, u_edge, v_edge : (3,) metres; position of the texture's upper-left corner, and its upper and
         left border. Seen from the front, u is to the right of v: the front is where
         ``(eye - origin) . (u_edge x v_edge) < 0``.
     region : (s0, t0, s1, t1), the part of the texture used, as fractions of its width and height.
     polygon : (K, 2), 3 <= K <= 8, convex, in units of the two edges, running from +u towards +v;
-        None is the whole.
-    mirrored : what the mirror parts of the texture reflect, as a face at its mirror image behind.
-    at_infinity : the face moves along with the eye (sky).
+        None for the whole parallelogram.
+    mirrored : what the reflecting parts of the texture show, as a face at its mirror image behind this one.
+    at_infinity : whether the face moves with the eye (sky).
     """
 
     texture: str
@@ -53,18 +53,18 @@ class Face:
     at_infinity: bool = False
 
     def edges(self) -> np.ndarray:
-        """Lines (K, 3) with ``a s + b t + c >= 0`` inside, in units of the two edges."""
+        """Return lines (K, 3) with ``a s + b t + c >= 0`` inside, in units of the two edges."""
         if self.polygon is None:
             return _UNIT_SQUARE_EDGES
         if not 3 <= len(self.polygon) <= MAX_CORNERS:
-            raise ValueError(f"a face has 3 to {MAX_CORNERS} corners, not {len(self.polygon)}")
+            raise ValueError(f"a face needs 3 to {MAX_CORNERS} corners, not {len(self.polygon)}")
         start, step = self.polygon, np.roll(self.polygon, -1, axis=0) - self.polygon
         a, b = -step[:, 1], step[:, 0]
         return np.stack([a, b, -(a * start[:, 0] + b * start[:, 1])], axis=1)
 
 
 def mirror_face(target: Face, mirror: Face) -> Face:
-    """The face `target` as it appears behind the plane of `mirror`."""
+    """Reflect the face `target` in the plane of `mirror`."""
     normal = np.cross(mirror.u_edge, mirror.v_edge)
     normal = normal / np.linalg.norm(normal)
     reflect = np.eye(3) - 2 * np.outer(normal, normal)

@@ -1,4 +1,4 @@
-"""Where the simulated drone is, when, and what its telemetry says of it: exact, and without rendering."""
+"""Exact trajectories of the simulated flights and their telemetry, without rendering."""
 
 from __future__ import annotations
 
@@ -19,12 +19,29 @@ ROLES = ("mapping", "evaluation")
 
 @dataclass(frozen=True, eq=False)
 class FlightPath:
-    """One flight with exact truth.
+    """One flight with its exact trajectory; N is the number of video frames.
 
-    role : "mapping" or "evaluation". time_s : (N,) of the video's frames. poses : at mid-exposure of the
-    middle row, East-North-Up about the true origin. blurred : (N,) bool; blur_vectors : (N, 3), rotation
-    of the camera during the exposure as a vector in the camera frame, radians, zero where not blurred.
-    exposure_ev : (N,). motion : poses at any time, also between frames and a few seconds beyond the ends.
+    Attributes
+    ----------
+    name : str
+        Name of the flight.
+    role : str
+        "mapping" or "evaluation".
+    camera : Camera
+        Intrinsics of all frames.
+    time_s : ndarray, shape (N,)
+        Times of the video frames.
+    poses : Poses
+        Poses at mid-exposure of the middle row, East-North-Up about the true origin.
+    blurred : ndarray of bool, shape (N,)
+        Whether the frame has motion blur.
+    blur_vectors : ndarray, shape (N, 3)
+        Rotation of the camera during the exposure, as a rotation vector in the camera frame in radians;
+        zero if not blurred.
+    exposure_ev : ndarray, shape (N,)
+        Exposure of the frames, in EV.
+    motion : Motion
+        Poses at any time, also between frames and a few seconds beyond both ends.
     """
 
     name: str
@@ -40,10 +57,22 @@ class FlightPath:
 
 @dataclass(frozen=True, eq=False)
 class FlightTelemetry:
-    """What one flight's telemetry says, before rounding: one record a video frame.
+    """Telemetry of one flight before rounding, with one record per video frame.
 
-    time_s : (N,) as stamped. lat_lon_deg : (N, 2). rel_alt_m, abs_alt_m : (N,). gimbal_deg : (N, 3)
-    heading, pitch, roll. errors_m : (N, 3), of the position, east, north, up; is_burst : (N,) bool.
+    Attributes
+    ----------
+    time_s : ndarray, shape (N,)
+        Timestamps as recorded.
+    lat_lon_deg : ndarray, shape (N, 2)
+        Recorded positions.
+    rel_alt_m, abs_alt_m : ndarray, shape (N,)
+        Recorded heights.
+    gimbal_deg : ndarray, shape (N, 3)
+        Heading, pitch and roll.
+    errors_m : ndarray, shape (N, 3)
+        Errors of the positions east, north and up.
+    is_burst : ndarray of bool, shape (N,)
+        Whether the position is affected by a multipath burst.
     """
 
     time_s: np.ndarray
@@ -56,14 +85,27 @@ class FlightTelemetry:
 
 
 def flight_rng(options: SimulateOptions, flight: str, purpose: int) -> np.random.Generator:
-    """Independent random numbers for each flight and purpose."""
+    """Return a random generator that is independent for each flight and purpose."""
     return np.random.default_rng([options.seed, zlib.crc32(flight.encode()), purpose])
 
 
 def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
-    """Exact paths of the flights that the options ask for, by name; mapping flights first.
+    """Compute the exact trajectories of the requested flights.
 
-    Raises InputError where `only` names no flight.
+    Parameters
+    ----------
+    options : SimulateOptions
+        What to simulate; `only` restricts the flights.
+
+    Returns
+    -------
+    dict of str to FlightPath
+        Flights by name, mapping flights first.
+
+    Raises
+    ------
+    InputError
+        If `only` names an unknown flight or role.
     """
     half_m = options.scene.half_m
     side = float(np.sqrt(options.area_factor)) * options.length_factor
@@ -83,8 +125,9 @@ def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
         motion, duration_s = straight_line(rng("straight"), half_m, options.length_factor)
         add("straight", "mapping", motion, duration_s)
     else:
-        # Along the facades looking forward at them, after a first look across; then the other way round,
-        # looking across first and at the facades in the end: both see all, from near and far.
+        # The first flight looks across the courtyard briefly, then at the facades ahead. The second one goes
+        # the other way round and looks across for longer before it turns to the facades. Both see everything
+        # from near and far.
         motion = courtyard_loop(
             rng("flight1"), half_m, duration_s=75 * side, margin_m=8.0, laps=1.25 * laps, turn=1,
             offsets_deg=[(0.0, 150.0), (0.1, 140.0), (0.32, 40.0), (0.75, 25.0), (1.0, 40.0)],
@@ -112,16 +155,16 @@ def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
     for name in wanted:
         if name not in motions and name not in ROLES:
             raise InputError(
-                f"there is no flight {name!r}; there are {', '.join([*motions, *ROLES])}"
+                f"unknown flight {name!r}; choose from {', '.join([*motions, *ROLES])}"
             )
     return {
-        name: _flight(options, name, role, duration_s, motion)
+        name: _flight_path(options, name, role, duration_s, motion)
         for name, (role, duration_s, motion) in motions.items()
         if name in wanted or role in wanted
     }
 
 
-def _flight(
+def _flight_path(
     options: SimulateOptions, name: str, role: str, duration_s: float, motion: Motion
 ) -> FlightPath:
     rng = flight_rng(options, name, 1)
@@ -152,23 +195,37 @@ def _flight(
 
 
 def simulate_telemetry(path: FlightPath, options: SimulateOptions) -> FlightTelemetry:
-    """Telemetry of a flight. The record stamped t is of the video's time t + `time_offset_s`.
+    """Simulate the telemetry of a flight.
 
-    The relative height counts from the courtyard's ground and carries the same vertical error as the
-    absolute one. Gimbal angles are those of the camera plus a constant bias for the flight.
+    Parameters
+    ----------
+    path : FlightPath
+        Exact trajectory of the flight.
+    options : SimulateOptions
+        Error model; a record with timestamp t belongs to the video time t + `time_offset_s`.
+
+    Returns
+    -------
+    FlightTelemetry
+        One record per video frame.
+
+    Notes
+    -----
+    The relative height refers to the ground of the courtyard and has the same vertical error as the
+    absolute one. Gimbal angles are those of the camera plus a bias that is constant for the flight.
     """
     rng = flight_rng(options, path.name, 2)
     true_s = path.time_s + options.time_offset_s
     centers, angles_deg = path.motion.at(true_s)
     errors_m, is_burst = gnss_errors(true_s, options.gnss, rng)
     bias_deg = rng.standard_normal(3) * options.gimbal_sigma_deg
-    found = centers + errors_m
+    measured = centers + errors_m
     gimbal = angles_deg + bias_deg if options.gimbal_angles else np.full((len(true_s), 3), np.nan)
     return FlightTelemetry(
         path.time_s,
-        options.origin.wgs84_from_enu(found)[:, :2],
-        found[:, 2],
-        found[:, 2] + options.origin.alt_m - options.geoid_m,
+        options.origin.wgs84_from_enu(measured)[:, :2],
+        measured[:, 2],
+        measured[:, 2] + options.origin.alt_m - options.geoid_m,
         gimbal,
         errors_m,
         is_burst,
@@ -176,7 +233,7 @@ def simulate_telemetry(path: FlightPath, options: SimulateOptions) -> FlightTele
 
 
 def exposure_poses(path: FlightPath, frame: int) -> Poses:
-    """Poses (K,) of a blurred frame's exposure, evenly spaced in time and symmetric about its middle."""
+    """Return K poses during a blurred frame's exposure, evenly spaced in time, symmetric about its middle."""
     vector = path.blur_vectors[frame]
     blur_px = np.linalg.norm(vector) * max(path.camera.focal_px)
     count = 2 * max(3, int(np.ceil(blur_px / 2.4)))

@@ -1,4 +1,4 @@
-"""What to simulate: every choice is an option, and two sets of them have names."""
+"""Options of the simulation and named presets."""
 
 from __future__ import annotations
 
@@ -13,64 +13,65 @@ from spn_data.simulate.scene import SceneOptions
 
 
 class MappingPaths(StrEnum):
-    """How the area is flown for mapping."""
+    """Flight patterns of the mapping flights."""
 
     COURTYARD = "courtyard"  # two flights inside the courtyard, 1.5-9 m high
     NADIR = "nadir"  # one flight in parallel lines above the building, looking down
-    STRAIGHT = "straight"  # one flight along a straight line beside the north facade
+    STRAIGHT = "straight"  # one flight along a straight line parallel to the north facade
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions:
-    """One camera; the image size is the flight's."""
+    """Lens of one camera; the image size is given by the flight."""
 
     fov_deg: float  # horizontal, of the undistorted image
     distortion: tuple[float, ...] = ()  # none, (k1,), (k1, k2) or (k1, k2, p1, p2) as in COLMAP
 
     def camera(self, width: int, height: int) -> Camera:
+        """Return the camera for an image size."""
         return Camera.from_horizontal_fov(width, height, self.fov_deg, self.distortion)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """All that the simulated flights depend on: equal options give equal files."""
+    """Options that determine the simulated flights: equal options give equal files."""
 
     preset: str = "standard"
     seed: int = 1
     width: int = 1280
     height: int = 720
-    fps: float = 10.0  # of the video; telemetry has one record a frame
+    fps: float = 10.0  # of the video; telemetry has one record per frame
     only: tuple[str, ...] = ()  # flights or roles (mapping, evaluation) to render; empty for all
     mapping_paths: MappingPaths = MappingPaths.COURTYARD
-    area_factor: float = 1.0  # times the courtyard's ground area; flights grow with its side
-    length_factor: float = 1.0  # times the flights' duration, at the same speed
+    area_factor: float = 1.0  # factor on the courtyard's ground area; flights grow with its side
+    length_factor: float = 1.0  # factor on the duration of the flights, at the same speed
     mapping_lens: LensOptions = field(
         default_factory=lambda: LensOptions(fov_deg=72.0, distortion=(-0.05, 0.015))
     )
     evaluation_lens: LensOptions = field(
         default_factory=lambda: LensOptions(fov_deg=94.0, distortion=(-0.1, 0.02))
     )
-    blur_share: float = 0.12  # of the frames that rotate during their exposure
+    blur_share: float = 0.12  # share of frames that rotate during their exposure
     blur_deg: tuple[float, float] = (
         0.35,
         1.3,
-    )  # least and greatest rotation during such an exposure
+    )  # minimum and maximum rotation during such an exposure
     exposure_sigma_ev: float = 0.2  # slow changes of exposure
-    lens_blur_px: float = 0.45  # deviation of the lens's point spread
-    noise_sigma: float = 1.8  # of the sensor, in grey levels of 255
+    lens_blur_px: float = 0.45  # standard deviation of the lens's point spread function
+    noise_sigma: float = 1.8  # of the sensor, in grey levels (of 255)
     readout_s: float = (
-        0.0  # rolling shutter: from the first row to the last; 0 for a global shutter
+        0.0  # rolling shutter: time from the first row to the last; 0 for a global shutter
     )
     gnss: GnssOptions = field(default_factory=GnssOptions)
-    gimbal_angles: bool = True  # whether telemetry has them
+    gimbal_angles: bool = True  # whether telemetry contains them
     gimbal_sigma_deg: tuple[float, float, float] = (
         2.0,
         0.3,
         0.3,
     )  # constant bias per flight: heading, pitch, roll
-    time_offset_s: float = 0.0  # to be added to telemetry's times to get the video's
+    time_offset_s: float = 0.0  # added to telemetry times to get video times
     origin: GeoOrigin = field(default_factory=lambda: GeoOrigin(49.015422, 8.425117, 163.2))
-    geoid_m: float = 48.3  # of mean sea level, which abs_alt counts from, above the ellipsoid
+    geoid_m: float = 48.3  # height of mean sea level, to which abs_alt refers, above the ellipsoid
     texels_per_m: float = 140.0  # resolution of the painted surfaces
     houses_per_hectare: float = 0.0  # on the courtyard's ground
     crf: int = 18  # H.264 quality; lower is better
@@ -78,22 +79,23 @@ class SimulateOptions:
     def __post_init__(self) -> None:
         if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
             raise InputError(
-                f"image size {self.width} x {self.height}: H.264 takes even numbers from 16 on"
+                f"image size {self.width} x {self.height}: H.264 needs even numbers of at least 16"
             )
         if self.fps <= 0 or self.area_factor <= 0 or self.length_factor <= 0:
             raise InputError("fps, area factor and length factor must be above zero")
         if not 0 <= self.blur_share <= 1:
-            raise InputError(f"blur share {self.blur_share} lies outside 0 to 1")
+            raise InputError(f"blur share {self.blur_share} is outside 0 to 1")
         if abs(self.time_offset_s) > 5:
-            raise InputError(f"time offset {self.time_offset_s} s is beyond 5 s either way")
-        # The ground is one picture, of so many texels at most.
+            raise InputError(f"time offset {self.time_offset_s} s is outside -5 to 5 s")
+        # The ground is one texture, which limits its number of texels.
         if self.area_factor > 16 and self.texels_per_m > 170 / self.area_factor**0.5:
             raise InputError(
-                f"area factor {self.area_factor} is beyond 16 at {self.texels_per_m:g} texels a metre"
+                f"area factor {self.area_factor} exceeds 16 at {self.texels_per_m:g} texels per metre"
             )
 
     @property
     def scene(self) -> SceneOptions:
+        """Options of the scene."""
         return SceneOptions(
             area_factor=self.area_factor,
             texels_per_m=self.texels_per_m,
@@ -109,7 +111,13 @@ PRESETS: dict[str, SimulateOptions] = {
 
 
 def preset(name: str, *, seed: int = 1) -> SimulateOptions:
-    """The options of a name in `PRESETS`, with a seed. Raises InputError for another name."""
+    """Return the options of a preset in `PRESETS` with a seed.
+
+    Raises
+    ------
+    InputError
+        If there is no preset of this name.
+    """
     if name not in PRESETS:
-        raise InputError(f"there is no preset {name!r}; there are {', '.join(sorted(PRESETS))}")
+        raise InputError(f"unknown preset {name!r}; choose from {', '.join(sorted(PRESETS))}")
     return replace(PRESETS[name], seed=seed)

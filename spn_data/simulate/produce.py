@@ -1,4 +1,4 @@
-"""Renders the flights of a scene into videos, with telemetry and truth beside them."""
+"""Rendering of the flights into videos, together with telemetry and ground truth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from spn_data.simulate.flight import (
 )
 from spn_data.simulate.presets import SimulateOptions
 from spn_data.simulate.render import BAND_PX, SceneRenderer
-from spn_data.simulate.scene import SceneFaces, build_place, paint
+from spn_data.simulate.scene import SceneFaces, build_scene, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
@@ -43,25 +43,42 @@ def simulate(
     *,
     workers: int | None = None,
 ) -> None:
-    """Write `mapping/`, `evaluation/` and `truth/` into a new folder `out`.
+    """Write `mapping/`, `evaluation/` and `truth/` to a new folder.
 
-    progress : called with (frames done, frames in all). workers : processes that render; None is one a
-    core, 1 renders in this process. The result does not depend on it. The folder appears when it is
-    complete. Raises StageError where `out` exists or cannot be made.
+    Parameters
+    ----------
+    out : Path
+        Folder to create; it appears only when complete.
+    options : SimulateOptions
+        What to simulate.
+    progress : callable, optional
+        Called with the number of rendered frames and the total number of frames.
+    workers : int, optional
+        Number of rendering processes; one per core by default, 1 renders in this process. The result does
+        not depend on it.
+
+    Raises
+    ------
+    StageError
+        If `out` already exists or cannot be created.
+    InputError
+        If the options name an unknown flight.
     """
     paths = simulate_paths(options)
     if out.exists():
-        raise StageError(f"{out} exists: name another folder, or remove it first")
+        raise StageError(f"{out} already exists; choose another folder or remove it first")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.partial-", dir=out.parent))
     except OSError as error:
-        raise StageError(f"{out}: cannot be made ({error})") from error
+        raise StageError(f"{out}: cannot be created ({error})") from error
     try:
         _produce(partial, options, paths, progress, workers or os.cpu_count() or 1)
-        partial.chmod(0o755)  # mkdtemp's is for its owner alone
+        partial.chmod(0o755)  # mkdtemp creates folders that only the owner can read
         if out.exists():
-            raise StageError(f"{out} has appeared while rendering: nothing was written there")
+            raise StageError(
+                f"{out} was created by another process while rendering; nothing was written to it"
+            )
         partial.rename(out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -79,15 +96,15 @@ def _produce(
         (folder / name).mkdir()
     write_options(folder / "truth", options)
     total, done = sum(len(path.time_s) for path in paths.values()), 0
-    place = build_place(options.scene)
-    with _Crew(options, texture_folder, workers) as crew:
-        for _ in crew.map(_paint_to, [(name,) for name in place.canvases]):
+    scene = build_scene(options.scene)
+    with _RenderPool(options, texture_folder, workers) as pool:
+        for _ in pool.map(_paint_texture, [(name,) for name in scene.canvases]):
             pass
         for path in paths.values():
 
             def frames(path: FlightPath = path) -> Iterator[np.ndarray]:
                 nonlocal done
-                for image in crew.map(_render, [(path.name, i) for i in range(len(path.time_s))]):
+                for image in pool.map(_render, [(path.name, i) for i in range(len(path.time_s))]):
                     yield image
                     done += 1
                     if progress is not None:
@@ -107,28 +124,28 @@ def _produce(
     shutil.rmtree(texture_folder)
 
 
-class _Studio:
-    """What one process holds to render: textures mapped from files, one renderer for each camera."""
+class _RenderContext:
+    """Rendering state of one process: textures mapped from files, and one renderer per camera."""
 
     def __init__(self, options: SimulateOptions, texture_folder: Path):
         cv2.setNumThreads(1)
         self.options = options
         self.texture_folder = texture_folder
-        self.place: SceneFaces = build_place(options.scene)
+        self.scene: SceneFaces = build_scene(options.scene)
         self.paths = simulate_paths(options)
         self.noise = noise_field(options.width, options.height, options.noise_sigma, options.seed)
         self._textures: dict[str, Texture] = {}
         self._renderers: dict[str, SceneRenderer] = {}
 
     def renderer(self, path: FlightPath) -> SceneRenderer:
-        """The renderer of a flight's camera."""
+        """Return the renderer for a flight's camera."""
         if not self._textures:
             self._textures = {
-                name: _open_texture(self.texture_folder, name) for name in self.place.canvases
+                name: _open_texture(self.texture_folder, name) for name in self.scene.canvases
             }
         if path.role not in self._renderers:
             self._renderers[path.role] = SceneRenderer(
-                self.place.faces, self._textures, path.camera
+                self.scene.faces, self._textures, path.camera
             )
         return self._renderers[path.role]
 
@@ -136,7 +153,7 @@ class _Studio:
 def _open_texture(folder: Path, name: str) -> Texture:
     count = len(list(folder.glob(f"{name}.*.npy")))
     files = [folder / f"{name}.{k}.npy" for k in range(count)]
-    # Large levels are shared between processes; each mapping holds a file open, and of these there are few.
+    # Large levels are shared between processes. Each memory map holds a file open, whose number is limited.
     levels = [
         np.load(file, mmap_mode="r") if file.stat().st_size > 4e6 else np.load(file)
         for file in files
@@ -144,21 +161,21 @@ def _open_texture(folder: Path, name: str) -> Texture:
     return Texture(tuple(np.asarray(level) for level in levels))
 
 
-def _paint_to(studio: _Studio, name: str) -> None:
-    texture = Texture.from_image(paint(studio.place, name))
+def _paint_texture(context: _RenderContext, name: str) -> None:
+    texture = Texture.from_image(paint(context.scene, name))
     for k, level in enumerate(texture.levels):
-        np.save(studio.texture_folder / f"{name}.{k}.npy", level)
+        np.save(context.texture_folder / f"{name}.{k}.npy", level)
 
 
-def _render(studio: _Studio, flight: str, frame: int) -> np.ndarray:
-    path = studio.paths[flight]
-    image = render_frame(studio.renderer(path), path, frame, studio.options.readout_s)
-    rng = flight_rng(studio.options, flight, 1000 + frame)
+def _render(context: _RenderContext, flight: str, frame: int) -> np.ndarray:
+    path = context.paths[flight]
+    image = render_frame(context.renderer(path), path, frame, context.options.readout_s)
+    rng = flight_rng(context.options, flight, 1000 + frame)
     return develop(
         image,
-        lens_blur_px=studio.options.lens_blur_px,
+        lens_blur_px=context.options.lens_blur_px,
         exposure_ev=float(path.exposure_ev[frame]),
-        noise=studio.noise,
+        noise=context.noise,
         rng=rng,
     )
 
@@ -166,7 +183,7 @@ def _render(studio: _Studio, flight: str, frame: int) -> np.ndarray:
 def render_frame(
     renderer: SceneRenderer, path: FlightPath, frame: int, readout_s: float = 0.0
 ) -> np.ndarray:
-    """One frame (H, W, 3) uint8 RGB of a flight, before exposure and noise."""
+    """Render one frame (H, W, 3) uint8 RGB of a flight, before exposure and noise."""
     blurred = bool(path.blurred[frame])
     if readout_s == 0.0:
         if blurred:
@@ -185,42 +202,41 @@ def render_frame(
     return np.rint(np.mean(images, axis=0, dtype=np.float32)).astype(np.uint8)
 
 
-_studio: _Studio | None = (
-    None  # of this worker process; a pool's initializer has nowhere else to put it
-)
+# State of this worker process; a pool's initializer can keep it only in a global.
+_context: _RenderContext | None = None
 
 
-def _open_studio(options: SimulateOptions, texture_folder: Path, parent_pid: int) -> None:
-    global _studio
-    # Ctrl-C reaches every process of the terminal; the parent alone answers it, and ends the others.
+def _init_worker(options: SimulateOptions, texture_folder: Path, parent_pid: int) -> None:
+    global _context
+    # Ctrl-C reaches every process of the terminal; only the parent handles it, and it ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent(parent_pid)
-    _studio = _Studio(options, texture_folder)
+    _context = _RenderContext(options, texture_folder)
 
 
-def _in_studio(task: Callable[..., Any], args: tuple[object, ...]) -> Any:
-    assert _studio is not None
-    return task(_studio, *args)
+def _run_in_worker(task: Callable[..., Any], args: tuple[object, ...]) -> Any:
+    assert _context is not None
+    return task(_context, *args)
 
 
-class _Crew:
-    """Processes that paint and render; with one worker, this process itself."""
+class _RenderPool:
+    """Processes that paint and render; with one worker, the current process."""
 
     def __init__(self, options: SimulateOptions, texture_folder: Path, workers: int):
         self._workers = workers
-        self._studio: _Studio | None = None
+        self._context: _RenderContext | None = None
         self._pool: ProcessPoolExecutor | None = None
         if workers == 1:
-            self._studio = _Studio(options, texture_folder)
+            self._context = _RenderContext(options, texture_folder)
         else:
             self._pool = ProcessPoolExecutor(
                 workers,
                 mp_context=multiprocessing.get_context("spawn"),
-                initializer=_open_studio,
+                initializer=_init_worker,
                 initargs=(options, texture_folder, os.getpid()),
             )
 
-    def __enter__(self) -> _Crew:
+    def __enter__(self) -> _RenderPool:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -228,14 +244,14 @@ class _Crew:
             self._pool.shutdown(cancel_futures=True)
 
     def map(self, task: Callable[..., Any], arguments: list[tuple[object, ...]]) -> Iterator[Any]:
-        """Results in order, with a few tasks under way ahead of the one awaited."""
+        """Yield results in order, with a limited number of tasks submitted ahead."""
         if self._pool is None:
             for args in arguments:
-                yield task(self._studio, *args)
+                yield task(self._context, *args)
             return
         pending: deque[Future[Any]] = deque()
         for args in arguments:
-            pending.append(self._pool.submit(_in_studio, task, args))
+            pending.append(self._pool.submit(_run_in_worker, task, args))
             if len(pending) > 4 * self._workers:
                 yield pending.popleft().result()
         while pending:

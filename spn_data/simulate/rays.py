@@ -1,4 +1,4 @@
-"""Rays of a distorted camera's pixels, in tiles."""
+"""Viewing rays of the pixels of a distorted camera, in tiles."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ TILE_PX = 32
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Rays of some image rows, and what bounds them in each of T tiles.
+    """Rays of a range of image rows, and their bounds in each of T tiles.
 
-    rays : (h, w * samples, 2) float32, x/z and y/z; a pixel's samples are neighbours in a row.
+    rays : (h, w * samples, 2) float32, x/z and y/z; the samples of a pixel are adjacent in a row.
     tiles : (T, 4) int, first row, last row + 1, first column, last column + 1 in `rays`; row by row.
-    middle, half : (T, 2), the bounding box of a tile's rays.
-    jet : (T, 3, 3), columns are the ray of the tile's middle pixel and its change by one pixel in x and y.
+    middle, half : (T, 2), centre and half size of the bounding box of a tile's rays.
+    jet : (T, 3, 3), columns are the ray of the tile's middle pixel and its derivative per pixel in x and y.
     """
 
     rays: np.ndarray
@@ -31,6 +31,7 @@ class RayGrid:
     def of_rows(
         cls, camera: Camera, offsets_px: np.ndarray, first_row: int, last_row: int, tile_rows: int
     ) -> RayGrid:
+        """Compute the rays of image rows, with samples at the given offsets (S, 2) from pixel centres."""
         samples = len(offsets_px)
         x = (np.arange(camera.width) + 0.5)[:, None] + offsets_px[:, 0]
         y = (np.arange(first_row, last_row) + 0.5)[:, None, None] + offsets_px[:, 1]

@@ -1,11 +1,11 @@
-"""Renders textured planar faces through a distorted lens: free of aliasing, exact to a few 0.01 px.
+"""Anti-aliased rendering of textured planar faces through a distorted lens, exact to a few 0.01 px.
 
 A plane seen through a pinhole is linear in the ray: with ``X = origin + s*u_edge + t*v_edge``, the vector
 ``(s, t, 1) / depth`` is a matrix times the ray ``(x, y, 1)``. Visibility, face edges and texture
-coordinates all come from that matrix, and lens distortion only enters the rays, which are computed once
-per camera. The image is worked off in tiles: where one face covers a tile (most of them), it is sampled
-at once; elsewhere each sample takes the nearest face. Each pixel is the mean of four samples on a rotated
-grid, each of them bilinear in a mip level chosen by the tile's footprint on the texture.
+coordinates all follow from that matrix, and lens distortion only enters the rays, which are computed once
+per camera. The image is processed in tiles: if one face covers a tile (most of them), it is sampled
+at once; otherwise each sample takes the nearest face. Each pixel is the mean of four samples on a rotated
+grid, each interpolated bilinearly in a mip level chosen by the tile's footprint on the texture.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from spn_data.geometry.camera import Camera
 from spn_data.simulate.faces import MAX_CORNERS, Face, Texture
 from spn_data.simulate.rays import TILE_PX, RayGrid
 
-BAND_PX = 8  # rows of one pose under a rolling shutter
+BAND_PX = 8  # rows that share one pose under a rolling shutter
 # Four distinct offsets in x and in y, so that edges of any direction get five shades of coverage.
-# They are point-symmetric (first and last, second and third), which keeps a pixel's centroid at its centre.
+# They are point-symmetric (first and last, second and third), so that their mean is the pixel centre.
 SAMPLE_OFFSETS_PX = np.array([[-3.0, -1.0], [1.0, -3.0], [-1.0, 3.0], [3.0, 1.0]]) / 8
-HAZE_RGB = (208, 214, 220)  # where a ray meets no face
-_EDGE_TOLERANCE = 1e-7  # lets neighbouring faces meet without a crack from rounding
+HAZE_RGB = (208, 214, 220)  # colour of rays that hit no face
+_EDGE_TOLERANCE = 1e-7  # prevents cracks between adjacent faces due to rounding
 
 
 class SceneRenderer:
-    """Holds the faces, the textures and one camera's rays; each image is a function of poses alone."""
+    """Renderer of a set of faces for one camera; each image depends only on the poses."""
 
     def __init__(self, faces: Sequence[Face], textures: Mapping[str, Texture], camera: Camera):
         mirrors = [face.mirrored for face in faces if face.mirrored is not None]
@@ -39,18 +39,18 @@ class SceneRenderer:
         self._origins = np.stack([face.origin for face in table]).astype(np.float64)
         self._axes = np.stack([np.stack([face.u_edge, face.v_edge]) for face in table])
         self._at_infinity = np.array([face.at_infinity for face in table])
-        # Padding edges only ask that the face be in front of the eye.
+        # Padding edges only require that the face is in front of the eye.
         self._edges = np.tile(np.array([0.0, 0.0, 1.0]), (len(faces), MAX_CORNERS, 1))
         self._edge_counts = []
         self._mirror_idx = np.full(len(table), -1)
-        following = len(faces)
+        next_mirror = len(faces)
         for i, face in enumerate(faces):
             edges = face.edges()
             self._edges[i, : len(edges)] = edges
             self._edge_counts.append(len(edges))
             if face.mirrored is not None:
-                self._mirror_idx[i] = following
-                following += 1
+                self._mirror_idx[i] = next_mirror
+                next_mirror += 1
         self._texel_from_face = np.zeros((len(table), 3, 3))
         for i, (face, texture) in enumerate(zip(table, self._textures, strict=True)):
             height, width = texture.levels[0].shape[:2]
@@ -63,14 +63,14 @@ class SceneRenderer:
         self._grids: dict[str, list[RayGrid]] = {}
 
     def render(self, center: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-        """Sharp image (H, W, 3) uint8 RGB from one pose: centre (3,) and rotation (3, 3)."""
+        """Render a sharp image (H, W, 3) uint8 RGB from one pose: centre (3,) and rotation (3, 3)."""
         return _mean_samples(self._cast(self._grid("sharp")[0], center, cam_from_world))
 
     def render_exposure(self, centers: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-        """Mean (H, W, 3) uint8 of what is seen from K poses during one exposure: (K, 3), (K, 3, 3).
+        """Render the mean (H, W, 3) uint8 over K poses during one exposure: (K, 3), (K, 3, 3).
 
-        Each pose is rendered with one sample a pixel; poses that lie symmetrically in time take
-        point-symmetric samples, so that the image is centred on the middle of the exposure.
+        Each pose is rendered with one sample per pixel; poses symmetric in time use point-symmetric
+        samples, so that the image is centred on the middle of the exposure.
         """
         count = len(centers)
         total = np.zeros((self._camera.height, self._camera.width, 3), np.float32)
@@ -82,7 +82,10 @@ class SceneRenderer:
         return np.rint(total / count).astype(np.uint8)
 
     def render_rolling(self, centers: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-        """Image (H, W, 3) uint8 whose i-th band of `BAND_PX` rows is seen from the i-th of B poses."""
+        """Render an image (H, W, 3) uint8 whose i-th band of `BAND_PX` rows is seen from the i-th of B poses.
+
+        Raises ValueError if the number of poses differs from the number of bands.
+        """
         bands = self._grid("bands")
         if len(bands) != len(centers):
             raise ValueError(f"{len(centers)} poses for {len(bands)} bands of rows")
@@ -106,7 +109,7 @@ class SceneRenderer:
         return self._grids[kind]
 
     def _face_from_ray(self, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """(F, 3, 3) matrices that take a ray (x, y, 1) to (s, t, 1) / depth; NaN for faces seen edge-on."""
+        """Return matrices (F, 3, 3) from a ray (x, y, 1) to (s, t, 1) / depth; NaN for faces seen edge-on."""
         offsets = self._origins - np.where(self._at_infinity[:, None], 0.0, center)
         matrices = np.concatenate([self._axes, offsets[:, None]], axis=1) @ rotation.T  # rows
         edge_on = np.abs(np.linalg.det(matrices)) < 1e-9
@@ -116,7 +119,7 @@ class SceneRenderer:
         return inverse
 
     def _cast(self, grid: RayGrid, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Colours (h, w * samples, 3) uint8 of a grid's rays."""
+        """Return the colours (h, w * samples, 3) uint8 of a grid's rays."""
         face_from_ray = self._face_from_ray(center, rotation)
         faces, keep, covered = self._faces_of_tiles(grid, face_from_ray, center)
         tile_idx, candidate = np.nonzero(keep.T)  # by tile
@@ -166,7 +169,7 @@ class SceneRenderer:
     def _faces_of_tiles(
         self, grid: RayGrid, face_from_ray: np.ndarray, center: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Faces (M,) that may be seen, in which tiles each may (M, T), and which tiles it covers (M, T)."""
+        """Return faces (M,) that may be visible, in which tiles (M, T), and which tiles they cover (M, T)."""
         n = self._visible_faces
         normals = np.cross(self._axes[:n, 0], self._axes[:n, 1])
         offsets = self._origins[:n] - np.where(self._at_infinity[:n, None], 0.0, center)
@@ -187,7 +190,7 @@ class SceneRenderer:
     def _mip_levels(
         self, face_from_ray: np.ndarray, face_idx: np.ndarray, jet: np.ndarray
     ) -> np.ndarray:
-        """Mip levels (P,) of faces (P,) at tiles with jets (P, 3, 3), from a pixel's footprint in texels."""
+        """Choose mip levels (P,) of faces (P,) at tiles with jets (P, 3, 3) by the pixel footprint."""
         q = self._texel_from_face[face_idx] @ face_from_ray[face_idx] @ jet
         inverse_depth = np.maximum(np.abs(q[:, 2, :1]), 1e-6)
         step = (q[:, :2, 1:] - q[:, :2, :1] * (q[:, 2:, 1:] / inverse_depth[:, None])) / (
@@ -197,7 +200,7 @@ class SceneRenderer:
         det = np.abs(step[:, 0, 0] * step[:, 1, 1] - step[:, 0, 1] * step[:, 1, 0])
         major = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * det**2, 0.0))) / 2)
         minor = det / np.maximum(major, 1e-12)
-        # Texels of about a pixel; four samples a pixel resolve a finer grain along one axis.
+        # Texels of about one pixel; four samples per pixel allow finer texels along one axis.
         texels = np.maximum(0.85 * minor, 0.35 * major)
         deepest = np.array([len(texture.levels) - 1 for texture in self._textures])[face_idx]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -207,11 +210,11 @@ class SceneRenderer:
     def _sample(
         self, face_from_ray: np.ndarray, face: int, level: int, rays: np.ndarray
     ) -> np.ndarray:
-        """Texture colours (h, w, 3 or 4) of one face along rays (h, w, 2); beyond its border, mirrored."""
+        """Sample the texture (h, w, 3 or 4) of a face along rays (h, w, 2), reflected beyond its border."""
         base = self._textures[face].levels[0].shape
         image = self._textures[face].levels[level]
         sx, sy = image.shape[1] / base[1], image.shape[0] / base[0]
-        # OpenCV's texel centres are at whole numbers, ours at half ones.
+        # OpenCV's texel centres are at integers, ours at half-integers.
         level_from_texel = np.array([[sx, 0, -0.5], [0, sy, -0.5], [0, 0, 1]])
         texel_from_ray = level_from_texel @ self._texel_from_face[face] @ face_from_ray[face]
         texels = cv2.perspectiveTransform(rays, texel_from_ray)
@@ -220,7 +223,7 @@ class SceneRenderer:
     def _shade(
         self, face_from_ray: np.ndarray, face: int, level: int, mirror_level: int, rays: np.ndarray
     ) -> np.ndarray:
-        """Colours (h, w, 3) of one face along rays (h, w, 2), with what its mirror parts reflect."""
+        """Return the colours (h, w, 3) of a face along rays (h, w, 2), including its reflections."""
         own = self._sample(face_from_ray, face, level, rays)
         if own.shape[2] == 3:
             return own
@@ -240,7 +243,7 @@ class SceneRenderer:
         covered: list[bool],
         rays: np.ndarray,
     ) -> np.ndarray:
-        """Colours (n, 3) along rays (n, 2) of the nearest among faces (face, level, mirror level)."""
+        """Return the colours (n, 3) along rays (n, 2) of the nearest of faces (face, level, mirror level)."""
         nearest = np.zeros(len(rays), np.float32)
         winner = np.full(len(rays), -1, np.int16)
         across = np.ascontiguousarray(rays.T)
@@ -267,7 +270,7 @@ class SceneRenderer:
 
 
 def _mean_samples(colours: np.ndarray) -> np.ndarray:
-    """Pixels (h, w, 3) from samples (h, 4 w, 3)."""
+    """Average samples (h, 4 w, 3) to pixels (h, w, 3)."""
     height, width = colours.shape[0], colours.shape[1] // len(SAMPLE_OFFSETS_PX)
     return cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
 
@@ -275,7 +278,7 @@ def _mean_samples(colours: np.ndarray) -> np.ndarray:
 def _form_bounds(
     forms: np.ndarray, middle: np.ndarray, half: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest values (F, E, T) of linear forms (F, E, 3) over boxes of rays (T, 2), (T, 2)."""
+    """Return minimum and maximum (F, E, T) of linear forms (F, E, 3) over boxes of rays (T, 2), (T, 2)."""
     value = forms[..., :2] @ middle.T + forms[..., 2:]
     spread = np.abs(forms[..., :2]) @ half.T
     return value - spread, value + spread

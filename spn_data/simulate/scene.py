@@ -1,4 +1,4 @@
-"""The simulated place: a courtyard between brick facades, its objects, the roofs and the town around it."""
+"""The simulated scene: a courtyard between brick facades, its objects, the roofs and the surrounding town."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class SceneOptions:
 
     size_m: tuple[float, float] = (39.0, 36.0)  # east-west and north-south, between the facades
     height_m: float = 18.0  # of the facades
-    area_factor: float = 1.0  # times the ground area; the height stays
+    area_factor: float = 1.0  # factor on the ground area; the height stays the same
     texels_per_m: float = 140.0  # of facades and ground
     houses_per_hectare: float = 0.0  # on the ground, for flights that look down on a large area
-    seed: int = 1  # of everything painted and placed
+    seed: int = 1  # random seed of textures and objects
 
     @property
     def half_m(self) -> tuple[float, float]:
@@ -33,11 +33,11 @@ class SceneOptions:
 
 @dataclass(frozen=True, eq=False)
 class SceneFaces:
-    """Faces of the scene, and how their textures are painted.
+    """Faces of the scene and the recipes of their textures.
 
-    canvases : painter's name and canvas of each texture; obstacles : (N, 6) boxes x0, y0, z0, x1, y1, z1 in
-    metres that no flight may enter; landmarks : (M, 3) exact centres of the survey targets on the facades.
-    World: East-North-Up, zero on the ground at the courtyard's middle.
+    canvases : name of the painter and canvas of each texture. obstacles : (N, 6) boxes x0, y0, z0, x1, y1, z1
+    in metres that no flight may enter. landmarks : (M, 3) exact centres of the survey targets on the facades.
+    The world is East-North-Up with its origin on the ground in the middle of the courtyard.
     """
 
     faces: tuple[Face, ...]
@@ -49,13 +49,13 @@ class SceneFaces:
 BUILDING_DEPTH_M = 10.0
 
 
-def build_place(options: SceneOptions) -> SceneFaces:
-    """The courtyard for a seed; textures are painted apart (`paint`)."""
+def build_scene(options: SceneOptions) -> SceneFaces:
+    """Build the courtyard for a seed; textures are painted separately (`paint`)."""
     builder = _Courtyard(options)
     builder.shell()
     builder.surroundings()
-    builder.roof_things()
-    builder.courtyard_things()
+    builder.roof_objects()
+    builder.courtyard_objects()
     builder.houses()
     return SceneFaces(
         tuple(builder.faces),
@@ -65,19 +65,19 @@ def build_place(options: SceneOptions) -> SceneFaces:
     )
 
 
-def paint(place: SceneFaces, name: str) -> np.ndarray:
-    """Picture (H, W, 3 or 4) uint8 RGB of one texture."""
-    painter, canvas = place.canvases[name]
+def paint(scene: SceneFaces, name: str) -> np.ndarray:
+    """Paint one texture (H, W, 3 or 4) uint8 RGB."""
+    painter, canvas = scene.canvases[name]
     return PAINTERS[painter](canvas)
 
 
-def paint_all(place: SceneFaces) -> dict[str, Texture]:
-    """All textures, in memory."""
-    return {name: Texture.from_image(paint(place, name)) for name in place.canvases}
+def paint_all(scene: SceneFaces) -> dict[str, Texture]:
+    """Paint all textures in memory."""
+    return {name: Texture.from_image(paint(scene, name)) for name in scene.canvases}
 
 
 class _Courtyard(Builder):
-    """Collects the parts of the courtyard."""
+    """Builder of the courtyard's parts."""
 
     def __init__(self, options: SceneOptions):
         super().__init__(options.seed)
@@ -85,7 +85,7 @@ class _Courtyard(Builder):
         self.landmarks: list[np.ndarray] = []
 
     def shell(self) -> None:
-        """Four inner facades with what their panes reflect, the ground between them, the sky."""
+        """Add the four inner facades with their reflections, the ground between them, and the sky."""
         hx, hy = self.options.half_m
         height, resolution = self.options.height_m, self.options.texels_per_m
         down = vector(0, 0, -height)
@@ -133,7 +133,7 @@ class _Courtyard(Builder):
         )
 
     def surroundings(self) -> None:
-        """Roofs around the courtyard, outer walls, and the town's ground as a frame around the building."""
+        """Add the roofs around the courtyard, the outer walls, and the ground and houses of the town."""
         hx, hy = self.options.half_m
         ox, oy, height = hx + BUILDING_DEPTH_M, hy + BUILDING_DEPTH_M, self.options.height_m
         strips = {
@@ -173,8 +173,8 @@ class _Courtyard(Builder):
             high = float(self.rng.uniform(7, 14))
             self.box((x - 11, y - 7, 0), (x + 11, y + 7, high), "house", "house-roof")
 
-    def roof_things(self) -> None:
-        """Air conditioners, skylights and chimneys on the roofs."""
+    def roof_objects(self) -> None:
+        """Add air conditioners, skylights and chimneys on the roofs."""
         hx, hy = self.options.half_m
         height = self.options.height_m
         self.canvas("machine", "metal", (2.0, 1.4), 90.0)
@@ -195,8 +195,8 @@ class _Courtyard(Builder):
                 side,
             )
 
-    def courtyard_things(self) -> None:
-        """Benches, planters, bins, a kiosk, columns and trees, clear of where the flights pass."""
+    def courtyard_objects(self) -> None:
+        """Add benches, planters, bins, a kiosk, columns and trees, clear of the flight paths."""
         hx, hy = self.options.half_m
         sx, sy = hx / 19.5, hy / 18.0
         self.canvas("bin", "metal", (1.0, 1.0), 150.0)
@@ -237,12 +237,14 @@ class _Courtyard(Builder):
             self.box((x - 0.28, y - 0.28, 0.0), (x + 0.28, y + 0.28, 0.95), "bin", "concrete")
 
     def houses(self) -> None:
-        """Houses strewn over the courtyard, each with a roof of its own."""
+        """Scatter houses over the courtyard, each with its own part of the roof texture."""
         hx, hy = self.options.half_m
         count = round(self.options.houses_per_hectare * 4 * hx * hy / 1e4)
         if count == 0:
             return
-        rng = np.random.default_rng([self.options.seed, 78])  # all else stays where it is
+        rng = np.random.default_rng(
+            [self.options.seed, 78]
+        )  # its own generator: everything else stays unchanged
         sheet_m = 90.0
         self.canvas("house-roofs", "roof", (sheet_m, sheet_m), self.options.texels_per_m)
         for _ in range(count):

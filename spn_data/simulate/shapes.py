@@ -1,4 +1,4 @@
-"""Solids from flat faces: boxes, columns, trees."""
+"""Solids built from planar faces: boxes, columns, trees."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from spn_data.simulate.faces import Face
 from spn_data.simulate.textures import Canvas
 
-SHEETS = {  # painter, size in metres, texels per metre: shared by the objects, each face at its own place
+# Size in metres and texels per metre by painter; shared by the objects, each face uses its own region.
+SHEETS = {
     "leaves": ((6.0, 6.0), 160.0),
     "planks": ((4.0, 4.0), 200.0),
     "concrete": ((5.0, 5.0), 160.0),
@@ -19,11 +20,12 @@ SHEETS = {  # painter, size in metres, texels per metre: shared by the objects, 
 
 
 def vector(*values: float) -> np.ndarray:
+    """Return the values as a float64 array."""
     return np.array(values, dtype=np.float64)
 
 
 class Builder:
-    """Collects the parts of one place."""
+    """Collector of the faces, textures and obstacles of a scene."""
 
     def __init__(self, seed: int):
         self.seed = seed
@@ -42,7 +44,8 @@ class Builder:
         resolution: float,
         name: str = "",
     ) -> None:
-        # Textures stay within what OpenCV's remap can address, and within memory for large areas.
+        """Register a texture; its resolution is reduced if the texture would get too large."""
+        # Textures stay within the limits of OpenCV's remap, and within memory for large areas.
         resolution = min(resolution, 30000 / max(size_m), (40e6 / (size_m[0] * size_m[1])) ** 0.5)
         self.canvases[texture] = (
             painter,
@@ -52,13 +55,14 @@ class Builder:
     def patch(
         self, sheet: str, width_m: float, height_m: float
     ) -> tuple[float, float, float, float]:
-        """A random part of a sheet, of the given size at the sheet's scale, at most all of it."""
+        """Choose a random region of a sheet with the given size at the sheet's scale, at most all of it."""
         size = self.canvases[sheet][1].size_m
         ds, dt = min(1.0, width_m / size[0]), min(1.0, height_m / size[1])
         s, t = self.rng.uniform(0, 1 - ds), self.rng.uniform(0, 1 - dt)
         return float(s), float(t), float(s + ds), float(t + dt)
 
     def add(self, texture: str, origin: np.ndarray, u_edge: np.ndarray, v_edge: np.ndarray) -> None:
+        """Add a parallelogram; faces of a shared sheet use a random region of it."""
         region = (0.0, 0.0, 1.0, 1.0)
         if texture in SHEETS:
             region = self.patch(
@@ -67,7 +71,7 @@ class Builder:
         self.faces.append(Face(texture, origin, u_edge, v_edge, region))
 
     def polygon(self, texture: str, points: np.ndarray) -> None:
-        """Convex planar polygon (K, 3), clockwise as seen from its front."""
+        """Add a convex planar polygon (K, 3), clockwise as seen from its front."""
         right = points[1] - points[0]
         right = right / np.linalg.norm(right)
         away = np.cross(right, points[2] - points[1])
@@ -89,7 +93,7 @@ class Builder:
         *,
         blocks: bool = True,
     ) -> None:
-        """Axis-parallel box without its bottom."""
+        """Add an axis-parallel box without its bottom; it is an obstacle unless `blocks` is False."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         down = vector(0, 0, z0 - z1)
         self.add(side, vector(x0, y0, z1), vector(x1 - x0, 0, 0), down)
@@ -103,7 +107,7 @@ class Builder:
     def rings(
         self, texture: str, x: float, y: float, rings: list[tuple[float, float]], sides: int
     ) -> None:
-        """Solid with flat sides through rings of (height, radius) from top to bottom, closed above."""
+        """Add a solid with flat sides through rings (height, radius) from top to bottom, closed on top."""
         angles = np.arange(sides) * 2 * np.pi / sides + 0.2
         loops = [
             np.stack([x + r * np.cos(angles), y + r * np.sin(angles), np.full(sides, z)], axis=1)
@@ -112,7 +116,7 @@ class Builder:
         self.polygon(texture, loops[0][::-1])
         for upper, lower in pairwise(loops):
             for k in range(sides):
-                j = (k + 1) % sides  # seen from outside, a growing angle runs to the right
+                j = (k + 1) % sides  # seen from outside, angles increase to the right
                 self.polygon(texture, np.stack([upper[k], upper[j], lower[j], lower[k]]))
         reach = max(r for _, r in rings)
         self.obstacles.append(
@@ -120,6 +124,7 @@ class Builder:
         )
 
     def tree(self, x: float, y: float, height: float, radius: float) -> None:
+        """Add a tree with a trunk and a crown."""
         self.rings("bark", x, y, [(height * 0.5, 0.14), (0.0, 0.22)], 6)
         low = height * 0.42
         profile = [(1.0, 0.2), (0.85, 0.7), (0.5, 1.0), (0.15, 0.75), (0.0, 0.3)]

@@ -1,4 +1,4 @@
-"""Writes telemetry as DJI's subtitle files do: one record a video frame."""
+"""Telemetry in the format of DJI subtitle files, with one record per video frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TAKEOFF = datetime(2026, 5, 17, 10, 30)  # nominal; each flight's clock starts h
 
 
 def srt_text(telemetry: FlightTelemetry, fps: float) -> str:
-    """Records with 6 decimals of latitude and longitude, 3 of heights, and 0.1 degrees of gimbal angles."""
+    """Format the records: positions with 6 decimals of a degree, heights with 3, gimbal angles with 1."""
     lines = []
     for i, time_s in enumerate(telemetry.time_s):
         end_s = (i + 1) / fps

@@ -1,4 +1,4 @@
-"""Paints what is not facade or courtyard: roofs, the surroundings, objects, the sky."""
+"""Painting of roofs, the surroundings, objects, the sky and reflections."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from spn_data.simulate.textures import (
 
 
 def paint_roof(canvas: Canvas) -> np.ndarray:
-    """Flat roof (H, W, 3): sheets of bitumen and gravel, patches, drains."""
+    """Paint a flat roof (H, W, 3): bitumen sheets, gravel and stains."""
     rng = canvas.rng
     image = masonry(
         canvas,
@@ -40,7 +40,7 @@ def paint_roof(canvas: Canvas) -> np.ndarray:
 
 
 def paint_surroundings(canvas: Canvas) -> np.ndarray:
-    """Town around the building (H, W, 3): grass, streets, parked cars, crossings, trees from above."""
+    """Paint the town around the building (H, W, 3): grass, streets, parked cars, trees from above."""
     rng = canvas.rng
     rows, columns = canvas.shape
     lush = clouds(rng, canvas, largest_m=25.0, smallest_m=0.3, gain=0.72)
@@ -189,7 +189,7 @@ def _bark(canvas: Canvas) -> np.ndarray:
 
 
 def _sky(canvas: Canvas) -> np.ndarray:
-    """Overcast sky (H, W, 3): broad soft clouds, fading to haze towards the picture's border."""
+    """Paint an overcast sky (H, W, 3): broad soft clouds that fade to haze towards the border."""
     field = clouds(canvas.rng, canvas, largest_m=2400.0, smallest_m=300.0)
     rows, columns = canvas.shape
     y, x = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None]
@@ -200,11 +200,11 @@ def _sky(canvas: Canvas) -> np.ndarray:
     return np.rint(inner * blue + (1 - inner) * np.array([208, 214, 220])).astype(np.uint8)
 
 
-REFLECTION_PARTS = (2, 1)  # of sky above and ground below, in heights of the facade between
+REFLECTION_PARTS = (2, 1)  # sky above and ground below the facade, in facade heights
 
 
 def _reflection(canvas: Canvas) -> np.ndarray:
-    """What a pane sees across the courtyard (H, W, 3): the facade of that name, sky above, ground below."""
+    """Paint the view across the courtyard (H, W, 3): the facade of that name, sky above, ground below."""
     height_m = canvas.size_m[1] / (1 + sum(REFLECTION_PARTS))
     facade = paint_facade(replace(canvas, size_m=(canvas.size_m[0], height_m)))
     wall = cv2.GaussianBlur(cv2.cvtColor(facade, cv2.COLOR_RGBA2RGB), (0, 0), 0.8)

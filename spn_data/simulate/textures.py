@@ -1,7 +1,7 @@
-"""What surfaces are painted with: masonry, stains, grain; and the courtyard's ground.
+"""Building blocks of painted textures (masonry, stains, grain), and the ground of the courtyard.
 
-Every picture is a function of its name, its size in metres and the seed. Structure has all scales, from
-stains of several metres to grain of one texel, so that image features behave as on a real place.
+Every texture is a function of its name, its size in metres and the seed. It has structure at all scales, from
+stains of several metres to grain of one texel, so that image features behave as in a real scene.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Canvas:
-    """What a painter needs to know.
+    """Size, resolution and random seed of a texture.
 
-    size_m : width and height of the picture; texels_per_m : its resolution; seed : of the scene;
-    name : also part of the seed, so that no two surfaces share their stains.
+    size_m : width and height; texels_per_m : resolution; seed : of the scene; name : is also part of the
+    random seed, so that no two surfaces share their stains.
     """
 
     name: str
@@ -34,9 +34,11 @@ class Canvas:
 
     @property
     def rng(self) -> np.random.Generator:
+        """New random generator, always in the same state."""
         return np.random.default_rng([self.seed, zlib.crc32(self.name.encode())])
 
     def texel(self, metres: float) -> int:
+        """Convert a length in metres to texels."""
         return round(metres * self.texels_per_m)
 
 
@@ -48,10 +50,10 @@ def clouds(
     smallest_m: float,
     gain: float = 0.55,
 ) -> np.ndarray:
-    """Smooth random field (H, W) float32 of about zero mean and unit deviation, in octaves of grain."""
+    """Draw a smooth random field (H, W) float32 as a sum of octaves, of about zero mean and unit variance."""
     rows, columns = canvas.shape
     width_m, height_m = canvas.size_m
-    # Below this grain the field is drawn small and enlarged: it costs a sixteenth.
+    # The field is drawn at a quarter of the resolution and enlarged, for a sixteenth of the cost.
     small = (max(2, rows // 4), max(2, columns // 4))
     total = np.zeros(small, np.float32)
     grain, weight, power = largest_m, 1.0, 0.0
@@ -68,7 +70,7 @@ def clouds(
 
 
 def grain(rng: np.random.Generator, shape: tuple[int, int], sigma: float) -> np.ndarray:
-    """Texel noise (H, W) float32, without a period shorter than 700 texels."""
+    """Draw texel noise (H, W) float32 with a period of at least 700 texels."""
     tile = rng.standard_normal((min(shape[0], 701), min(shape[1], 997)), dtype=np.float32)
     tile = 0.6 * tile + 1.2 * cv2.GaussianBlur(tile, (0, 0), 1.0)
     repeats = (-(-shape[0] // tile.shape[0]), -(-shape[1] // tile.shape[1]))
@@ -76,14 +78,14 @@ def grain(rng: np.random.Generator, shape: tuple[int, int], sigma: float) -> np.
 
 
 def shade(image: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Image (H, W, 3) uint8 times a factor (H, W)."""
+    """Multiply an image (H, W, 3) uint8 by a factor (H, W)."""
     return cv2.multiply(image, cv2.merge([factor] * 3), dtype=cv2.CV_8U)
 
 
 def _courses(
     canvas: Canvas, size_m: tuple[float, float], joint_m: float, bond: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row (H, W) and column (H, W) of the brick at each texel, and whether it lies in a joint (H, W)."""
+    """Return row (H, W) and column (H, W) of the brick at each texel, and whether it is in a joint (H, W)."""
     rows, columns = canvas.shape
     y = (np.arange(rows, dtype=np.float32) + 0.5) / np.float32(canvas.texels_per_m)
     x = (np.arange(columns, dtype=np.float32) + 0.5) / np.float32(canvas.texels_per_m)
@@ -106,7 +108,7 @@ def masonry(
     joint_rgb: tuple[int, int, int] = (150, 145, 138),
     bond: float = 0.5,
 ) -> np.ndarray:
-    """Stones (H, W, 3) uint8 that take their colours from a palette (K, 3), with joints between them."""
+    """Paint stones (H, W, 3) uint8 with colours from a palette (K, 3) and joints between them."""
     row, column, joint = _courses(canvas, size_m, joint_m, bond)
     count = (int(row.max()) + 1, int(column.max()) + 1)
     choice = rng.integers(0, len(palette), count).astype(np.uint8)
@@ -119,13 +121,13 @@ def masonry(
 def palette_around(
     rng: np.random.Generator, base: tuple[int, int, int], spread: float
 ) -> np.ndarray:
-    """Colours (64, 3) that vary in brightness by a share `spread`, and a little in hue."""
+    """Draw colours (64, 3) that vary in brightness by the relative `spread`, and a little in hue."""
     tone = rng.normal(1.0, spread, (64, 1)) * np.asarray(base)
     return tone * rng.normal(1.0, spread / 5, (64, 3))
 
 
 def stain(image: np.ndarray, canvas: Canvas, rng: np.random.Generator, count: int) -> None:
-    """Darkens or bleaches blots of irregular outline, in place."""
+    """Darken or bleach irregular patches, in place."""
     rows, columns = image.shape[:2]
     for _ in range(count):
         height, width = canvas.texel(rng.uniform(0.3, 2.5)), canvas.texel(rng.uniform(0.2, 1.8))
@@ -148,7 +150,7 @@ def stain(image: np.ndarray, canvas: Canvas, rng: np.random.Generator, count: in
 
 
 def poster(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """A poster (h, w, 3) uint8: shapes and lettering in a few strong colours."""
+    """Paint a poster (h, w, 3) uint8: shapes and lettering in a few strong colours."""
     image = np.full((height, width, 3), rng.integers(150, 250, 3), np.uint8)
     for _ in range(9):
         colour = tuple(int(v) for v in rng.integers(10, 240, 3))
@@ -178,7 +180,7 @@ def poster(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
 
 
 def paint_plaza(canvas: Canvas) -> np.ndarray:
-    """Ground of the courtyard (H, W, 3): slabs, beds of grass, gravel, leaves, manholes, stains."""
+    """Paint the ground of the courtyard (H, W, 3): slabs, cobbles, grass, leaves, manholes, stains."""
     rng = canvas.rng
     rows, columns = canvas.shape
     palette = palette_around(rng, (146, 142, 134), 0.07)
@@ -230,7 +232,5 @@ def paint_plaza(canvas: Canvas) -> np.ndarray:
     side = (
         np.minimum(np.arange(columns), columns - 1 - np.arange(columns))[None] / canvas.texels_per_m
     )
-    dim = (
-        1 - 0.3 * np.exp(-edge / 0.9) - 0.3 * np.exp(-side / 0.9)
-    )  # less sky is seen near the walls
+    dim = 1 - 0.3 * np.exp(-edge / 0.9) - 0.3 * np.exp(-side / 0.9)  # less skylight near the walls
     return shade(image, dim.astype(np.float32))

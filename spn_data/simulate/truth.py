@@ -1,4 +1,4 @@
-"""The exact truth beside simulated flights: files written and read."""
+"""Files with the exact ground truth of simulated flights."""
 
 from __future__ import annotations
 
@@ -23,10 +23,20 @@ _COLUMNS = ("frame", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "blurred")
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is exactly known of one flight.
+    """Exact ground truth of one flight.
 
-    time_s : (N,) container timestamps of the video's frames; poses : East-North-Up in metres about `origin`,
-    at mid-exposure of the middle row; blurred : (N,) bool; origin : with ellipsoidal height.
+    Attributes
+    ----------
+    time_s : ndarray, shape (N,)
+        Container timestamps of the video frames.
+    poses : Poses
+        Poses at mid-exposure of the middle row, East-North-Up in metres about `origin`.
+    blurred : ndarray of bool, shape (N,)
+        Whether the frame has motion blur.
+    camera : Camera
+        Intrinsics of all frames.
+    origin : GeoOrigin
+        Origin of the world, with ellipsoidal height.
     """
 
     time_s: np.ndarray
@@ -37,7 +47,7 @@ class Truth:
 
 
 def write_truth(folder: Path, path: FlightPath) -> None:
-    """`<flight>.csv` and `<flight>_camera.json` in a folder."""
+    """Write `<flight>.csv` and `<flight>_camera.json` to a folder."""
     with (folder / f"{path.name}.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_COLUMNS)
@@ -51,13 +61,13 @@ def write_truth(folder: Path, path: FlightPath) -> None:
         "height": path.camera.height,
         "params": [float(v) for v in path.camera.params],
     }
-    write_json(folder / f"{path.name}_camera.json", camera)
+    _write_json(folder / f"{path.name}_camera.json", camera)
 
 
 def write_options(folder: Path, options: SimulateOptions) -> None:
-    """`origin.json` and `options.json` in a folder."""
+    """Write `origin.json` and `options.json` to a folder."""
     origin = options.origin
-    write_json(
+    _write_json(
         folder / "origin.json",
         {
             **origin.plain(),
@@ -65,22 +75,39 @@ def write_options(folder: Path, options: SimulateOptions) -> None:
             "rel_alt_minus_up_m": 0.0,
         },
     )
-    write_json(folder / "options.json", asdict(options))
+    _write_json(folder / "options.json", asdict(options))
 
 
-def write_json(path: Path, values: dict[str, object]) -> None:
+def _write_json(path: Path, values: dict[str, object]) -> None:
     text = json.dumps({"version": VERSION, **values}, indent=2, sort_keys=True)
     path.write_text(text + "\n", encoding="utf-8")
 
 
 def read_truth(folder: Path, flight: str) -> Truth:
-    """The truth of one flight from `OUT/truth`.
+    """Read the ground truth of one flight from `OUT/truth`.
 
-    Raises InputError where there is none, FormatError where it is damaged or of a newer version.
+    Parameters
+    ----------
+    folder : Path
+        The folder `truth` of simulated flights.
+    flight : str
+        Name of the flight.
+
+    Returns
+    -------
+    Truth
+        Exact poses and camera of the flight.
+
+    Raises
+    ------
+    InputError
+        If there is no ground truth of this flight.
+    FormatError
+        If a file is damaged or was written by a newer version.
     """
     table_path, camera_path = folder / f"{flight}.csv", folder / f"{flight}_camera.json"
     if not table_path.is_file():
-        raise InputError(f"no truth of a flight {flight!r}", path=folder)
+        raise InputError(f"no ground truth for flight {flight!r}", path=folder)
     camera, origin = _read_json(camera_path), _read_json(folder / "origin.json")
     try:
         with table_path.open(encoding="utf-8", newline="") as file:
@@ -102,7 +129,7 @@ def read_truth(folder: Path, flight: str) -> Truth:
         )
     except (ValueError, KeyError, IndexError, StopIteration, TypeError) as error:
         raise FormatError(
-            f"{table_path}: this is not a truth file as written here ({error})"
+            f"{table_path}: not a ground-truth file of spn-data simulate ({error})"
         ) from error
 
 

@@ -10,13 +10,13 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import rotations_from_angles
 from spn_data.geometry.rendering import (
+    PinholeRenderer,
     RenderingOptions,
-    SceneRenderer,
     canonical_camera,
     undistorted_camera,
 )
 from spn_data.simulate.render import SceneRenderer as Simulator
-from spn_data.simulate.scene import SceneOptions, build_place, paint_all
+from spn_data.simulate.scene import SceneOptions, build_scene, paint_all
 
 MAPPING = Camera("OPENCV", 1280, 720, np.array([880.9, 881.5, 645, 356, -0.12, 0.03, 1e-3, -5e-4]))
 SLANTED = Camera("SIMPLE_RADIAL", 1280, 720, np.array([930.0, 620.0, 371.0, -0.06]))
@@ -65,8 +65,8 @@ def test_the_canonical_camera_has_no_empty_border_and_is_as_wide_as_can_be(other
         outside.append(max(np.abs(np.concatenate(pixels) - 0.5).max() - 0.5, 0.0))
     assert outside[0] < 1e-6
     assert outside[1] > 1e-5
-    assert all(SceneRenderer(camera, target).all_valid for camera in cameras)
-    assert not all(SceneRenderer(camera, wider).all_valid for camera in cameras)
+    assert all(PinholeRenderer(camera, target).all_valid for camera in cameras)
+    assert not all(PinholeRenderer(camera, wider).all_valid for camera in cameras)
 
 
 def test_a_pinhole_keeps_its_whole_view():
@@ -82,7 +82,7 @@ def test_the_undistorted_camera_keeps_the_images_size():
     target = undistorted_camera(SLANTED)
     assert (target.width, target.height) == (1280, 720)
     assert target.params[1:].tolist() == [640.0, 360.0]
-    assert SceneRenderer(SLANTED, target).all_valid
+    assert PinholeRenderer(SLANTED, target).all_valid
 
 
 def test_an_axis_outside_the_image_is_refused():
@@ -99,7 +99,7 @@ def test_a_lens_model_that_folds_back_is_not_followed_past_the_fold():
     target = canonical_camera([camera], RenderingOptions(width_px=320))
     assert np.linalg.norm(target.unproject(np.zeros((1, 2)))) <= fold * (1 + 1e-9)
     beyond = Camera("SIMPLE_PINHOLE", 320, 240, np.array([80.0, 160.0, 120.0]))
-    valid = SceneRenderer(camera, beyond).valid
+    valid = PinholeRenderer(camera, beyond).valid
     radius = np.hypot(*np.meshgrid((np.arange(320) - 159.5) / 80, (np.arange(240) - 119.5) / 80))
     assert valid[120, 160]
     assert not valid[radius > fold].any()
@@ -107,7 +107,7 @@ def test_a_lens_model_that_folds_back_is_not_followed_past_the_fold():
 
 @pytest.fixture(scope="module")
 def place():
-    built = build_place(SceneOptions(seed=2, texels_per_m=40.0))
+    built = build_scene(SceneOptions(seed=2, texels_per_m=40.0))
     return built.faces, paint_all(built)
 
 
@@ -122,7 +122,7 @@ def test_rendering_agrees_with_the_simulators_projection(place, camera):
     center, rotation = np.array([2.0, -8.0, 6.0]), rotations_from_angles(np.array([20.0, -12, 3]))
     taken = Simulator(*place, camera).render(center, rotation)
     wanted = Simulator(*place, target).render(center, rotation)
-    found = SceneRenderer(camera, target).render(taken)
+    found = PinholeRenderer(camera, target).render(taken)
     assert found.dtype == np.uint8
     assert found.shape == wanted.shape == (270, 480, 3)
     shifts = shift_px(found.mean(axis=2), wanted.mean(axis=2))
@@ -140,7 +140,7 @@ def test_what_is_finer_than_a_pixel_is_averaged_away():
     def contrast(period_out_px: float) -> float:
         period = period_out_px * 1280 / 480
         stripes = 127 + 100 * np.cos(2 * np.pi * (0.8 * x + 0.6 * y) / period)
-        found = SceneRenderer(camera, target).render(np.round(stripes).astype(np.uint8))
+        found = PinholeRenderer(camera, target).render(np.round(stripes).astype(np.uint8))
         return float(np.sqrt(2) * found[10:-10, 10:-10].std() / 100)
 
     assert contrast(10) > 0.97
@@ -152,7 +152,7 @@ def test_what_is_finer_than_a_pixel_is_averaged_away():
 def test_a_narrower_camera_leaves_invalid_pixels_black():
     """The mask is true just where the pixel's whole area projects into the image, by the camera itself."""
     target = canonical_camera([MAPPING], SMALL)
-    renderer = SceneRenderer(NARROW, target)
+    renderer = PinholeRenderer(NARROW, target)
     assert 0.1 < renderer.valid.mean() < 0.9
     white = renderer.render(np.full((540, 960, 3), 200, np.uint8))
     assert (white[~renderer.valid] == 0).all()
@@ -172,7 +172,7 @@ def test_a_users_mask_is_rendered_with_its_image():
     target = canonical_camera([MAPPING], SMALL)
     usable = np.ones((720, 1280), bool)
     usable[:, 900:] = False
-    rendered = SceneRenderer(MAPPING, target).render_mask(usable)
+    rendered = PinholeRenderer(MAPPING, target).render_mask(usable)
     edge = target.project(
         np.column_stack([MAPPING.unproject(np.array([[900.0, 356.0]])), np.ones(1)])
     )[0, 0]
@@ -190,7 +190,7 @@ def test_points_move_with_the_image(camera):
     )
     pixels = camera.project(points)
     points = points[np.all((pixels > 0) & (pixels < [camera.width, camera.height]), axis=1)]
-    renderer = SceneRenderer(camera, target)
+    renderer = PinholeRenderer(camera, target)
     moved, seen = renderer.map_pixels(camera.project(points))
     wanted = target.project(points)
     in_view = np.all((wanted >= 0) & (wanted < [480, 270]), axis=1)
@@ -205,7 +205,7 @@ def test_points_move_with_the_image(camera):
 
 def test_no_points_move_to_no_points():
     """A frame that sees nothing is no special case."""
-    moved, seen = SceneRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).map_pixels(
+    moved, seen = PinholeRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).map_pixels(
         np.zeros((0, 2))
     )
     assert moved.shape == (0, 2)
@@ -215,6 +215,6 @@ def test_no_points_move_to_no_points():
 def test_an_image_of_another_size_is_our_mistake():
     """The camera of another image is noticed."""
     with pytest.raises(ValueError, match="960x540 for a camera of 1280x720"):
-        SceneRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).render(
+        PinholeRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).render(
             np.zeros((540, 960, 3), np.uint8)
         )

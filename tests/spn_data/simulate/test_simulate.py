@@ -152,7 +152,7 @@ def test_options_lead_to_complete_flights(change: dict[str, object], tmp_path: P
 def test_existing_folder_is_refused_and_a_stopped_run_leaves_nothing(tmp_path: Path) -> None:
     """What is there stays; an interrupted run leaves neither the folder nor its partial one."""
     (tmp_path / "there").mkdir()
-    with pytest.raises(StageError, match="there exists: name another folder"):
+    with pytest.raises(StageError, match="there already exists; choose another folder"):
         simulate(tmp_path / "there", TINY, workers=1)
 
     def stop(done: int, total: int) -> None:
@@ -175,11 +175,11 @@ def test_progress_counts_every_frame(tmp_path: Path) -> None:
 def test_impossible_options_are_refused_in_one_line() -> None:
     """Odd image sizes, no frames, shares beyond one and offsets of minutes are the user's to correct."""
     for change, message in (
-        ({"width": 161}, "image size 161 x 90: H.264 takes even numbers"),
+        ({"width": 161}, "image size 161 x 90: H.264 needs even numbers"),
         ({"fps": 0.0}, "fps, area factor and length factor must be above zero"),
-        ({"blur_share": 1.5}, "blur share 1.5 lies outside 0 to 1"),
-        ({"time_offset_s": -9.0}, "time offset -9.0 s is beyond 5 s either way"),
-        ({"area_factor": 17.0, "texels_per_m": 50.0}, "area factor 17.0 is beyond 16 at 50 texels"),
+        ({"blur_share": 1.5}, "blur share 1.5 is outside 0 to 1"),
+        ({"time_offset_s": -9.0}, "time offset -9.0 s is outside -5 to 5 s"),
+        ({"area_factor": 17.0, "texels_per_m": 50.0}, "area factor 17.0 exceeds 16 at 50 texels"),
     ):
         with pytest.raises(InputError, match=re.escape(message)):
             replace(TINY, **change)  # type: ignore[arg-type]
@@ -191,15 +191,15 @@ def test_damaged_or_newer_truth_is_refused(flights: Path, tmp_path: Path) -> Non
     truth.mkdir()
     for name, content in tree(flights / "truth").items():
         (truth / name).write_bytes(content)
-    with pytest.raises(InputError, match="no truth of a flight 'nowhere'"):
+    with pytest.raises(InputError, match="no ground truth for flight 'nowhere'"):
         read_truth(truth, "nowhere")
     (truth / "low.csv").write_text("a,b\n1,2\n", encoding="utf-8")
-    with pytest.raises(FormatError, match=r"low\.csv: this is not a truth file"):
+    with pytest.raises(FormatError, match=r"low\.csv: not a ground-truth file"):
         read_truth(truth, "low")
     (truth / "medium.csv").write_text(
         (truth / "medium.csv").read_text() + "x,y\n", encoding="utf-8"
     )
-    with pytest.raises(FormatError, match=r"medium\.csv: this is not a truth file"):
+    with pytest.raises(FormatError, match=r"medium\.csv: not a ground-truth file"):
         read_truth(truth, "medium")
     camera = json.loads((truth / "flight1_camera.json").read_text())
     (truth / "flight1_camera.json").write_text(json.dumps({**camera, "version": 2}))

@@ -19,7 +19,7 @@ from spn_data.simulate import (
     simulate_paths,
     simulate_telemetry,
 )
-from spn_data.simulate.scene import build_place
+from spn_data.simulate.scene import build_scene
 
 CASES = [(1, 1.0), (2, 1.0), (3, 4.0)]
 
@@ -86,7 +86,7 @@ def test_flights_stay_clear_of_walls_and_objects(paths: MappingPaths) -> None:
     """No camera comes within half a metre of an obstacle, or two metres of a facade below its top."""
     for seed in (1, 2, 3):
         options = replace(preset("standard", seed=seed), mapping_paths=paths)
-        place = build_place(options.scene)
+        place = build_scene(options.scene)
         low, high = place.obstacles[:, :3], place.obstacles[:, 3:]
         for path in simulate_paths(options).values():
             centers = path.poses.centers
@@ -141,9 +141,9 @@ def test_presets_differ_in_image_and_rate_only() -> None:
         np.testing.assert_allclose(
             path.poses.centers, standard[name].poses.centers[::2], atol=1e-12
         )
-    with pytest.raises(InputError, match="no preset 'large'; there are demo, standard"):
+    with pytest.raises(InputError, match="unknown preset 'large'; choose from demo, standard"):
         preset("large")
-    with pytest.raises(InputError, match="no flight 'flight3'"):
+    with pytest.raises(InputError, match="unknown flight 'flight3'"):
         simulate_paths(replace(preset("demo"), only=("flight3",)))
 
 

@@ -16,7 +16,7 @@ from spn_data.simulate.flight import exposure_poses
 from spn_data.simulate.paths import Motion
 from spn_data.simulate.produce import render_frame
 from spn_data.simulate.render import HAZE_RGB, SceneRenderer
-from spn_data.simulate.scene import SceneFaces, SceneOptions, build_place, paint_all
+from spn_data.simulate.scene import SceneFaces, SceneOptions, build_scene, paint_all
 
 CELLS = 16
 LENSES = {
@@ -162,7 +162,7 @@ def test_panes_show_the_mirror_image_of_what_lies_opposite() -> None:
 
 @pytest.fixture(scope="module")
 def place() -> SceneFaces:
-    return build_place(SceneOptions(texels_per_m=60.0, seed=3))
+    return build_scene(SceneOptions(texels_per_m=60.0, seed=3))
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +271,7 @@ def test_houses_leave_all_else_where_it_is() -> None:
     """Twelve a hectare on 2.2 hectares, each with a part of the roofs' picture of its own."""
     options = SceneOptions(texels_per_m=12.0, seed=3, area_factor=16.0)
     without, with_houses = (
-        build_place(replace(options, houses_per_hectare=n)) for n in (0.0, 12.0)
+        build_scene(replace(options, houses_per_hectare=n)) for n in (0.0, 12.0)
     )
     for one, other in zip(without.faces, with_houses.faces, strict=False):
         assert one.texture == other.texture
