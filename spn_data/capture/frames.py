@@ -1,4 +1,4 @@
-"""Frames: one row per candidate frame of the sources, chosen or not, and frames.csv."""
+"""Frames: one row per candidate frame of the sources, chosen or not, and its file frames.csv."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KEY = re.compile(r"[A-Za-z0-9._-]{1,200}", re.ASCII)
 
 
 class FrameStatus(StrEnum):
-    """What became of a candidate."""
+    """Outcome of the frame selection for one candidate."""
 
     CHOSEN = "chosen"
     SKIPPED = "skipped"
@@ -28,18 +28,42 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """N candidate frames, in the order of sequence and time. What is not known is NaN.
+    """N candidate frames in order of sequence and time; unknown values are NaN.
 
-    names : (N,) str, the image's name in the model, `<sequence>/<frame>.jpg`; unique.
-    sequences, cameras : (N,) str; frames of one camera share their intrinsics (one lens, one flight).
-    sources : (N,) str, name of the file that the frame is from.
-    video_frame : (N,) int, index among that file's decoded frames; -1 for a photo.
-    time_s : (N,) seconds since the sequence's first frame.
-    status : (N,) str, a FrameStatus; reason : (N,) str.
-    sharpness : (N,) grey levels (`spn_data.capture.selection`); motion_px : (N,) motion of the image since
-    the frame chosen before, full-size pixels; width, height : (N,) int, upright image, 0 where unreadable.
-    lat_lon_deg (N, 2) WGS84, rel_alt_m (N,), abs_alt_m (N,), sigma_m (N, 3) east, north, up,
-    gimbal_deg (N, 3) heading, pitch, roll : telemetry at the frame's time, as in `Telemetry`.
+    Attributes
+    ----------
+    names : ndarray of str, shape (N,)
+        Unique name of the image in the model, `<sequence>/<frame>.jpg`.
+    sequences : ndarray of str, shape (N,)
+        Sequence of the frame.
+    cameras : ndarray of str, shape (N,)
+        Frames of one camera share their intrinsics (one lens, one flight).
+    sources : ndarray of str, shape (N,)
+        Name of the source file.
+    video_frame : ndarray of int, shape (N,)
+        Index among that file's decoded frames; -1 for a photo.
+    time_s : ndarray, shape (N,)
+        Seconds since the sequence's first frame.
+    status : ndarray of str, shape (N,)
+        A `FrameStatus`.
+    reason : ndarray of str, shape (N,)
+        Why the frame has this status, for the user.
+    sharpness : ndarray, shape (N,)
+        Grey levels, see `spn_data.capture.measurement.image_sharpness`.
+    motion_px : ndarray, shape (N,)
+        Image motion since the previously chosen frame, in full-size pixels.
+    width, height : ndarray of int, shape (N,)
+        Size of the upright image in pixels; 0 if unreadable.
+    lat_lon_deg : ndarray, shape (N, 2)
+        WGS84 position; this and the columns below are telemetry at the frame's time, as in `Telemetry`.
+    rel_alt_m : ndarray, shape (N,)
+        Height above take-off.
+    abs_alt_m : ndarray, shape (N,)
+        Absolute height.
+    sigma_m : ndarray, shape (N, 3)
+        Standard deviations east, north, up.
+    gimbal_deg : ndarray, shape (N, 3)
+        Heading, pitch, roll.
     """
 
     names: np.ndarray
@@ -65,29 +89,29 @@ class Frames:
         for column in fields(self):
             array = getattr(self, column.name)
             if len(array) != n:
-                raise ValueError(f"{column.name} has {len(array)} rows, names {n}")
+                raise ValueError(f"{column.name} has {len(array)} rows, but names has {n}")
         if len(set(self.names.tolist())) != n:
-            raise ValueError("names of frames are not unique")
+            raise ValueError("frame names are not unique")
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def chosen(self) -> np.ndarray:
-        """(N,) bool."""
+        """Frames selected for mapping, (N,) bool."""
         return self.status == FrameStatus.CHOSEN
 
     @property
     def has_fix(self) -> np.ndarray:
-        """(N,) bool: the telemetry knows the horizontal position."""
+        """Frames whose telemetry includes a horizontal position, (N,) bool."""
         return np.isfinite(self.lat_lon_deg).all(axis=1)
 
     def select(self, index: np.ndarray) -> Frames:
-        """The rows of an index or mask (N,)."""
+        """Return the rows selected by an index or mask (N,)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def with_telemetry(self, telemetry: Telemetry) -> Frames:
-        """The same frames with the telemetry's rows (N), one for each frame: `track.at(frames.time_s)`."""
+        """Return the same frames with telemetry of N rows, one per frame: `track.at(frames.time_s)`."""
         if len(telemetry) != len(self):
             raise ValueError(f"{len(telemetry)} rows of telemetry for {len(self)} frames")
         return replace(
@@ -101,15 +125,15 @@ class Frames:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Frames]) -> Frames:
-        """The rows of several, one after the other."""
+        """Concatenate the rows of several tables."""
         if not parts:
-            raise ValueError("no frames to put together")
+            raise ValueError("no frames to concatenate")
         return cls(
             **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)}
         )
 
 
-# Column of the file -> field and, where the field has several, its column.
+# Column of the file -> field and, if the field has several columns, the index of the column.
 _TEXT = {
     "name": "names",
     "sequence": "sequences",
@@ -143,7 +167,15 @@ _MAY_BE_UNKNOWN = set(_COLUMNS) - _STRINGS - _INTEGERS - {"time_s"}
 
 
 def write_frames(path: Path, frames: Frames) -> None:
-    """As frames.csv (docs/input.md); the file appears whole."""
+    """Write frames.csv (docs/input.md); the file is written atomically.
+
+    Parameters
+    ----------
+    path : Path
+        Target file.
+    frames : Frames
+        Its rows.
+    """
     columns = {}
     for name, (field, index) in _COLUMNS.items():
         values = getattr(frames, field)
@@ -156,7 +188,23 @@ def write_frames(path: Path, frames: Frames) -> None:
 
 
 def read_frames(path: Path) -> Frames:
-    """From frames.csv; InputError with the line where it is not what `write_frames` writes."""
+    """Read frames.csv.
+
+    Parameters
+    ----------
+    path : Path
+        A file written by `write_frames`.
+
+    Returns
+    -------
+    Frames
+        Its rows.
+
+    Raises
+    ------
+    InputError
+        With the line number, if the file is not as `write_frames` writes it.
+    """
     table: dict[str, list[object]] = {column: [] for column in _COLUMNS}
     seen: set[str] = set()
     for line, row in read_csv(path, _COLUMNS):
@@ -188,7 +236,7 @@ def _convert(column: str, cell: str) -> object:
         value = int(cell) if column in _INTEGERS else float(cell)
     except ValueError:
         raise ValueError(f"{column} {cell!r} is not a number") from None
-    if not abs(value) <= 1e15:  # NaN is not either
+    if not abs(value) <= 1e15:  # also catches NaN
         raise ValueError(f"{column} {cell!r} is not a finite number")
     return value
 
@@ -197,20 +245,31 @@ def _check_row(row: dict[str, str], seen: set[str]) -> None:
     name, sequence, camera, source = (row[column] for column in _TEXT)
     check_name(name)
     if not name.startswith(sequence + "/"):
-        raise ValueError(f"name {name!r} does not begin with its sequence {sequence!r}")
+        raise ValueError(f"name {name!r} does not start with its sequence {sequence!r}")
     if not _KEY.fullmatch(camera):
-        raise ValueError(f"camera {camera!r} holds other characters than A-Z a-z 0-9 . _ -")
+        raise ValueError(f"camera {camera!r} contains characters other than A-Z a-z 0-9 . _ -")
     if "/" in source or "\\" in source or source in ("", ".", ".."):
-        raise ValueError(f"source {source!r} is not the name of a file")
+        raise ValueError(f"source {source!r} is not a file name")
     status = row["status"]
     if status not in set(FrameStatus):
-        raise ValueError(f"status {status!r} is none of {', '.join(FrameStatus)}")
+        raise ValueError(f"status {status!r} is not one of {', '.join(FrameStatus)}")
     if name in seen:
-        raise ValueError(f"name {name!r} is there twice")
+        raise ValueError(f"duplicate name {name!r}")
     seen.add(name)
 
 
 def check_name(name: str) -> None:
-    """ValueError unless the name is `<sequence>/<frame>.jpg` in plain characters: it stays in its folder."""
+    """Check that a frame name is `<sequence>/<frame>.jpg` in plain characters, so it cannot leave its folder.
+
+    Parameters
+    ----------
+    name : str
+        Name to check.
+
+    Raises
+    ------
+    ValueError
+        If it is anything else.
+    """
     if not _NAME.fullmatch(name) or any(part.startswith(".") for part in name.split("/")):
         raise ValueError(f"name {name!r} is not <sequence>/<frame>.jpg in plain characters")

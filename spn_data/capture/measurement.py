@@ -1,4 +1,4 @@
-"""How sharp each image of a sequence is, and how far the image moved since the one before."""
+"""Sharpness of each image of a sequence and its motion relative to the image before."""
 
 from __future__ import annotations
 
@@ -8,24 +8,37 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 
-MEASURE_WIDTH = 640  # columns on which sharpness is measured
+MEASURE_WIDTH = 640  # image width in pixels at which sharpness is measured
 _TRACK_WIDTH = 320
 _MAX_CORNERS = 150
 _MIN_TRACKS = 12
 _REDETECT_BELOW = 90
-LOST_AFTER = 5  # images in a row that could not be tracked from the last one that could
+LOST_AFTER = 5  # consecutive images that could not be tracked from the last tracked one
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """N images of one sequence in the order of time, as measured in one cheap pass.
+    """N images of one sequence in order of time, as measured in one cheap pass.
 
-    source_idx : (N,) which of the sequence's files; index : (N,) among that file's frames.
-    time_s : (N,) on the sequence's clock. width, height : (N,) full size, pixels; 0 where unreadable.
-    sharpness : (N,) grey levels, see `sharpness_of`; NaN where unreadable.
-    motion : (N, 2, 3) affine map of image positions from the image before, in shares of the image's width,
-    zero at its centre; NaN where the two could not be tied (cut, other camera, darkness).
-    damaged : (N,) bool. problem : (N,) str, why an image is unreadable, else empty.
+    Attributes
+    ----------
+    source_idx : ndarray of int, shape (N,)
+        Which of the sequence's files the image is from.
+    index : ndarray of int, shape (N,)
+        Index among that file's frames.
+    time_s : ndarray, shape (N,)
+        Seconds on the sequence's clock.
+    width, height : ndarray of int, shape (N,)
+        Full size in pixels; 0 if unreadable.
+    sharpness : ndarray, shape (N,)
+        Grey levels, see `image_sharpness`; NaN if unreadable.
+    motion : ndarray, shape (N, 2, 3)
+        Affine map of image positions from the image before, in fractions of the image width, with the
+        origin at the centre; NaN if the two could not be linked (cut, other camera, darkness).
+    damaged : ndarray of bool, shape (N,)
+        Packets were lost since the last key frame.
+    problem : ndarray of str, shape (N,)
+        Why an image is unreadable, or "".
     """
 
     source_idx: np.ndarray
@@ -43,17 +56,20 @@ class Measurements:
 
     @property
     def readable(self) -> np.ndarray:
-        """(N,) bool."""
+        """Images that could be decoded, (N,) bool."""
         return self.problem == ""
 
     def select(self, index: np.ndarray) -> Measurements:
-        """The rows of an index or mask (N,)."""
+        """Return the rows selected by an index or mask (N,)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class GrayImage:
-    """One image to measure; `gray` is uint8, at most MEASURE_WIDTH wide, None where `problem` says why."""
+    """One image to measure.
+
+    `gray` is uint8 and at most MEASURE_WIDTH wide; None if unreadable, with the reason in `problem`.
+    """
 
     source_idx: int
     index: int
@@ -71,21 +87,33 @@ def measure(
     lost_after: int = LOST_AFTER,
     progress: Callable[[int], None] | None = None,
 ) -> Measurements:
-    """Sharpness and motion of a sequence's images; `progress` hears how many are done.
+    """Measure sharpness and motion of a sequence's images.
 
-    lost_after : images in a row that could not be tracked, at which motion is unknown. Below that they are
-    taken to be blurred and to stand where the one before stood: right for video, where one lasts a moment;
-    for photos it is 1.
+    Parameters
+    ----------
+    images : iterable of GrayImage
+        In order of time.
+    lost_after : int
+        Number of consecutive untracked images at which motion becomes unknown. Shorter runs count as
+        blurred images at the position of the image before: right for video, in which blur is brief; use 1
+        for photos.
+    progress : callable, optional
+        Called with the number of images done.
+
+    Returns
+    -------
+    Measurements
+        One row per image.
     """
     rows: list[GrayImage] = []
     sharpness: list[float] = []
     motions: list[np.ndarray] = []
     tracker = _Tracker(lost_after)
     for image in images:
-        known = image.gray is not None
-        sharpness.append(sharpness_of(image.gray) if image.gray is not None else np.nan)
+        readable = image.gray is not None
+        sharpness.append(image_sharpness(image.gray) if image.gray is not None else np.nan)
         motions.append(tracker.follow(image.gray) if image.gray is not None else _IDENTITY)
-        rows.append(replace(image, gray=None, problem=image.problem if not known else ""))
+        rows.append(replace(image, gray=None, problem=image.problem if not readable else ""))
         if progress is not None:
             progress(len(rows))
     return Measurements(
@@ -101,16 +129,16 @@ def measure(
     )
 
 
-def sharpness_of(gray: np.ndarray) -> float:
-    """RMS second difference of a grey image (h, w) uint8, in grey levels.
+def image_sharpness(gray: np.ndarray) -> float:
+    """Return the RMS second difference of a grey image (h, w) uint8, in grey levels.
 
-    The geometric mean of both directions, so that motion blur along one shows; smoothed across each, so that
-    noise counts less.
+    It is the geometric mean of both directions, so that motion blur along one of them shows, and is smoothed
+    across each, which reduces the influence of noise.
     """
     horizontal = cv2.Sobel(gray, cv2.CV_16S, 2, 0, ksize=3)
     vertical = cv2.Sobel(gray, cv2.CV_16S, 0, 2, ksize=3)
     energy = cv2.norm(horizontal, cv2.NORM_L2) * cv2.norm(vertical, cv2.NORM_L2)
-    return float(np.sqrt(energy / gray.size) / 4)  # the kernels' smoothing weights add up to 4
+    return float(np.sqrt(energy / gray.size) / 4)  # the kernels' smoothing weights sum to 4
 
 
 _IDENTITY = np.eye(2, 3)
@@ -118,7 +146,7 @@ _UNKNOWN = np.full((2, 3), np.nan)
 
 
 class _Tracker:
-    """Follows corners from image to image and fits an affine map to each step."""
+    """Optical-flow tracker: follows corners from image to image and fits an affine map to each step."""
 
     def __init__(self, lost_after: int) -> None:
         self._lost_after = lost_after
@@ -127,9 +155,9 @@ class _Tracker:
         self._missed = 0
 
     def follow(self, gray: np.ndarray) -> np.ndarray:
-        """(2, 3) affine from the last image that could be followed; identity where it can't, NaN: a break.
+        """Return the affine map (2, 3) from the last tracked image; identity if untracked, NaN at a break.
 
-        A blurred image is passed over: the next is followed from the one before it, so that the product
+        A blurred image is skipped and the next one is tracked from the image before it, so that the product
         of all maps stays right.
         """
         scale = _TRACK_WIDTH / gray.shape[1]
@@ -156,7 +184,7 @@ class _Tracker:
 
 
 def _corners(gray: np.ndarray) -> np.ndarray:
-    """(K, 1, 2) float32 corners spread over the image."""
+    """Detect corners (K, 1, 2) float32 spread over the image."""
     found = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, 0.01, 8)
     return np.empty((0, 1, 2), np.float32) if found is None else found
 
@@ -164,9 +192,9 @@ def _corners(gray: np.ndarray) -> np.ndarray:
 def _affine_step(
     before: np.ndarray, after: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """The affine map of one step, in shares of the width about the centre, and the points that followed it.
+    """Fit the affine map of one step, in fractions of the width about the centre; also return its points.
 
-    None where fewer than _MIN_TRACKS corners are found again, forward and back.
+    The map is None if fewer than _MIN_TRACKS corners pass the forward-backward check.
     """
     if len(points) < _MIN_TRACKS:
         return None, points
@@ -193,7 +221,7 @@ _LK = {
 
 
 def _fit_affine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(2, 3) affine map of (K, 2) to (K, 2) by least squares, three rounds of Cauchy weights."""
+    """Fit an affine map (2, 3) from points (K, 2) to (K, 2) by least squares, reweighted thrice (Cauchy)."""
     design = np.column_stack([start, np.ones(len(start))])
     weights = np.ones(len(start))
     for _ in range(3):
@@ -203,3 +231,32 @@ def _fit_affine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         scale = max(float(np.median(residual)), 1e-4)
         weights = 1 / (1 + (residual / scale) ** 2)
     return solution.T
+
+
+def relative_sharpness(measured: Measurements, neighbours_s: float) -> np.ndarray:
+    """Return sharpness (N,) relative to the median of the frames within `neighbours_s`; NaN if unreadable."""
+    result = np.full(len(measured), np.nan)
+    rows = np.flatnonzero(measured.readable)
+    times, sharpness = measured.time_s[rows], measured.sharpness[rows]
+    first = np.searchsorted(times, times - neighbours_s - 1e-9)
+    last = np.searchsorted(times, times + neighbours_s + 1e-9)
+    for k, row in enumerate(rows):
+        middle = float(np.median(sharpness[first[k] : last[k]]))
+        result[row] = sharpness[k] / middle if middle > 0 else 1.0
+    return result
+
+
+# Image positions at which motion is measured, in fractions of the width about the centre.
+_GRID = np.array([[x, y, 1.0] for y in (-0.2, 0.0, 0.2) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)])
+
+
+def homogeneous(affine: np.ndarray) -> np.ndarray:
+    """Extend an affine map (2, 3) to a homogeneous matrix (3, 3)."""
+    return np.vstack([affine, [0.0, 0.0, 1.0]])
+
+
+def displacement(total: np.ndarray) -> float:
+    """Return how far a homogeneous affine map moves the image, in fractions of its width; inf if unknown."""
+    moved = _GRID @ total[:2].T - _GRID[:, :2]
+    distance = float(np.median(np.linalg.norm(moved, axis=1)))
+    return distance if np.isfinite(distance) else float("inf")

@@ -1,4 +1,4 @@
-"""Photos: which of a sequence can be read, their pixels upright, and masks."""
+"""Photo headers, upright decoding of photos, and masks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from spn_data.errors import InputError
 from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
 MAX_PHOTO_PIXELS = 500_000_000
-_MAX_ASPECT_ERROR = 0.01  # by which a mask's shape may differ from the image's
-_FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG opens MPO as well
+_MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
+_FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG includes MPO
 _ORIENTATION = 0x0112
 _DIAGONAL_35MM = 43.267
 _TURNS = {
@@ -34,9 +34,16 @@ _TURNS = {
 
 @dataclass(frozen=True, eq=False)
 class PhotoHeaders:
-    """What N photos of one sequence say before their pixels are decoded.
+    """Headers of the N photos of one sequence, read without decoding pixels.
 
-    paths : (N,); metadata : (N,), None where unreadable; problem : (N,), why, else "".
+    Attributes
+    ----------
+    paths : tuple of Path, length N
+        The photos.
+    metadata : tuple of PhotoMetadata or None, length N
+        Their EXIF and XMP; None if unreadable.
+    problem : tuple of str, length N
+        Why a photo is unreadable, or "".
     """
 
     paths: tuple[Path, ...]
@@ -45,23 +52,30 @@ class PhotoHeaders:
 
     @property
     def sizes(self) -> np.ndarray:
-        """(N, 2) width and height upright, pixels; 0 where unreadable."""
+        """Upright width and height in pixels, (N, 2) int; 0 if unreadable."""
         return np.array([_upright_size(m) for m in self.metadata], dtype=np.int64).reshape(-1, 2)
 
     @property
     def lens(self) -> tuple[object, ...]:
-        """(N,) equal for photos through one lens at one zoom and size; None where unreadable."""
+        """Keys (N,), equal for photos taken through one lens at one zoom and size; None if unreadable."""
         return tuple(
             None
             if m is None
-            else (m.make, m.model, m.lens, _zoom(m.focal_mm), _zoom(m.focal_35mm), _upright_size(m))
+            else (
+                m.make,
+                m.model,
+                m.lens,
+                _rounded(m.focal_mm),
+                _rounded(m.focal_35mm),
+                _upright_size(m),
+            )
             for m in self.metadata
         )
 
     def focal_px(self, row: int) -> float | None:
-        """Of the upright photo, from the 35-mm equivalent, which compares diagonals (CIPA DCG-001).
+        """Return the focal length of the upright photo in pixels, or None if the EXIF states none.
 
-        None where it says none.
+        Derived from the 35 mm equivalent, which compares diagonals (CIPA DCG-001).
         """
         metadata = self.metadata[row]
         if metadata is None or not metadata.focal_35mm > 0:
@@ -70,17 +84,16 @@ class PhotoHeaders:
 
 
 def read_headers(paths: Sequence[Path]) -> PhotoHeaders:
-    """Headers of photos; one that can't be read is noted, and the others go on."""
+    """Read the headers of photos; the reason why one cannot be read is kept in `problem`."""
     metadata: list[PhotoMetadata | None] = []
     problem: list[str] = []
     for path in paths:
         try:
             photo = read_photo(path)
-            if photo.width * photo.height > MAX_PHOTO_PIXELS:
-                raise InputError(f"{photo.width}x{photo.height} pixels are too many", path=path)
+            _check_size(photo.width, photo.height, path)
         except InputError as error:
             metadata.append(None)
-            problem.append(_reason(error, path))
+            problem.append(_message_without_path(error, path))
         else:
             metadata.append(photo)
             problem.append("")
@@ -88,15 +101,31 @@ def read_headers(paths: Sequence[Path]) -> PhotoHeaders:
 
 
 def decode_photo(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 BGR, upright by its EXIF orientation, 8 bits; InputError where damaged."""
-    with _opened(path) as image:
+    """Decode a photo, upright by its EXIF orientation.
+
+    Parameters
+    ----------
+    path : Path
+        A JPEG, PNG or TIFF.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W, 3)
+        BGR; 16-bit photos are scaled to 8 bits.
+
+    Raises
+    ------
+    InputError
+        If the photo is damaged, too large or of a pixel format without a known range.
+    """
+    with _open_image(path) as image:
         rgb = _to_8_bits(_upright(image), path).convert("RGB")
         return np.ascontiguousarray(np.asarray(rgb)[:, :, ::-1])
 
 
 def decode_photo_gray(path: Path, *, max_width: int) -> np.ndarray:
-    """(h, w) uint8 grey, upright, at most `max_width` wide; a JPEG is decoded at a reduced size."""
-    with _opened(path) as image:
+    """Decode an upright grey image (h, w) uint8 at most `max_width` wide; JPEGs are decoded reduced."""
+    with _open_image(path) as image:
         image.draft("L", (max_width, max_width * image.height // max(image.width, 1)))
         gray = np.asarray(_to_8_bits(_upright(image), path).convert("L"))
     scale = max_width / gray.shape[1]
@@ -107,44 +136,69 @@ def decode_photo_gray(path: Path, *, max_width: int) -> np.ndarray:
 
 
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """(height, width) bool, True where the image may be used: where the mask is white (at least half).
+    """Load a mask of usable pixels.
 
-    A mask of another size but the same shape is resized without blending; another shape is an InputError.
+    Parameters
+    ----------
+    path : Path
+        An image, white (at least half) where pixels may be used. A mask of the same aspect ratio but another
+        size is resized with nearest-neighbour interpolation.
+    width, height : int
+        Size of the images that it masks.
+
+    Returns
+    -------
+    ndarray of bool, shape (height, width)
+        True at pixels that may be used.
+
+    Raises
+    ------
+    InputError
+        If the mask cannot be read, has another aspect ratio or is all black.
     """
-    with _opened(path) as image:
+    with _open_image(path) as image:
         mask = np.asarray(_to_8_bits(image, path).convert("L"))
     if mask.shape != (height, width):
         found = f"{mask.shape[1]}x{mask.shape[0]}"
         if abs(mask.shape[1] * height / (mask.shape[0] * width) - 1) > _MAX_ASPECT_ERROR:
             raise InputError(
-                f"a mask of {found} does not fit images of {width}x{height}", path=path
+                f"the mask is {found} but the images are {width}x{height}: the aspect ratios differ",
+                path=path,
             )
         mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
     usable = mask >= 128
     if not usable.any():
-        raise InputError("the mask is black all over: white is what may be used", path=path)
+        raise InputError("the mask is entirely black; usable pixels must be white", path=path)
     return usable
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """The photo, with its size checked before pixels take memory; damage becomes an InputError."""
+def _open_image(path: Path) -> Iterator[Image.Image]:
+    """Open a photo after checking its size; damage becomes an InputError."""
     try:
         with warnings.catch_warnings():
-            # Large photos are told by `read_headers` and the limit below, damaged EXIF by `read_photo`.
+            # `read_headers` and the limit below report large photos, `read_photo` reports damaged EXIF.
             warnings.simplefilter("ignore")
             with Image.open(path, formats=_FORMATS) as image:
-                if image.width * image.height > MAX_PHOTO_PIXELS:
-                    raise InputError(f"{image.width}x{image.height} pixels are too many", path=path)
+                _check_size(image.width, image.height, path)
                 yield image
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        reason = str(error) if isinstance(error, Image.DecompressionBombError) else _damage(error)
+        reason = (
+            str(error) if isinstance(error, Image.DecompressionBombError) else _damage_reason(error)
+        )
         raise InputError(f"cannot be read as an image: {reason}", path=path) from error
 
 
+def _check_size(width: int, height: int, path: Path) -> None:
+    """Refuse a photo whose header claims an absurd size."""
+    if width * height > MAX_PHOTO_PIXELS:
+        limit = f"{MAX_PHOTO_PIXELS / 1e6:.0f} megapixels"
+        raise InputError(f"{width}x{height} pixels exceed the limit of {limit}", path=path)
+
+
 def _upright(image: Image.Image) -> Image.Image:
-    """Turned as EXIF says; as stored where the EXIF is damaged, which `read_photo` tells."""
-    image.load()  # Pillow turns a TIFF itself when it is loaded, and then reports no orientation
+    """Apply the EXIF orientation, unless the EXIF is damaged, which `read_photo` reports."""
+    image.load()  # Pillow turns a TIFF upright on loading and then reports no orientation
     try:
         orientation = image.getexif().get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
@@ -153,19 +207,21 @@ def _upright(image: Image.Image) -> Image.Image:
     return image if turn is None else image.transpose(turn)
 
 
-def _damage(error: Exception) -> str:
+def _damage_reason(error: Exception) -> str:
     strerror = getattr(error, "strerror", None)
     if strerror:
         return str(strerror)
-    return "it is truncated" if "truncated" in str(error) else "it is damaged or no image"
+    return "it is truncated" if "truncated" in str(error) else "it is damaged or not an image"
 
 
 def _to_8_bits(image: Image.Image, path: Path) -> Image.Image:
-    """Modes of 16 bits scaled to 8; those without a known range are refused."""
+    """Scale 16-bit modes to 8 bits; refuse modes without a known range."""
     if image.mode.startswith("I;16"):
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     if image.mode in ("I", "F"):
-        raise InputError(f"pixels of kind {image.mode!r} (thermal?) have no known range", path=path)
+        raise InputError(
+            f"pixel format {image.mode!r} (thermal?) has no known value range", path=path
+        )
     return image
 
 
@@ -176,9 +232,9 @@ def _upright_size(photo: PhotoMetadata | None) -> tuple[int, int]:
     return (photo.height, photo.width) if turned else (photo.width, photo.height)
 
 
-def _zoom(focal_mm: float) -> float | None:
+def _rounded(focal_mm: float) -> float | None:
     return round(focal_mm, 2) if np.isfinite(focal_mm) else None
 
 
-def _reason(error: InputError, path: Path) -> str:
+def _message_without_path(error: InputError, path: Path) -> str:
     return str(error).removeprefix(f"{path}: ")

@@ -1,4 +1,4 @@
-"""The choice of frames: sharp beside their neighbours, and far enough apart to see parallax."""
+"""Selection of frames: sharper than their neighbours and far enough apart for parallax."""
 
 from __future__ import annotations
 
@@ -7,47 +7,77 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spn_data.capture.frames import FrameStatus
-from spn_data.capture.measurement import Measurements
+from spn_data.capture.measurement import (
+    Measurements,
+    displacement,
+    homogeneous,
+    relative_sharpness,
+)
 from spn_data.errors import InputError
 
 _UNKNOWN_HEIGHT_M = 100.0
-# Positions in the image at which motion is measured, in shares of its width about the centre.
-_GRID = np.array([[x, y, 1.0] for y in (-0.2, 0.0, 0.2) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionOptions:
-    """How frames are chosen."""
+    """Options of the frame selection.
 
-    motion_share: float = 0.10  # motion of the image between chosen frames, as a share of its width
-    window: float = (
-        0.35  # the sharpest is taken within this part of motion_share before and after it
-    )
-    min_spacing_s: float = 0.3  # chosen frames are never closer in time
-    max_spacing_s: float = 4.0  # nor further apart, though the image stands still
-    max_distance_m: float = 3.0  # nor further apart by the telemetry, where it is known ...
-    max_distance_share: float = (
-        0.1  # ... or this share of the height above take-off, if that is more
-    )
-    blur_ratio: float = (
-        0.75  # a frame is blurred below this share of its neighbours' median sharpness
-    )
-    neighbours_s: float = 1.0  # frames this near in time are its neighbours
-    min_sharpness: float = 1.0  # grey levels; a source whose best frames stay below it is unusable
-    still_share: float = 0.005  # photos that moved less, at one place, are the same photo twice
-    still_m: float = 0.5  # and lie nearer than this by their telemetry
-    target_count: int | None = None  # of all sources; scales motion_share and max_spacing_s
-    min_count: int = (
-        30  # of a video, where no target is given: below it frames are chosen more densely
-    )
+    Attributes
+    ----------
+    motion_share : float
+        Image motion between chosen frames, as a fraction of the image width.
+    window : float
+        The sharpest frame is taken within this fraction of `motion_share` before and after it.
+    min_spacing_s : float
+        Chosen frames are never closer in time.
+    max_spacing_s : float
+        Chosen frames are never further apart in time, even if the image does not move.
+    max_distance_m, max_distance_share : float
+        If the telemetry states positions, chosen frames are never further apart than `max_distance_m` or
+        this fraction of the height above take-off, whichever is larger.
+    blur_ratio : float
+        A frame is blurred below this fraction of its neighbours' median sharpness.
+    neighbours_s : float
+        Frames this close in time are neighbours.
+    min_sharpness : float
+        Grey levels; a source whose best frames stay below it is unusable.
+    still_share, still_m : float
+        A photo repeats the one before if the image moved less than `still_share` of its width and, by
+        telemetry, the camera moved no more than `still_m`.
+    target_count : int, optional
+        Frames wanted from all sources; scales `motion_share`, `max_spacing_s` and the distances.
+    min_count : int
+        If a video gives fewer frames than this and there is no target, frames are chosen more densely.
+    """
+
+    motion_share: float = 0.10
+    window: float = 0.35
+    min_spacing_s: float = 0.3
+    max_spacing_s: float = 4.0
+    max_distance_m: float = 3.0
+    max_distance_share: float = 0.1
+    blur_ratio: float = 0.75
+    neighbours_s: float = 1.0
+    min_sharpness: float = 1.0
+    still_share: float = 0.005
+    still_m: float = 0.5
+    target_count: int | None = None
+    min_count: int = 30
 
 
 @dataclass(frozen=True, eq=False)
 class FrameChoice:
-    """What became of N measured frames.
+    """Outcome of the selection for N measured frames.
 
-    status : (N,) str, a FrameStatus; reason : (N,) str; motion_px : (N,) motion of the image since the frame
-    chosen before, in full-size pixels, NaN before the first and where it is not known.
+    Attributes
+    ----------
+    status : ndarray of str, shape (N,)
+        A `FrameStatus`.
+    reason : ndarray of str, shape (N,)
+        Why, for the user.
+    motion_px : ndarray, shape (N,)
+        Image motion since the previously chosen frame in full-size pixels; NaN before the first chosen
+        frame and if unknown.
     """
 
     status: np.ndarray
@@ -56,34 +86,36 @@ class FrameChoice:
 
     @property
     def chosen(self) -> np.ndarray:
-        """(N,) bool."""
+        """Frames selected for mapping, (N,) bool."""
         return self.status == FrameStatus.CHOSEN
 
 
-def relative_sharpness(measured: Measurements, neighbours_s: float) -> np.ndarray:
-    """(N,) sharpness over the median of the frames within `neighbours_s`; NaN where unreadable."""
-    result = np.full(len(measured), np.nan)
-    rows = np.flatnonzero(measured.readable)
-    times, sharpness = measured.time_s[rows], measured.sharpness[rows]
-    first = np.searchsorted(times, times - neighbours_s - 1e-9)
-    last = np.searchsorted(times, times + neighbours_s + 1e-9)
-    for k, row in enumerate(rows):
-        middle = float(np.median(sharpness[first[k] : last[k]]))
-        result[row] = sharpness[k] / middle if middle > 0 else 1.0
-    return result
-
-
 def check_usable(measured: Measurements, options: SelectionOptions, name: str) -> None:
-    """InputError where nothing of a source can be used: nothing readable, or the sharpest tenth near zero."""
+    """Check that a source has usable images.
+
+    Parameters
+    ----------
+    measured : Measurements
+        The images of the source.
+    options : SelectionOptions
+        Supplies `min_sharpness`.
+    name : str
+        Names the source in messages.
+
+    Raises
+    ------
+    InputError
+        If no image is readable, or the 90 % quantile of sharpness is below `min_sharpness`.
+    """
     sharpness = measured.sharpness[measured.readable]
     if len(sharpness) == 0:
-        why = measured.problem[0] if len(measured) else "it holds none"
-        raise InputError(f"not one image can be read: {why}", path=name)
+        why = measured.problem[0] if len(measured) else "it contains none"
+        raise InputError(f"no image can be read: {why}", path=name)
     best = float(np.quantile(sharpness, 0.9))
     if best < options.min_sharpness:
         raise InputError(
-            f"every frame is blurred, dark or empty: sharpness {best:.1f} grey levels in the best tenth of "
-            f"{len(sharpness)}, needed {options.min_sharpness:g}; check lens, focus and exposure",
+            f"every frame is blurred, dark or empty: the sharpest tenth of {len(sharpness)} reaches "
+            f"{best:.1f} grey levels, {options.min_sharpness:g} are needed; check lens, focus and exposure",
             path=name,
         )
 
@@ -91,14 +123,14 @@ def check_usable(measured: Measurements, options: SelectionOptions, name: str) -
 def choose(
     measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
 ) -> FrameChoice:
-    """Which frames of a video are used, and why.
+    """Choose frames of a video.
 
-    position_m : (N, 3) by the telemetry: east, north and height above take-off; NaN where unknown. An
-    unknown height is taken as 100 m, so that distance adds few frames.
-
-    From each chosen frame, the next is the sharpest whose motion is near `motion_share`. Where the image
-    stands still it is the sharpest before `max_spacing_s`. A passage without a sharp frame still gives its
+    From each chosen frame, the next one is the sharpest whose motion is near `motion_share`. If the image
+    does not move, it is the sharpest before `max_spacing_s`. A stretch without a sharp frame still gives its
     best one.
+
+    position_m : (N, 3) east, north and height above take-off from telemetry; NaN if unknown. An unknown
+    height is taken as 100 m, so that distance adds few frames.
     """
     n = len(measured)
     status = np.full(n, str(FrameStatus.SKIPPED), dtype="U10")
@@ -107,23 +139,23 @@ def choose(
     unreadable = ~measured.readable
     status[unreadable] = FrameStatus.UNREADABLE
     reason[unreadable] = measured.problem[unreadable]
-    passage = _Passage.of(measured, options, position_m)
-    rows, done, last = passage.rows, 0, None
+    frames = _VideoFrames.from_measurements(measured, options, position_m)
+    rows, done, last = frames.rows, 0, None
     while done < len(rows):
-        ahead = passage.ahead(last)
-        window, widened = passage.windows(ahead)
+        ahead = frames.look_ahead(last)
+        window, widened = frames.windows(ahead)
         if len(window) == 0:
             pick, end = None, len(rows)
         else:
-            pick, why = passage.best(window, widened)
+            pick, why = frames.pick_best(window, widened)
             end = pick
         for k in range(done, end):
-            reason[rows[k]] = passage.why_skipped(k, ahead)
-            motion_px[rows[k]] = passage.pixels(k, ahead)
+            reason[rows[k]] = frames.why_skipped(k, ahead)
+            motion_px[rows[k]] = frames.motion_px(k, ahead)
         if pick is not None:
             status[rows[pick]] = FrameStatus.CHOSEN
             reason[rows[pick]] = why
-            motion_px[rows[pick]] = passage.pixels(pick, ahead)
+            motion_px[rows[pick]] = frames.motion_px(pick, ahead)
         last, done = pick, end + 1
     return FrameChoice(status, reason.astype(np.str_), motion_px)
 
@@ -131,10 +163,21 @@ def choose(
 def choose_all(
     sources: list[tuple[Measurements, np.ndarray | None]], options: SelectionOptions
 ) -> list[FrameChoice]:
-    """`choose` for several videos (measurements, positions), near `target_count` frames in all where given.
+    """Choose frames of several videos.
 
-    Without a target, a video that gives fewer than `min_count` frames is chosen from more densely: a short
-    clip, or one far from what it shows, would else fall apart.
+    Parameters
+    ----------
+    sources : list of (Measurements, ndarray or None)
+        Measurements of each video, and its positions (N, 3) as in `choose`.
+    options : SelectionOptions
+        With a `target_count`, about that many frames are chosen in all. Without one, a video with fewer than
+        `min_count` frames is sampled more densely: the frames of a short clip, or of one far from its
+        subject, might otherwise not connect.
+
+    Returns
+    -------
+    list of FrameChoice
+        One per video.
     """
     if options.target_count is not None:
         return _choose_near(sources, options, options.target_count)
@@ -150,9 +193,9 @@ def choose_all(
 def _choose_near(
     sources: list[tuple[Measurements, np.ndarray | None]], options: SelectionOptions, target: int
 ) -> list[FrameChoice]:
-    """Near `target` frames in all: motion and the longest spacing are scaled together.
+    """Choose about `target` frames in all by scaling motion, longest spacing and distance together.
 
-    The shortest spacing holds, so that a target may stay out of reach.
+    The shortest spacing still holds, so the target may be out of reach.
     """
 
     def scaled(factor: float) -> list[FrameChoice]:
@@ -181,44 +224,12 @@ def _choose_near(
     return best[1]
 
 
-def choose_photos(
-    measured: Measurements, options: SelectionOptions, *, position_m: np.ndarray | None = None
-) -> FrameChoice:
-    """All readable photos but those that repeat the one chosen before: same place, image unmoved.
-
-    position_m : (N, 3) as for `choose`.
-    """
-    n = len(measured)
-    status = np.full(n, str(FrameStatus.CHOSEN), dtype="U10")
-    reason = np.full(n, "chosen: photo", dtype=object)
-    motion_px = np.full(n, np.nan)
-    last: int | None = None
-    total = np.eye(3)
-    for row in range(n):
-        total = _homogeneous(measured.motion[row]) @ total
-        if not measured.readable[row]:
-            status[row], reason[row] = FrameStatus.UNREADABLE, measured.problem[row]
-            continue
-        if last is not None:
-            share = _displacement(total)
-            motion_px[row] = share * measured.width[row] if np.isfinite(share) else np.nan
-            apart = np.nan
-            if position_m is not None:
-                apart = float(np.linalg.norm(position_m[row, :2] - position_m[last, :2]))
-            if share < options.still_share and not apart > options.still_m:
-                status[row] = FrameStatus.SKIPPED
-                reason[row] = f"skipped: the photo before, {motion_px[row]:.1f} px apart"
-                continue
-        last, total = row, np.eye(3)
-    return FrameChoice(status, reason.astype(np.str_), motion_px)
-
-
 @dataclass(frozen=True, eq=False)
-class _Ahead:
-    """The frames after the one chosen last, as far as the next must be chosen.
+class _Lookahead:
+    """The K frames after the last chosen one, up to the longest spacing.
 
-    first : position of the first of them; elapsed_s, motion (shares of the width, inf beyond a break of the
-    image), distance (NaN unknown, 1 at the greatest that is allowed) : (K,) since the frame chosen last.
+    first : index of the first of them. elapsed_s, motion (fractions of the width, inf beyond a break) and
+    distance (1 at the greatest allowed, NaN if unknown) : (K,) since the last chosen frame.
     """
 
     first: int
@@ -229,24 +240,25 @@ class _Ahead:
 
 
 @dataclass(frozen=True, eq=False)
-class _Passage:
-    """The M readable frames of a video; rows : (M,) where they stand among all."""
+class _VideoFrames:
+    """The M readable frames of a video; rows : (M,) their indices among all frames."""
 
     rows: np.ndarray
     time_s: np.ndarray
     width: np.ndarray
-    steps: np.ndarray  # (M, 3, 3) motion from the frame before
-    relative: np.ndarray  # (M,) sharpness beside the neighbours
-    score: np.ndarray  # (M,) the same, with damaged frames below all others
+    steps: np.ndarray  # (M, 3, 3) homogeneous motion from the frame before
+    relative: np.ndarray  # (M,) sharpness relative to the neighbours
+    score: np.ndarray  # (M,) the same, lowered for damaged frames
     damaged: np.ndarray
     position_m: np.ndarray | None
     options: SelectionOptions
 
     @classmethod
-    def of(
+    def from_measurements(
         cls, measured: Measurements, options: SelectionOptions, position_m: np.ndarray | None
-    ) -> _Passage:
-        # The step of an unreadable frame is the identity: leaving its row out loses no motion.
+    ) -> _VideoFrames:
+        """Select the readable frames."""
+        # Unreadable frames have identity motion, so dropping their rows loses none.
         rows = np.flatnonzero(measured.readable)
         relative = relative_sharpness(measured, options.neighbours_s)[rows]
         damaged = measured.damaged[rows]
@@ -254,7 +266,7 @@ class _Passage:
             rows,
             measured.time_s[rows],
             measured.width[rows],
-            np.array([_homogeneous(a) for a in measured.motion[rows]]).reshape(-1, 3, 3),
+            np.array([homogeneous(a) for a in measured.motion[rows]]).reshape(-1, 3, 3),
             relative,
             np.where(damaged, 0.1 * relative, relative),
             damaged,
@@ -262,8 +274,8 @@ class _Passage:
             options,
         )
 
-    def ahead(self, last: int | None) -> _Ahead:
-        """What lies after frame `last`, up to the longest spacing (a frame at least); None for the start."""
+    def look_ahead(self, last: int | None) -> _Lookahead:
+        """Describe the frames after `last` (None at the start), up to the longest spacing, at least one."""
         first = 0 if last is None else last + 1
         origin = 0 if last is None else last
         limit = self.time_s[origin] + self.options.max_spacing_s
@@ -274,7 +286,7 @@ class _Passage:
         for i, k in enumerate(range(first, stop)):
             if k > 0:
                 total = self.steps[k] @ total
-            motion[i] = _displacement(total)
+            motion[i] = displacement(total)
         distance = np.full(stop - first, np.nan)
         if self.position_m is not None:
             apart = self.position_m[first:stop] - self.position_m[origin]
@@ -284,19 +296,19 @@ class _Passage:
             )
             distance = np.linalg.norm(apart[:, :2], axis=1) / limit_m
         elapsed = self.time_s[first:stop] - self.time_s[origin]
-        return _Ahead(first, elapsed, motion, distance, last is None)
+        return _Lookahead(first, elapsed, motion, distance, last is None)
 
-    def windows(self, ahead: _Ahead) -> tuple[np.ndarray, np.ndarray]:
-        """Positions of the frames from which the next is taken, and of a wider window should they be blurred.
+    def windows(self, ahead: _Lookahead) -> tuple[np.ndarray, np.ndarray]:
+        """Return the frames that compete to be next, and a wider window in case they are all blurred.
 
-        Empty where the video ends before another frame is due.
+        Both are empty if the video ends before another frame is due.
         """
         near = self._between(ahead, 1 - self.options.window, 1 + self.options.window)
         if len(near) == 0:
             return near, near
         return near, np.union1d(near, self._between(ahead, 0.4, 2.5))
 
-    def _between(self, ahead: _Ahead, low: float, high: float) -> np.ndarray:
+    def _between(self, ahead: _Lookahead, low: float, high: float) -> np.ndarray:
         options = self.options
         if ahead.at_start:
             late = (ahead.motion > 0.5 * options.motion_share * high) | (
@@ -313,7 +325,7 @@ class _Passage:
         if not due.any():
             return np.array([], dtype=np.int64)
         start = int(np.argmax(due))
-        # Where the image moves too fast for the shortest spacing, a few frames still compete.
+        # If the image moves too fast for the shortest spacing, a few frames still compete.
         grace_s = ahead.elapsed_s[start] + 0.5 * options.min_spacing_s
         over = (ahead.motion > high * options.motion_share) | (ahead.distance > high)
         over &= ahead.elapsed_s > grace_s
@@ -321,56 +333,45 @@ class _Passage:
         stop = int(np.argmax(over)) if over.any() else len(over)
         return ahead.first + np.arange(start, stop)
 
-    def best(self, window: np.ndarray, widened: np.ndarray) -> tuple[int, str]:
-        """The frame taken from a window, and the reason in words."""
+    def pick_best(self, window: np.ndarray, widened: np.ndarray) -> tuple[int, str]:
+        """Return the sharpest acceptable frame of a window, and the reason for the user."""
         pick = int(window[np.argmax(self.score[window])])
-        if self._good(pick):
+        if self._is_sharp(pick):
             return pick, f"chosen: sharpest of {len(window)} in its window"
         pick = int(widened[np.argmax(self.score[widened])])
-        if self._good(pick):
+        if self._is_sharp(pick):
             return (
                 pick,
-                f"chosen: sharpest of {len(widened)}, all nearer the wanted place are blurred",
+                f"chosen: sharpest of {len(widened)}; those nearer the wanted spacing are blurred",
             )
         if self.damaged[pick]:
             return (
                 pick,
-                f"chosen: damaged by lost packets, as are all {len(widened)} in its passage",
+                f"chosen: damaged by lost packets, like all {len(widened)} in this stretch",
             )
         return pick, (
             f"chosen: blurred ({self.relative[pick]:.2f} of its neighbours' sharpness), but the best of "
-            f"{len(widened)} in its passage"
+            f"{len(widened)} in this stretch"
         )
 
-    def _good(self, k: int) -> bool:
+    def _is_sharp(self, k: int) -> bool:
         return bool(self.score[k] >= self.options.blur_ratio)
 
-    def pixels(self, k: int, ahead: _Ahead) -> float:
-        """Motion since the frame chosen last, full-size pixels; NaN where unknown."""
+    def motion_px(self, k: int, ahead: _Lookahead) -> float:
+        """Return motion since the last chosen frame in full-size pixels; NaN if unknown."""
         i = k - ahead.first
         if ahead.at_start or i >= len(ahead.motion) or not np.isfinite(ahead.motion[i]):
             return float("nan")
         return round(float(ahead.motion[i] * self.width[k]), 1)
 
-    def why_skipped(self, k: int, ahead: _Ahead) -> str:
-        """The reason in words."""
+    def why_skipped(self, k: int, ahead: _Lookahead) -> str:
+        """Return the reason why a frame is skipped, for the user."""
         if self.damaged[k]:
             return "skipped: damaged by lost packets"
         if self.relative[k] < self.options.blur_ratio:
             return f"skipped: blurred, {self.relative[k]:.2f} of its neighbours' sharpness"
-        moved = self.pixels(k, ahead)
+        moved = self.motion_px(k, ahead)
         share = moved / self.width[k]
         if share < (1 - self.options.window) * self.options.motion_share:
-            return f"skipped: {moved:.0f} px from the frame chosen before"
-        return "skipped: the frame chosen after it is sharper"
-
-
-def _homogeneous(affine: np.ndarray) -> np.ndarray:
-    return np.vstack([affine, [0.0, 0.0, 1.0]])
-
-
-def _displacement(total: np.ndarray) -> float:
-    """How far an affine map (3, 3) moves the image, in shares of its width; inf where it is not known."""
-    moved = _GRID @ total[:2].T - _GRID[:, :2]
-    distance = float(np.median(np.linalg.norm(moved, axis=1)))
-    return distance if np.isfinite(distance) else float("inf")
+            return f"skipped: only {moved:.0f} px from the previously chosen frame"
+        return "skipped: the next chosen frame is sharper"

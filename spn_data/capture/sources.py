@@ -1,4 +1,4 @@
-"""What a folder holds: videos, photos and the telemetry beside them, as sequences. Decodes nothing."""
+"""Discovery of sequences in a folder: videos, photos and their telemetry files. Decodes nothing."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff"])
 TELEMETRY_SUFFIXES = frozenset([".srt", ".gpx", ".csv"])
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
-MIN_SPLIT_BYTES = int(
-    3.5 * 2**30
-)  # cameras split a flight where FAT32 ends a file, just below 4 GiB
-_CONTIGUOUS_S = 5.0  # creation times have whole seconds, and a part starts while the last is closed
+# Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
+MIN_SPLIT_BYTES = int(3.5 * 2**30)
+# Creation times have whole seconds, and a part starts while the one before is still being closed.
+_CONTIGUOUS_S = 5.0
 _MAX_DEPTH = 8
 _MAX_FILES = 200_000
 
@@ -39,7 +39,7 @@ _T = TypeVar("_T")
 
 
 class SourceKind(StrEnum):
-    """What a sequence is made of."""
+    """Kind of media in a sequence."""
 
     VIDEO = "video"
     PHOTOS = "photos"
@@ -47,11 +47,18 @@ class SourceKind(StrEnum):
 
 @dataclass(frozen=True)
 class Source:
-    """One sequence: a flight's video, in one or several parts, or a folder of photos.
+    """One sequence: a flight's video in one or several parts, or a folder of photos.
 
-    sequence : unique, of the characters A-Z a-z 0-9 . _ -, so that it can name a folder.
-    parts : video files in the order of time, or photos in the order of their names.
-    telemetry : files beside them, of the same name.
+    Attributes
+    ----------
+    sequence : str
+        Unique name of the characters A-Z a-z 0-9 . _ -, so that it can name a folder.
+    kind : SourceKind
+        Video or photos.
+    parts : tuple of Path
+        Video files in order of time, or photos in order of their names.
+    telemetry : tuple of Path
+        Telemetry files of the same name in the same folder.
     """
 
     sequence: str
@@ -62,7 +69,7 @@ class Source:
 
 @dataclass(frozen=True)
 class FoundSources:
-    """What was found, in the order of names; ignored : (path, reason) of everything else."""
+    """Sequences found, sorted by name, and (path, reason) of every ignored file."""
 
     sources: tuple[Source, ...]
     ignored: tuple[tuple[Path, str], ...]
@@ -74,17 +81,36 @@ def discover(
     probe: Callable[[Path], VideoInfo] | None = None,
     min_split_bytes: int = MIN_SPLIT_BYTES,
 ) -> FoundSources:
-    """The sequences of a folder and those below it, or of a single video or photo.
+    """Find the sequences in a folder and its subfolders, or take a single video or photo.
 
-    Several video files are one sequence where a camera split one recording:
-    - GoPro: `GX010042`, `GX020042`, ... (also GH) and `GOPR0042`, `GP010042`, ...: the same number,
-      chapters without a hole;
-    - DJI: consecutive numbers (`DJI_0007`, `DJI_0008`), all but the last part at least `min_split_bytes`, and
-      by `probe` (default `video.probe`, called only for these) the same size and rate, and either each begins
-      when the one before it ends or all bear the same creation time. Without creation times they stay apart.
+    Several video files form one sequence if a camera split one recording:
 
-    Links are not followed, proxies and hidden files are passed over: all are listed in `ignored`.
-    InputError where there is no video and no photo.
+    - GoPro: `GX010042`, `GX020042`, ... (also GH) and `GOPR0042`, `GP010042`, ...: the same number with
+      consecutive chapters.
+    - DJI: consecutive numbers (`DJI_0007`, `DJI_0008`), every part but the last at least `min_split_bytes`
+      long, the same size, codec and frame rate by `probe`, and either each part starts when the one before
+      ends or all have the same creation time. Without creation times the files stay separate.
+
+    Links are not followed; proxies and hidden files are skipped. Both are listed in `ignored`.
+
+    Parameters
+    ----------
+    folder : Path
+        A folder, or a single video or photo.
+    probe : callable, optional
+        Returns the `VideoInfo` of a file (default `video.probe`); called only for DJI candidates.
+    min_split_bytes : int
+        Smallest size of a file that a DJI camera may have split.
+
+    Returns
+    -------
+    FoundSources
+        Sequences and ignored files, both sorted.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist or contains neither a video nor a photo.
     """
     if not folder.exists():
         raise InputError("does not exist", path=folder)
@@ -94,23 +120,23 @@ def discover(
         files = list(_walk(folder, ignored))
     else:
         root = folder.parent
-        files = [folder, *_siblings(folder)]
-    by_kind = _sort(files, ignored)
+        files = [folder, *_sibling_telemetry(folder)]
+    by_kind = _classify(files, ignored)
     sources: list[Source] = []
     taken: set[str] = set()
     for parts in _group_videos(by_kind["video"], probe, min_split_bytes):
-        beside = tuple(t for part in parts for t in _beside(part, by_kind["telemetry"]))
-        name = _unique(parts[0].stem, parts[0].parent.name, taken)
-        sources.append(Source(name, SourceKind.VIDEO, parts, beside))
+        telemetry = tuple(t for part in parts for t in _same_name(part, by_kind["telemetry"]))
+        name = _unique_name(parts[0].stem, parts[0].parent.name, taken)
+        sources.append(Source(name, SourceKind.VIDEO, parts, telemetry))
     for place, photos in _by_folder(by_kind["photo"]).items():
-        name = _unique(place.resolve().name, place.resolve().parent.name, taken)
-        # A folder's telemetry bears the folder's name, or is the only one lying in it.
+        name = _unique_name(place.resolve().name, place.resolve().parent.name, taken)
+        # Telemetry of a photo folder has the folder's name, or is the only file of its kind in it.
         here = [t for t in by_kind["telemetry"] if t.parent == place]
         used = {t for s in sources for t in s.telemetry}
         free = [t for t in here if t not in used and t.suffix.lower() != ".srt"]
         named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
-        beside = named or (tuple(free) if len(free) == 1 else ())
-        sources.append(Source(name, SourceKind.PHOTOS, photos, beside))
+        telemetry = named or (tuple(free) if len(free) == 1 else ())
+        sources.append(Source(name, SourceKind.PHOTOS, photos, telemetry))
     used = {t for s in sources for t in s.telemetry}
     for path in by_kind["telemetry"]:
         if path not in used and folder.is_dir():
@@ -122,24 +148,24 @@ def discover(
 
 
 def safe_name(text: str, fallback: str = "sequence") -> str:
-    """Text as a name of A-Z a-z 0-9 . _ - that does not begin with a dot; at most 80 characters."""
+    """Return text as a name of at most 80 characters A-Z a-z 0-9 . _ - without a leading dot."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", plain).strip(".-")[:80].rstrip(".-")
     return plain or fallback
 
 
 def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
-    """Regular files below a folder, sorted; links, hidden and special files go to `ignored`."""
+    """Yield the regular files in a folder tree, sorted; links, hidden and special files go to `ignored`."""
     count = 0
 
     def refuse(error: OSError) -> None:
-        ignored.append((Path(error.filename), f"can't be read: {error.strerror}"))
+        ignored.append((Path(error.filename), f"cannot be read: {error.strerror}"))
 
     for place, folders, names in os.walk(folder, onerror=refuse):
         here = Path(place)
         for name in sorted(folders):
             if (here / name).is_symlink():
-                ignored.append((here / name, "link: name the folder that it points to instead"))
+                ignored.append((here / name, "link: pass the folder that it points to instead"))
             elif name.startswith("."):
                 ignored.append((here / name, "hidden"))
             elif (here / name / "stage.json").exists():
@@ -154,22 +180,22 @@ def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
             path = here / name
             count += 1
             if count > _MAX_FILES:
-                raise InputError(f"holds more than {_MAX_FILES} files", path=folder)
+                raise InputError(f"contains more than {_MAX_FILES:,} files", path=folder)
             if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
                 shown = name.encode("unicode_escape").decode()
                 ignored.append(
-                    (here / shown, "control characters or no UTF-8 in its name: rename it")
+                    (here / shown, "control characters or invalid UTF-8 in its name: rename it")
                 )
             elif path.is_symlink():
-                ignored.append((path, "link: name the file that it points to instead"))
+                ignored.append((path, "link: pass the file that it points to instead"))
             elif not path.is_file():
                 ignored.append((path, "not a regular file"))
             else:
                 yield path
 
 
-def _siblings(video: Path) -> list[Path]:
-    """Telemetry beside a single file."""
+def _sibling_telemetry(video: Path) -> list[Path]:
+    """Return the telemetry files with the name of a single video or photo."""
     return sorted(
         p
         for p in video.parent.iterdir()
@@ -179,7 +205,8 @@ def _siblings(video: Path) -> list[Path]:
     )
 
 
-def _sort(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[str, list[Path]]:
+def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[str, list[Path]]:
+    """Sort files into videos, photos and telemetry; everything else goes to `ignored`."""
     kinds: dict[str, list[Path]] = {"video": [], "photo": [], "telemetry": []}
     for path in files:
         suffix = path.suffix.lower()
@@ -202,10 +229,10 @@ def _sort(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[str, l
 
 def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
     if not folder.is_dir():
-        return f"is no video or photo: its name ends in {folder.suffix or 'nothing'}"
+        return f"is not a video or photo: unsupported suffix {folder.suffix or '(none)'}"
     links = sum(why.startswith("link") for _, why in ignored)
-    found = f"; {len(ignored)} other files are there" if ignored else "; the folder is empty"
-    return "holds no video and no photo" + found + (f", {links} of them links" if links else "")
+    found = f"; {len(ignored)} other files" if ignored else "; the folder is empty"
+    return "contains no video or photo" + found + (f", {links} of them links" if links else "")
 
 
 def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:
@@ -215,12 +242,12 @@ def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:
     return {place: tuple(sorted(found)) for place, found in sorted(folders.items())}
 
 
-def _beside(part: Path, telemetry: list[Path]) -> list[Path]:
+def _same_name(part: Path, telemetry: list[Path]) -> list[Path]:
     return [t for t in telemetry if t.parent == part.parent and t.stem.lower() == part.stem.lower()]
 
 
-def _unique(stem: str, parent: str, taken: set[str]) -> str:
-    """A safe name that no other sequence has, also where case does not count."""
+def _unique_name(stem: str, parent: str, taken: set[str]) -> str:
+    """Return a safe name that no other sequence has, even if case is ignored; adds it to `taken`."""
     name = safe_name(stem)
     if name.lower() in taken:
         name = safe_name(f"{parent}-{stem}")
@@ -236,7 +263,7 @@ def _unique(stem: str, parent: str, taken: set[str]) -> str:
 def _group_videos(
     videos: list[Path], probe: Callable[[Path], VideoInfo] | None, min_split_bytes: int
 ) -> list[tuple[Path, ...]]:
-    """Video files, parts of one recording together, in the order of names."""
+    """Group video files that are parts of one recording, sorted by name."""
     chapters: dict[tuple[Path, str, str], list[tuple[int, Path]]] = {}
     groups: list[tuple[Path, ...]] = []
     others: list[Path] = []
@@ -266,7 +293,7 @@ def _group_videos(
 
 
 def _runs(items: list[_T], joined: Callable[[_T, _T], bool]) -> list[list[_T]]:
-    """Items cut wherever two neighbours are not joined."""
+    """Split a list between neighbours that are not joined."""
     runs = [[item] for item in items[:1]]
     for before, after in pairwise(items):
         if joined(before, after):
@@ -292,7 +319,7 @@ def _is_next_dji_part(
         probe = video.probe
     try:
         first, second = probe(before), probe(after)
-    except InputError:  # it is told when the file is used
+    except InputError:  # reported when the file is used
         return False
     same = (first.width, first.height, first.codec) == (second.width, second.height, second.codec)
     if not same or abs(first.fps - second.fps) > 0.01 * first.fps:

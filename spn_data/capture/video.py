@@ -1,4 +1,4 @@
-"""Video files through PyAV: what they hold, and their frames with the container's own timestamps."""
+"""Video files: properties and decoded frames with the container's own timestamps."""
 
 from __future__ import annotations
 
@@ -9,28 +9,58 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 
+from spn_data.capture.video_container import (
+    Orientation,
+    decoded_frames,
+    frame_orientation,
+    open_container,
+    pixel_aspect_ratio,
+    upright_size,
+    video_stream,
+)
 from spn_data.errors import InputError
 
-# Only containers of one file: a playlist or script could name other files, or hosts, to be read.
-_DEMUXERS = "mov,matroska,webm,mpegts,mpeg,avi,asf,flv,h264,hevc,mpegvideo,ogg,mxf"
 MAX_PIXELS = 200_000_000
 _MAX_PACKETS_TO_FIRST_FRAME = 1000
-# Plane 0 of these is 8-bit luma, so that the grey image costs no conversion.
+# Plane 0 of these formats is 8-bit luma, so that the grey image needs no conversion.
 _LUMA_FIRST = ("yuv4", "yuvj4", "yuva4", "nv12", "nv16", "nv21", "gray8", "gray")
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video file says of itself, with its first frame decoded.
+    """Properties of a video file whose first frame can be decoded.
 
-    width, height : of the upright image with square pixels. rotation_deg : how far the stored image is turned
-    counter-clockwise to stand upright (0, 90, 180, 270). frame_count : the container's, or an estimate.
-    fps : nominal; the frames' own times hold (`decode`). created_utc : the container's creation time.
-    data_streams : names of data tracks such as "GoPro MET" (GPMF) or "DJI meta". notes : one sentence each.
+    Attributes
+    ----------
+    path : Path
+        The file.
+    width, height : int
+        Size of the upright image with square pixels.
+    rotation_deg : int
+        Counter-clockwise rotation that makes the stored image upright (0, 90, 180, 270).
+    codec, pixel_format : str
+        FFmpeg's names.
+    duration_s : float
+        Duration; NaN if unknown.
+    frame_count : int
+        As stated by the container, or an estimate.
+    fps : float
+        Nominal frame rate; use the frames' own times (`decode`) for anything else.
+    time_base : Fraction
+        Unit of the stream's timestamps, in seconds.
+    created_utc : datetime or None
+        Creation time stored in the container.
+    pixel_aspect : Fraction
+        Width over height of a stored pixel.
+    has_subtitles : bool
+        The file has a subtitle track.
+    data_streams : tuple of str
+        Names of data tracks such as "GoPro MET" (GPMF) or "DJI meta".
+    notes : tuple of str
+        What the user should know, one sentence each.
     """
 
     path: Path
@@ -49,21 +79,24 @@ class VideoInfo:
     data_streams: tuple[str, ...]
     notes: tuple[str, ...]
 
-    @property
-    def has_gpmf(self) -> bool:
-        """A GoPro metadata track lies inside."""
-        return any("GoPro MET" in name for name in self.data_streams)
-
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
     """One decoded frame.
 
-    index : position among the frames that were decoded. time_s : the container's timestamp, 0 at the
-    first frame. width, height : of the upright full-size image with square pixels. damaged : packets were
-    lost since the last key frame.
-    image : (H, W, 3) uint8 BGR upright from `decode`, (h, w) uint8 luma, maybe smaller, from `decode_gray`;
-    None for a frame that was not wanted.
+    Attributes
+    ----------
+    index : int
+        Position among the decoded frames.
+    time_s : float
+        The container's timestamp, 0 at the first frame.
+    width, height : int
+        Size of the upright full-size image with square pixels.
+    damaged : bool
+        Packets were lost since the last key frame.
+    image : ndarray of uint8 or None
+        (H, W, 3) upright BGR from `decode`; (h, w) upright luma, possibly reduced, from `decode_gray`;
+        None for a frame that was not wanted.
     """
 
     index: int
@@ -76,43 +109,44 @@ class VideoFrame:
 
 @dataclass
 class DecodeReport:
-    """Filled while a file is decoded; complete once its iterator has ended."""
+    """Counts and notes, filled while a file is decoded and complete once its iterator has ended."""
 
     frames: int = 0
     lost_packets: int = 0
-    damaged_frames: int = 0  # shown from references that were lost
-    out_of_order: int = 0  # dropped: their timestamp was not after the frame before
-    expected_frames: int = 0  # as the container counts them; 0 where it does not
+    damaged_frames: int = 0  # predicted from lost reference frames
+    out_of_order: int = 0  # dropped because their timestamp was not after that of the frame before
+    expected_frames: int = 0  # as stated by the container; 0 if it does not say
     notes: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Orientation:
-    """How a stored image becomes upright: transposed first, then flipped."""
-
-    transpose: bool = False
-    flip_x: bool = False
-    flip_y: bool = False
-
-    def apply(self, image: np.ndarray) -> np.ndarray:
-        if self.transpose:
-            image = cv2.transpose(image)
-        if self.flip_x or self.flip_y:
-            image = cv2.flip(image, -1 if self.flip_x and self.flip_y else int(self.flip_x))
-        return image
-
-
 def probe(path: Path) -> VideoInfo:
-    """What the file holds; InputError where it is not a video, is empty, truncated, or has no frame."""
-    with _open(path) as container:
-        stream = _video_stream(container, path)
+    """Read the properties of a video and decode its first frame.
+
+    Parameters
+    ----------
+    path : Path
+        The video file.
+
+    Returns
+    -------
+    VideoInfo
+        Its properties.
+
+    Raises
+    ------
+    InputError
+        If the file is not a video, is empty or truncated, has no frame, or its frames are too large.
+    """
+    with open_container(path) as container:
+        stream = video_stream(container, path)
         first = _first_frame(container, stream, path)
-        orientation = _orientation(first)
-        aspect = _pixel_aspect(stream)
-        width, height = _upright_size(first, orientation, aspect)
+        orientation = frame_orientation(first)
+        aspect = pixel_aspect_ratio(stream)
+        width, height = upright_size(first, orientation, aspect)
         if width * height > MAX_PIXELS:
             raise InputError(
-                f"{width}x{height} pixels a frame are more than can be handled", path=path
+                f"frames of {width}x{height} pixels exceed the limit of {MAX_PIXELS / 1e6:.0f} megapixels",
+                path=path,
             )
         rate = stream.average_rate or stream.guessed_rate
         fps = float(rate) if rate else float("nan")
@@ -148,12 +182,31 @@ def decode(
     threads: int = 0,
     report: DecodeReport | None = None,
 ) -> Iterator[VideoFrame]:
-    """The frames in the order of time, upright, 8-bit BGR.
+    """Decode frames in order of time as upright 8-bit BGR images.
 
-    wanted : indices whose image is converted (default all), after the last of which decoding ends; or what
-    tells of a frame without its image whether it is wanted. The others pass with image None. threads : of
-    the decoder, 0 for one a core. Damaged packets are passed over and counted in `report`. InputError where
-    nothing can be decoded or where frames carry no timestamps.
+    Damaged packets are skipped and counted in `report`.
+
+    Parameters
+    ----------
+    path : Path
+        The video file.
+    wanted : collection of int or callable, optional
+        Indices of the frames whose image is needed (default all); decoding ends after the last of them. Or a
+        function that decides from a frame without its image. Other frames are yielded with image None.
+    threads : int
+        Decoder threads, 0 for one per core.
+    report : DecodeReport, optional
+        Filled with what was lost.
+
+    Yields
+    ------
+    VideoFrame
+        Every frame up to the last wanted one.
+
+    Raises
+    ------
+    InputError
+        If nothing can be decoded, or frames have no timestamps.
     """
     last = max(wanted, default=-1) if isinstance(wanted, Collection) else None
     for item, orientation, frame in _frames(path, threads, report or DecodeReport()):
@@ -165,7 +218,7 @@ def decode(
         if not is_wanted:
             yield item
             continue
-        # Untagged video of 720 lines and more is BT.709 by custom; swscale would take BT.601.
+        # Untagged video of 720 lines or more is BT.709 by convention; swscale would assume BT.601.
         tagged = int(frame.colorspace) != 2
         source = None if tagged or frame.height < 720 else "ITU709"
         image = frame.to_ndarray(format="bgr24", src_colorspace=source)
@@ -178,7 +231,7 @@ def decode(
 def decode_gray(
     path: Path, *, max_width: int = 640, threads: int = 0, report: DecodeReport | None = None
 ) -> Iterator[VideoFrame]:
-    """All frames as upright luma of at most `max_width` columns (never enlarged), cheaply, for measuring."""
+    """Decode all frames as upright luma at most `max_width` wide (never enlarged); cheap, for measuring."""
     for item, orientation, frame in _frames(path, threads, report or DecodeReport()):
         scale = min(1.0, max_width / item.width)
         size = (max(1, round(item.width * scale)), max(1, round(item.height * scale)))
@@ -197,18 +250,18 @@ def decode_gray(
 
 def _frames(
     path: Path, threads: int, report: DecodeReport
-) -> Iterator[tuple[VideoFrame, _Orientation, Any]]:
-    """The frames with their times, undecoded to arrays yet; fills the report."""
-    with _open(path) as container:
-        stream = _video_stream(container, path)
+) -> Iterator[tuple[VideoFrame, Orientation, Any]]:
+    """Yield the frames with their times, not yet converted to arrays, and fill the report."""
+    with open_container(path) as container:
+        stream = video_stream(container, path)
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         report.expected_frames = int(stream.frames)
-        aspect = _pixel_aspect(stream)
+        aspect = pixel_aspect_ratio(stream)
         start: float | None = None
         previous = -1.0
         damaged = False
-        for frame, lost in _decoded(container, stream):
+        for frame, lost in decoded_frames(container, stream):
             report.lost_packets += lost
             damaged = damaged or lost > 0
             if frame is None:
@@ -217,7 +270,7 @@ def _frames(
             stamp = frame.pts if frame.pts is not None else frame.dts
             if stamp is None:
                 raise InputError(
-                    f"frame {report.frames} has no timestamp; rewrite it in a container that keeps them",
+                    f"frame {report.frames} has no timestamp; remux it into a container that keeps them",
                     path=path,
                 )
             clock_s = float(stamp * (frame.time_base or stream.time_base))
@@ -227,124 +280,41 @@ def _frames(
                 report.out_of_order += 1
                 continue
             previous = time_s
-            orientation = _orientation(frame)
-            width, height = _upright_size(frame, orientation, aspect)
+            orientation = frame_orientation(frame)
+            width, height = upright_size(frame, orientation, aspect)
             report.damaged_frames += damaged
             item = VideoFrame(report.frames, time_s, width, height, damaged, None)
             report.frames += 1
             yield item, orientation, frame
     if report.frames == 0:
-        raise InputError("no frame of it can be decoded: it is damaged or truncated", path=path)
-    _conclude(report)
+        raise InputError("no frame can be decoded: the file is damaged or truncated", path=path)
+    _add_notes(report)
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[tuple[Any, int]]:
-    """(frame, 0) for each decoded frame and (None, 1) for each packet that can't be decoded."""
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets)
-        except StopIteration:
-            return
-        except av.error.FFmpegError:  # the container breaks off here
-            yield None, 1
-            return
-        try:
-            frames = packet.decode()
-        except av.error.EOFError:
-            return
-        except av.error.FFmpegError:
-            yield None, 1
-            continue
-        for frame in frames:
-            yield frame, 0
-
-
-def _conclude(report: DecodeReport) -> None:
+def _add_notes(report: DecodeReport) -> None:
     if report.lost_packets:
-        report.notes.append(f"{report.lost_packets} damaged packets were passed over")
+        report.notes.append(f"{report.lost_packets} damaged packets were skipped")
     if report.damaged_frames:
         report.notes.append(f"{report.damaged_frames} frames show traces of damage in the file")
     if report.out_of_order:
-        report.notes.append(f"{report.out_of_order} frames dropped whose timestamps did not rise")
+        report.notes.append(
+            f"{report.out_of_order} frames dropped because their timestamps did not increase"
+        )
     missing = report.expected_frames - report.frames - report.out_of_order
-    # A frame or two at the ends are often cut by an edit list.
+    # Edit lists often cut a frame or two at the ends.
     if missing > max(2, 0.01 * report.expected_frames):
         report.notes.append(
             f"only {report.frames} of {report.expected_frames} frames can be decoded: damaged or truncated"
         )
 
 
-def _open(path: Path) -> Any:
-    """The container, opened for reading one local file and nothing else."""
-    if path.is_dir():
-        raise InputError("is a folder, not a video", path=path)
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-    if size == 0:
-        raise InputError("is empty (0 bytes)", path=path)
-    try:
-        return av.open(
-            f"file:{path.resolve()}",
-            options={"format_whitelist": _DEMUXERS, "protocol_whitelist": "file"},
-            metadata_errors="replace",
-        )
-    except av.error.FFmpegError as error:
-        raise InputError(_why_unreadable(path), path=path) from error
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-
-
-def _why_unreadable(path: Path) -> str:
-    with path.open("rb") as file:
-        head = file.read(12)
-    if head[4:8] in (b"ftyp", b"mdat", b"wide", b"free", b"moov"):
-        return (
-            "is truncated: the index (moov) that a camera writes at the end of a recording is missing; "
-            "copy it again, or let the drone repair it"
-        )
-    return "is not a video"
-
-
-def _video_stream(container: Any, path: Path) -> Any:
-    stream = container.streams.best("video")
-    if stream is None:
-        raise InputError("holds no video stream", path=path)
-    return stream
-
-
 def _first_frame(container: Any, stream: Any, path: Path) -> Any:
-    for tries, (frame, _) in enumerate(_decoded(container, stream)):
+    for tries, (frame, _) in enumerate(decoded_frames(container, stream)):
         if frame is not None:
             return frame
         if tries >= _MAX_PACKETS_TO_FIRST_FRAME:
             break
-    raise InputError("no frame of it can be decoded: it is damaged or truncated", path=path)
-
-
-def _orientation(frame: Any) -> _Orientation:
-    """From the display matrix (a, b, u, c, d, v, x, y, w): x' = a x + c y, y' = b x + d y (ISO 14496-12)."""
-    for data in frame.side_data:
-        if data.type.name == "DISPLAYMATRIX":
-            a, b, _, c, d = np.frombuffer(data, np.int32)[:5].tolist()
-            if abs(b) + abs(c) > abs(a) + abs(d):
-                return _Orientation(True, flip_x=c < 0, flip_y=b < 0)
-            return _Orientation(False, flip_x=a < 0, flip_y=d < 0)
-    return _Orientation()
-
-
-def _pixel_aspect(stream: Any) -> Fraction:
-    """Width of a stored pixel over its height; 1 where the file does not say."""
-    ratio = stream.sample_aspect_ratio
-    return Fraction(ratio) if ratio and Fraction(1, 4) <= ratio <= 4 else Fraction(1)
-
-
-def _upright_size(frame: Any, orientation: _Orientation, aspect: Fraction) -> tuple[int, int]:
-    """(width, height) upright and with square pixels."""
-    width, height = round(frame.width * aspect), int(frame.height)
-    return (height, width) if orientation.transpose else (width, height)
+    raise InputError("no frame can be decoded: the file is damaged or truncated", path=path)
 
 
 def _creation_time(metadata: dict[str, str]) -> datetime | None:
@@ -364,16 +334,16 @@ def _notes(frame: Any, aspect: Fraction) -> tuple[str, ...]:
     notes = []
     if aspect != 1:
         notes.append(
-            f"pixels of {aspect.numerator}:{aspect.denominator} are stretched to square ones"
+            f"non-square pixels ({aspect.numerator}:{aspect.denominator}) are resampled to square ones"
         )
     if int(frame.color_trc) in (16, 18):
         notes.append("high dynamic range (HDR) is converted to 8 bits without tone mapping")
     if frame.interlaced_frame:
         notes.append(
-            "interlaced: moving edges are combed, which spoils features; deinterlace it first"
+            "interlaced: combing on moving edges degrades features; deinterlace the video first"
         )
     if int(frame.rotation) % 90:
-        notes.append(f"rotation of {frame.rotation} degrees is taken to the nearest right angle")
+        notes.append(f"rotation of {frame.rotation} degrees is rounded to the nearest right angle")
     return tuple(notes)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.area.area import FRAMES, Area
-from spn_data.capture.candidates import analyse, frames_of
+from spn_data.capture.candidates import analyse, build_frames
 from spn_data.capture.extraction import estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, FrameStatus, write_frames
 from spn_data.capture.selection import FrameChoice
@@ -103,7 +103,7 @@ def take_frames(
     choice = FrameChoice(status, reason, np.full(len(status), np.nan))
     track = telemetry_of(source, candidates, any_telemetry=any_telemetry)
     zoom = None if track is None else track.at(measured.time_s).zoom
-    frames = frames_of(candidates, choice, focal=zoom)
+    frames = build_frames(candidates, choice, focal=zoom)
     if track is not None:
         frames = frames.with_telemetry(track.at(frames.time_s))
         write_track(folder / TRACK, track)

@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 
 from spn_data.area.area import EVALUATION, FRAMES, TRACKED, Area
-from spn_data.capture.candidates import Candidates, analyse, frames_of
+from spn_data.capture.candidates import Candidates, analyse, build_frames
 from spn_data.capture.extraction import ExtractionCost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames
+from spn_data.capture.photo_selection import choose_photos
 from spn_data.capture.photos import load_mask
 from spn_data.capture.selection import (
     FrameChoice,
     SelectionOptions,
     check_usable,
     choose_all,
-    choose_photos,
 )
 from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
 from spn_data.capture.video import probe
@@ -203,7 +203,7 @@ def choose_frames(
     total = sum(int(choice.chosen.sum()) for choice in choices)
     for one, track, choice in zip(candidates, tracks, choices, strict=True):
         zoom = None if track is None else track.at(one.measured.time_s).zoom
-        frames = frames_of(one, choice, focal=zoom)
+        frames = build_frames(one, choice, focal=zoom)
         if track is not None:
             frames = frames.with_telemetry(track.at(frames.time_s))
             write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)

@@ -77,7 +77,7 @@ def cut(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.unlink(), "holds no video and no photo"),
+        (lambda path: path.unlink(), "contains no video or photo"),
         (cut, "flight1.mp4: is truncated: the index (moov)"),
         (lambda path: path.write_bytes(b""), "flight1.mp4: is empty (0 bytes)"),
         (lambda path: path.write_text("no video\n"), "flight1.mp4: is not a video"),
@@ -188,11 +188,11 @@ def test_masks_that_do_not_fit_are_refused_before_any_work(flight1: Path, tmp_pa
         flight1, *area, "--mask", tmp_path / "other"
     )
     mask(tmp_path / "tall.png", 320, 180, 255)
-    assert "a mask of 180x320 does not fit images of 320x180" in refused(
+    assert "the mask is 180x320 but the images are 320x180" in refused(
         flight1, *area, "--mask", tmp_path / "tall.png"
     )
     mask(tmp_path / "black.png", 180, 320, 0)
-    assert "black all over" in refused(flight1, *area, "--mask", tmp_path / "black.png")
+    assert "entirely black" in refused(flight1, *area, "--mask", tmp_path / "black.png")
     assert not (tmp_path / "area").exists()
 
 

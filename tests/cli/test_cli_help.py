@@ -200,7 +200,7 @@ def test_an_error_of_the_users_data_is_one_line_and_exits_with_1(tmp_path):
     ran = CliRunner().invoke(main, ["reconstruct", str(folder), "--area", str(tmp_path / "area")])
     assert ran.exit_code == 1
     assert ran.output.splitlines() == [
-        f"Error: {folder}: holds no video and no photo; the folder is empty"
+        f"Error: {folder}: contains no video or photo; the folder is empty"
     ]
 
 

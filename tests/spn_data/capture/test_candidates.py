@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from spn_data.capture.candidates import analyse, frames_of
+from spn_data.capture.candidates import analyse, build_frames
 from spn_data.capture.extraction import (
     BYTES_PER_PIXEL,
     check_space,
@@ -23,7 +23,8 @@ from spn_data.capture.extraction import (
 )
 from spn_data.capture.frames import Frames, read_frames, write_frames
 from spn_data.capture.measurement import Measurements
-from spn_data.capture.selection import SelectionOptions, choose, choose_photos
+from spn_data.capture.photo_selection import choose_photos
+from spn_data.capture.selection import SelectionOptions, choose
 from spn_data.capture.sources import Source, SourceKind, discover
 from spn_data.capture.video import decode
 from spn_data.errors import InputError
@@ -74,14 +75,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Source:
 def frames_from(source: Source, options: SelectionOptions = OPTIONS) -> Frames:
     candidates = analyse(source)
     rule = choose_photos if source.kind is SourceKind.PHOTOS else choose
-    return frames_of(candidates, rule(candidates.measured, options))
+    return build_frames(candidates, rule(candidates.measured, options))
 
 
 def test_chapters_are_one_sequence_on_one_clock(flight: Source) -> None:
     """Numbers and times go on where the first file ends; the file's own frame number begins again."""
     candidates = analyse(flight)
     assert candidates.part_start_s == (0.0, 3.0)
-    frames = frames_of(candidates, choose(candidates.measured, OPTIONS))
+    frames = build_frames(candidates, choose(candidates.measured, OPTIONS))
     np.testing.assert_allclose(frames.time_s, np.arange(50) / 10, atol=1e-6)
     assert frames.names[30] == "GX010001/000030.jpg"
     assert (frames.sources[30], frames.video_frame[30]) == ("GX020001.MP4", 0)
@@ -158,7 +159,9 @@ def test_a_video_that_was_replaced_is_told(flight: Source, tmp_path: Path) -> No
         write_flight(folder / "GX010001.MP4", count, size=size)
         shutil.copy(flight.parts[1], folder)
         [other] = discover(folder).sources
-        with pytest.raises(InputError, match=r"GX010001\.MP4: frame \d+ is not in it any more"):
+        with pytest.raises(
+            InputError, match=r"GX010001\.MP4: frame \d+ is missing: the video has changed"
+        ):
             extract_chosen(other, frames, folder / "out")
 
 
@@ -168,7 +171,7 @@ def test_zoom_and_size_make_other_cameras(flight: Source, tmp_path: Path) -> Non
     choice = choose(candidates.measured, OPTIONS)
     focal = np.full(50, 24.0)
     focal[10:20], focal[25], focal[40:] = 48.0, np.nan, 24.2
-    cameras = frames_of(candidates, choice, focal=focal).cameras.tolist()
+    cameras = build_frames(candidates, choice, focal=focal).cameras.tolist()
     assert cameras == ["GX010001"] * 10 + ["GX010001-2"] * 10 + ["GX010001"] * 30
     shutil.copy(flight.parts[0], tmp_path)
     write_flight(tmp_path / "GX020001.MP4", 20, size=(320, 180))
@@ -194,7 +197,7 @@ def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
         image.save(folder / "x_turned.png")
     [source] = discover(folder).sources
     candidates = analyse(source)
-    frames = frames_of(candidates, choose_photos(candidates.measured, OPTIONS))
+    frames = build_frames(candidates, choose_photos(candidates.measured, OPTIONS))
     assert frames.names.tolist() == [
         "survey/DJI_0000.jpg",
         *(f"survey/{p.stem}.jpg" for p in real),
@@ -247,7 +250,7 @@ def test_costs_are_estimated_before(flight: Source, tmp_path: Path) -> None:
 def test_a_full_disk_is_told_before_starting(tmp_path: Path) -> None:
     """More than any disk here has; the folder need not exist yet."""
     with pytest.raises(
-        InputError, match=r"the frames need about 1000000000\.00 GB and .* GB are free"
+        InputError, match=r"the frames need about 1000000000\.00 GB but only .* GB are free"
     ):
         check_space(tmp_path / "not" / "there", 10**18)
     check_space(tmp_path / "not" / "there", 1000)

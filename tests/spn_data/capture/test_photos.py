@@ -84,7 +84,7 @@ def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
     Image.fromarray(deep).save(tmp_path / "deep.png")
     assert decode_photo(tmp_path / "deep.png")[0, 0].tolist() == [0x8F] * 3
     Image.fromarray(np.full((10, 20), 21.5, np.float32)).save(tmp_path / "thermal.tif")
-    with pytest.raises(InputError, match=r"thermal\.tif: pixels of kind 'F'"):
+    with pytest.raises(InputError, match=r"thermal\.tif: pixel format 'F'"):
         decode_photo(tmp_path / "thermal.tif")
 
 
@@ -127,7 +127,7 @@ def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
     assert large[:360].all()
     assert not large[360:].any()
     with pytest.raises(
-        InputError, match=r"mask\.png: a mask of 160x90 does not fit images of 640x480"
+        InputError, match=r"mask\.png: the mask is 160x90 but the images are 640x480"
     ):
         load_mask(tmp_path / "mask.png", 640, 480)
 
@@ -135,5 +135,5 @@ def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
 def test_a_black_mask_is_refused(tmp_path: Path) -> None:
     """Inverted or empty masks would leave nothing, without a word."""
     Image.fromarray(np.zeros((90, 160), np.uint8)).save(tmp_path / "mask.png")
-    with pytest.raises(InputError, match="black all over: white is what may be used"):
+    with pytest.raises(InputError, match="entirely black; usable pixels must be white"):
         load_mask(tmp_path / "mask.png", 160, 90)

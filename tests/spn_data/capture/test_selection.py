@@ -9,14 +9,19 @@ import numpy as np
 import pytest
 
 from spn_data.capture.frames import FrameStatus
-from spn_data.capture.measurement import GrayImage, Measurements, measure, sharpness_of
+from spn_data.capture.measurement import (
+    GrayImage,
+    Measurements,
+    image_sharpness,
+    measure,
+    relative_sharpness,
+)
+from spn_data.capture.photo_selection import choose_photos
 from spn_data.capture.selection import (
     SelectionOptions,
     check_usable,
     choose,
     choose_all,
-    choose_photos,
-    relative_sharpness,
 )
 from spn_data.errors import InputError
 
@@ -95,7 +100,7 @@ def test_a_sharp_frame_a_little_further_is_preferred_to_a_blurred_one() -> None:
     assert choice.chosen[21:24].any()
     assert not choice.chosen[24:37].any()
     after = np.flatnonzero(choice.chosen[37:])[0] + 37
-    assert choice.reason[after].endswith("all nearer the wanted place are blurred")
+    assert choice.reason[after].endswith("those nearer the wanted spacing are blurred")
 
 
 def test_sharpness_is_judged_beside_neighbours_not_in_total() -> None:
@@ -146,7 +151,7 @@ def test_hovering_gives_few_frames() -> None:
     place = rng.normal(0, 0.01, 600)
     choice = choose(measured(np.diff(place, prepend=place[0])), DEFAULT)
     assert 60 / 4 <= choice.chosen.sum() <= 60 / 2.4
-    assert "px from the frame chosen before" in choice.reason[5]
+    assert "px from the previously chosen frame" in choice.reason[5]
 
 
 def test_distance_by_telemetry_adds_frames_where_the_image_stands_still() -> None:
@@ -232,7 +237,7 @@ def test_photos_are_all_chosen_but_repeats() -> None:
     data.motion[4] = [[1, 0, 0.3], [0, 1, 0]]
     choice = choose_photos(data, DEFAULT)
     assert choice.status.tolist() == ["chosen", "chosen", "skipped", "unreadable", "chosen"]
-    assert choice.reason[2] == "skipped: the photo before, 1.3 px apart"
+    assert choice.reason[2] == "skipped: repeats the photo before, 1.3 px apart"
     place = np.array([[0, 0, 50], [9, 0, 50], [12, 0, 50], [15, 0, 50], [20, 0, 50]], float)
     assert choose_photos(data, DEFAULT, position_m=place).chosen[2]
 
@@ -240,15 +245,15 @@ def test_photos_are_all_chosen_but_repeats() -> None:
 def test_sharpness_falls_with_blur_and_along_one_direction_alone() -> None:
     """Golden order: sharp, motion blur of 7 px along x, Gaussian blur; noise counts little."""
     image = texture()
-    sharp = sharpness_of(image)
-    motion = sharpness_of(cv2.blur(image, (7, 1)))
-    defocused = sharpness_of(cv2.GaussianBlur(image, (0, 0), 3))
+    sharp = image_sharpness(image)
+    motion = image_sharpness(cv2.blur(image, (7, 1)))
+    defocused = image_sharpness(cv2.GaussianBlur(image, (0, 0), 3))
     assert defocused < motion < 0.6 * sharp
-    assert sharpness_of(np.full((200, 300), 90, np.uint8)) == 0
+    assert image_sharpness(np.full((200, 300), 90, np.uint8)) == 0
     # Stripes have no detail along themselves: nothing tells blur along them.
-    assert sharpness_of(np.tile(np.array([[0, 0, 90, 90]], np.uint8), (200, 75))) == 0
+    assert image_sharpness(np.tile(np.array([[0, 0, 90, 90]], np.uint8), (200, 75))) == 0
     # One column brighter by 4 levels: second differences 4, -8, 4 along x, none along y.
-    assert sharpness_of(np.pad([[4]], ((2, 2), (2, 2))).astype(np.uint8)) == pytest.approx(
+    assert image_sharpness(np.pad([[4]], ((2, 2), (2, 2))).astype(np.uint8)) == pytest.approx(
         np.sqrt(6 * 16 * (1 + 4 + 1)) / 4 / 5
     )
 
@@ -321,5 +326,5 @@ def test_a_source_with_some_sharp_frames_is_used() -> None:
     data = measure(images_of([cv2.GaussianBlur(image, (0, 0), 20)] * 8 + [image] * 2))
     check_usable(data, DEFAULT, "flight.mp4")
     broken = replace(data, problem=np.full(10, "it is truncated"))
-    with pytest.raises(InputError, match=r"^photos: not one image can be read: it is truncated$"):
+    with pytest.raises(InputError, match=r"^photos: no image can be read: it is truncated$"):
         check_usable(broken, DEFAULT, "photos")

@@ -181,10 +181,10 @@ def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "linked" / "a.mp4").symlink_to(tmp_path / "other" / "readme.txt")
     expected = {
         "missing": "does not exist",
-        "empty": "holds no video and no photo; the folder is empty",
-        "other": "holds no video and no photo; 2 other files are there",
-        "linked": "holds no video and no photo; 2 other files are there, 1 of them links",
-        "other/readme.txt": "is no video or photo: its name ends in .txt",
+        "empty": "contains no video or photo; the folder is empty",
+        "other": "contains no video or photo; 2 other files",
+        "linked": "contains no video or photo; 2 other files, 1 of them links",
+        "other/readme.txt": "is not a video or photo: unsupported suffix .txt",
     }
     for name, message in expected.items():
         with pytest.raises(InputError) as caught:
