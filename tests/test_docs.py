@@ -166,7 +166,7 @@ def test_counts_of_a_stage_are_documented():
     """formats.md names every count that the stages record."""
     text = section(page("docs/formats.md"), "stage.json")
     for name in ("frames", "model", "geo"):
-        tree = ast.parse(page(f"spn_data/pipeline/{name}.py"))
+        tree = ast.parse(page(f"spn_data/pipeline/{name}_stage.py"))
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and node.name == "_counts":
                 returned = next(n for n in ast.walk(node) if isinstance(n, ast.Return)).value

@@ -364,10 +364,10 @@ def test_every_option_is_documented_with_its_default() -> None:
     text = DOC.read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
     options = [p for p in main.commands["split"].params if isinstance(p, click.Option)]
-    assert set(rows) == {option.opts[-1] for option in options}
+    assert set(rows) == {option.opts[0] for option in options}
     for option in options:
         if option.show_default is True:
-            shown = rows[option.opts[-1]].strip("` ")
+            shown = rows[option.opts[0]].strip("` ")
             is_number = isinstance(option.default, int | float)
             assert (float(shown) if is_number else shown) == option.default, option.opts
     for option in main.commands["audit"].params:
