@@ -1,0 +1,1 @@
+"""Poses of arbitrary photos and videos from a trained network."""

@@ -1,4 +1,4 @@
-"""Poses of any images by a trained network: streamed, with covariance, and never one that was not found."""
+"""Prediction of poses with a trained network, streamed to files; frames without a pose are marked as such."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.prediction.flown import Flight, FlownFrame, FrameFilter, Views, frames
-from spn_model.prediction.predicted_files import PoseTable, Rows, tum_texts, write_wgs84
+from spn_model.prediction.flights import Flight, FlightFrame, FrameFilter, ViewRenderers, frames
+from spn_model.prediction.predicted_files import PoseRows, PoseTable, tum_texts, write_wgs84
 
 VERSION = 1
 RECORD, POSES, WGS84, TUM = "predict.json", "poses.csv", "wgs84.csv", "tum"
@@ -27,19 +27,29 @@ FORMATS = ("csv", "tum", "wgs84")
 
 @dataclass(frozen=True, kw_only=True)
 class PredictOptions:
-    """What is written of which frames."""
+    """Which frames are predicted, and what is written.
+
+    Attributes
+    ----------
+    choice : FrameFilter
+        Frames of videos to use.
+    formats : tuple of str
+        Of `FORMATS`; the CSV is always written.
+    batch : int
+        Batch size.
+    """
 
     choice: FrameFilter = field(default_factory=FrameFilter)
-    formats: tuple[str, ...] = ("csv",)  # of FORMATS; the CSV is always there
-    batch: int = 8  # images given to the network at once
+    formats: tuple[str, ...] = ("csv",)
+    batch: int = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predicted:
     """What was written. counts : frames by status; reasons : of failures, most frequent first.
 
-    complete : all frames were done; seen : least share of the network's view that a camera filled;
-    seconds : of the network alone.
+    complete : whether all frames were processed; seen : smallest share of the network's view that a camera
+    covered; seconds : time of the network alone.
     """
 
     folder: Path
@@ -51,17 +61,30 @@ class Predicted:
 
 
 def check_target(folder: Path, *, overwrite: bool) -> None:
-    """Raises StageError unless the folder is free, or poses of ours that may be replaced."""
+    """Check that poses may be written to a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Target of `predict`.
+    overwrite : bool
+        Whether predicted poses may be replaced.
+
+    Raises
+    ------
+    StageError
+        If the folder holds anything but predicted poses, or holds poses and `overwrite` is false.
+    """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise StageError(f"{folder} is not a folder; name another with --to")
+        raise StageError(f"{folder} is not a folder; choose another with --to")
     if not folder.exists() or not any(folder.iterdir()):
         return
     if not (folder / RECORD).is_file():
         raise StageError(
-            f"{folder} holds files that are no predicted poses; name another folder with --to"
+            f"{folder} holds files other than predicted poses; choose another folder with --to"
         )
     if not overwrite:
-        raise StageError(f"{folder} holds predicted poses already; --overwrite replaces them")
+        raise StageError(f"{folder} already holds predicted poses; use --overwrite to replace them")
 
 
 def predict(
@@ -74,30 +97,55 @@ def predict(
     facts: Mapping[str, Any],
     overwrite: bool = False,
 ) -> Predicted:
-    """Write poses of all chosen frames to a folder, which appears whole.
+    """Write the poses of all chosen frames to a folder, which is replaced atomically.
 
-    Stopped by Ctrl-C, it appears with the frames done so far, marked as incomplete. facts : what predict.json
-    tells besides. Raises StageError where the folder holds something else, where the disk is full, and for
-    WGS84 in a world without a place.
+    Parameters
+    ----------
+    network : Checkpoint
+        Trained network.
+    flights : sequence of Flight
+        Flights from `find_flights`.
+    folder : Path
+        Target folder.
+    progress : Progress
+        Receives the sequence, frames done, and expected frames.
+    options : PredictOptions, optional
+        Frames and formats.
+    facts : mapping
+        Additional plain values for predict.json.
+    overwrite : bool
+        Whether predicted poses in the folder may be replaced.
+
+    Returns
+    -------
+    Predicted
+
+    Raises
+    ------
+    StageError
+        If the folder holds something else, if the disk is full, and for WGS84 without a georeferenced
+        network.
+    PredictionStopped
+        After Ctrl-C: the folder holds the frames done so far and is marked as incomplete.
     """
     options = options or PredictOptions()
     check_target(folder, overwrite=overwrite)
     origin = network.view.origin
     if "wgs84" in options.formats and origin is None:
         raise StageError(
-            "wgs84 needs a place in the world, and the network was trained in one without: its poses are "
-            "in the map's own frame; write csv or tum, or georegister the area and train anew"
+            "wgs84 needs a georeferenced network, but this one was trained in a map without an origin; "
+            "write csv or tum, or georegister the area and train again"
         )
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    views = Views(network.view)
+    views = ViewRenderers(network.view)
     seconds = 0.0
     try:
         with PoseTable(partial / POSES) as table:
             complete, stop = False, None
             try:
-                for rows, took in _estimated(network, flights, views, progress, options):
+                for rows, took in _estimate_batches(network, flights, views, progress, options):
                     table.add(rows)
                     seconds += took
                 complete = True
@@ -105,7 +153,7 @@ def predict(
                 stop = error
             done = table.rows()
         if "tum" in options.formats:
-            world = _world(network)
+            world = _describe_world(network)
             (partial / TUM).mkdir()
             for name, text in tum_texts(done, world):
                 write_atomically(partial / TUM / f"{name}.txt", text)
@@ -147,34 +195,40 @@ def predict(
 
 
 class PredictionStopped(KeyboardInterrupt):
-    """Raised where Ctrl-C ended the work; what was done stands in the folder."""
+    """Raised after Ctrl-C; the folder holds the poses so far.
+
+    Attributes
+    ----------
+    predicted : Predicted
+        What was written.
+    """
 
     def __init__(self, predicted: Predicted):
         super().__init__("stopped")
         self.predicted = predicted
 
 
-def _estimated(
+def _estimate_batches(
     network: Checkpoint,
     flights: Sequence[Flight],
-    views: Views,
+    views: ViewRenderers,
     progress: Progress,
     options: PredictOptions,
-) -> Iterator[tuple[Rows, float]]:
-    """Rows of a batch after the other, and the seconds that the network took."""
+) -> Iterator[tuple[PoseRows, float]]:
+    """Yield the rows of one batch after the other, and the seconds that the network took."""
     for flight in flights:
         done, expected = 0, max(1, flight.expected // options.choice.every)
         for batch in _batches(frames(flight, views, options.choice), options.batch):
-            rows, seconds = _of_batch(network, batch)
+            rows, seconds = _estimate_batch(network, batch)
             done += len(batch)
-            # A container's count of frames may be wrong.
+            # The number of frames in the container may be wrong.
             progress(flight.source.sequence, done, max(expected, done))
             yield rows, seconds
 
 
-def _batches(found: Iterator[FlownFrame], size: int) -> Iterator[list[FlownFrame]]:
-    """In order; images of a batch have one size."""
-    batch: list[FlownFrame] = []
+def _batches(found: Iterator[FlightFrame], size: int) -> Iterator[list[FlightFrame]]:
+    """Yield batches of frames, in order."""
+    batch: list[FlightFrame] = []
     for frame in found:
         batch.append(frame)
         if len(batch) >= size:
@@ -184,8 +238,8 @@ def _batches(found: Iterator[FlownFrame], size: int) -> Iterator[list[FlownFrame
         yield batch
 
 
-def _of_batch(network: Checkpoint, batch: Sequence[FlownFrame]) -> tuple[Rows, float]:
-    rows, seconds = Rows.unknown(batch), 0.0
+def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[PoseRows, float]:
+    rows, seconds = PoseRows.unknown(batch), 0.0
     shows = [k for k, frame in enumerate(batch) if frame.image is not None]
 
     def size(k: int) -> tuple[int, ...]:
@@ -194,18 +248,18 @@ def _of_batch(network: Checkpoint, batch: Sequence[FlownFrame]) -> tuple[Rows, f
         return image.shape
 
     for _, group in groupby(shows, key=size):
-        of = np.array(list(group))
-        images = np.stack([frame.image for frame in (batch[k] for k in of)])
-        matrices = np.stack([batch[k].matrix for k in of])
+        chosen = np.array(list(group))
+        images = np.stack([frame.image for frame in (batch[k] for k in chosen)])
+        matrices = np.stack([batch[k].matrix for k in chosen])
         started = time.perf_counter()
         estimates = network.model.estimate(images, matrices)
         seconds += time.perf_counter() - started
-        rows.put(of, estimates)
+        rows.set_estimates(chosen, estimates)
     return rows, seconds
 
 
-def _world(network: Checkpoint) -> str:
-    """The world frame in one line."""
+def _describe_world(network: Checkpoint) -> str:
+    """Describe the world frame in one line."""
     o = network.view.origin
     if o is None:
         unit = "m" if network.view.units == "m" else "model (not metres)"

@@ -1,4 +1,4 @@
-"""Predicted poses as files: CSV row by row, TUM, positions on the globe."""
+"""Files of predicted poses: CSV written row by row, TUM, and WGS84 positions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
 from spn_data.storage.files import write_csv
 from spn_model.models.pose_model import PoseEstimates
-from spn_model.prediction.flown import FlownFrame
+from spn_model.prediction.flights import FlightFrame
 
 ESTIMATED, FAILED, UNREADABLE = "estimated", "failed", "unreadable"
 _UPPER = np.triu_indices(6)
@@ -31,10 +31,10 @@ COLUMNS = (
 
 
 @dataclass(eq=False)
-class Rows:
-    """N frames with what became of them. status : ESTIMATED, FAILED (no pose in it) or UNREADABLE.
+class PoseRows:
+    """N frames with their poses. status : ESTIMATED, FAILED (the image has no pose) or UNREADABLE.
 
-    poses, covariance (N, 6, 6) : NaN where there is none, or it is not known.
+    poses, covariance (N, 6, 6) : NaN where there is none, or it is unknown.
     """
 
     names: np.ndarray
@@ -48,8 +48,8 @@ class Rows:
     covariance: np.ndarray
 
     @classmethod
-    def unknown(cls, frames: Sequence[FlownFrame]) -> Rows:
-        """Without poses yet."""
+    def unknown(cls, frames: Sequence[FlightFrame]) -> PoseRows:
+        """Return rows of frames without poses."""
         n = len(frames)
         return cls(
             np.array([frame.name for frame in frames], dtype=object),
@@ -63,21 +63,21 @@ class Rows:
             np.full((n, 6, 6), np.nan),
         )
 
-    def put(self, of: np.ndarray, estimates: PoseEstimates) -> None:
-        """What the network says of some rows."""
+    def set_estimates(self, chosen: np.ndarray, estimates: PoseEstimates) -> None:
+        """Store the estimates of some rows."""
         found = np.isfinite(estimates.poses.centers).all(axis=1)
         found &= np.isfinite(estimates.poses.quats_wxyz).all(axis=1)
-        self.status[of] = np.where(found, ESTIMATED, FAILED)
+        self.status[chosen] = np.where(found, ESTIMATED, FAILED)
         reasons = [str(reason) or "no pose was found" for reason in estimates.reasons]
-        self.reason[of] = np.where(found, "", np.array(reasons, dtype=object))
-        rows = of[found]
+        self.reason[chosen] = np.where(found, "", np.array(reasons, dtype=object))
+        rows = chosen[found]
         self.poses.centers[rows] = estimates.poses.centers[found]
         self.poses.quats_wxyz[rows] = canonical_quats(estimates.poses.quats_wxyz[found])
         self.covariance[rows] = estimates.covariance[found]
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Rows]) -> Rows:
-        """One after the other."""
+    def concatenate(cls, parts: Sequence[PoseRows]) -> PoseRows:
+        """Concatenate rows in order."""
         if not parts:
             return cls.unknown([])
         columns = {
@@ -91,36 +91,36 @@ class Rows:
         return len(self.names)
 
     def counts(self) -> dict[str, int]:
-        """Frames by status."""
+        """Return the number of frames by status."""
         return {s: int((self.status == s).sum()) for s in (ESTIMATED, FAILED, UNREADABLE)}
 
     def reasons(self) -> list[tuple[str, int]]:
-        """Why frames have no pose, most frequent first."""
+        """Return the reasons for missing poses with their counts, most frequent first."""
         return Counter(self.reason[self.status != ESTIMATED].tolist()).most_common()
 
 
 class PoseTable:
-    """poses.csv, written as far as frames are done; keeps what other formats need."""
+    """poses.csv, written batch by batch; keeps the rows for the other formats."""
 
     def __init__(self, path: Path):
         self._path = path
-        self._parts: list[Rows] = []
-        self._length = 0  # of the file with whole batches
+        self._parts: list[PoseRows] = []
+        self._length = 0  # bytes of complete batches
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> PoseTable:
-        with self._told():
+        with self._reporting_errors():
             self._file = self._path.open("wb")
             self._length = self._file.write(_lines([COLUMNS]))
         return self
 
     def __exit__(self, *error: object) -> None:
         assert self._file is not None
-        with self._told():
+        with self._reporting_errors():
             self._file.close()
 
-    def add(self, rows: Rows) -> None:
-        """Raises StageError where the disk does not take them."""
+    def add(self, rows: PoseRows) -> None:
+        """Append rows; raise StageError if the disk does not accept them."""
         assert self._file is not None
         poses = np.hstack([rows.poses.centers, rows.poses.quats_wxyz])
         covariance = rows.covariance[:, _UPPER[0], _UPPER[1]]
@@ -133,22 +133,22 @@ class PoseTable:
             ]
             for k in range(len(rows))
         )
-        with self._told():
+        with self._reporting_errors():
             self._file.write(content)
             self._file.flush()
         self._parts.append(rows)
         self._length += len(content)
 
-    def rows(self) -> Rows:
-        """All of them; what an interruption left of another batch is cut off the file."""
+    def rows(self) -> PoseRows:
+        """Return all rows, and cut off what an interrupted batch has left in the file."""
         assert self._file is not None
-        with self._told():
+        with self._reporting_errors():
             self._file.flush()
             self._file.truncate(self._length)
-        return Rows.concatenate(self._parts)
+        return PoseRows.concatenate(self._parts)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -161,7 +161,7 @@ def _lines(rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode("utf-8")
 
 
-def tum_texts(rows: Rows, world: str) -> Iterator[tuple[str, str]]:
+def tum_texts(rows: PoseRows, world: str) -> Iterator[tuple[str, str]]:
     """Yield the name of each flight with its trajectory as the content of a TUM file.
 
     Frames without a pose have no line, because the format cannot represent them.
@@ -171,8 +171,11 @@ def tum_texts(rows: Rows, world: str) -> Iterator[tuple[str, str]]:
         yield name, tum_text(name, rows.time_s[mine], rows.poses[mine], world)
 
 
-def write_wgs84(path: Path, rows: Rows, origin: GeoOrigin) -> None:
-    """A row a frame: latitude, longitude, height, angles, standard deviations; empty where unknown."""
+def write_wgs84(path: Path, rows: PoseRows, origin: GeoOrigin) -> None:
+    """Write one row per frame: latitude, longitude, height, angles, standard deviations.
+
+    Unknown values are empty.
+    """
     found = rows.status == ESTIMATED
     places, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 3), np.nan)
     poses = rows.poses[np.flatnonzero(found)]
@@ -202,7 +205,7 @@ def write_wgs84(path: Path, rows: Rows, origin: GeoOrigin) -> None:
 
 
 def _cell(value: float, digits: int | None = None) -> str:
-    """Empty where unknown."""
+    """Format a number; empty if unknown."""
     if not np.isfinite(value):
         return ""
     return repr(float(value)) if digits is None else f"{value:.{digits}f}"

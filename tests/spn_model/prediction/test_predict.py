@@ -27,7 +27,7 @@ from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.json_files import write_json
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.prediction.flown import FrameFilter, Views, find_flights, frames
+from spn_model.prediction.flights import FrameFilter, ViewRenderers, find_flights, frames
 from spn_model.prediction.predict import Predicted, PredictionStopped, PredictOptions, predict
 from spn_model.prediction.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
 from tests.worlds.judged_world import write_judged, write_network
@@ -113,7 +113,7 @@ def test_images_are_rendered_into_the_view_of_the_training(network, tmp_path):
     """Another lens at another size comes out as the training's camera would have seen it."""
     lens = Camera("SIMPLE_RADIAL", 512, 384, np.array([200.0, 250.0, 200.0, -0.02]))
     (flight,), _ = find_flights([_gradient(tmp_path, lens)], lens)
-    (seen,) = frames(flight, Views(network.view), FrameFilter())
+    (seen,) = frames(flight, ViewRenderers(network.view), FrameFilter())
     assert seen.image is not None
     assert seen.image.shape == (48, 64, 3)
     np.testing.assert_allclose(seen.matrix, CAMERA.matrix)
@@ -151,7 +151,7 @@ def test_without_a_camera_there_is_no_pose(network, video, photos, tmp_path):
     """A video or photos of an unknown lens are refused; the line names the remedy."""
     for source in (video, photos):
         with pytest.raises(
-            InputError, match=r"its camera is not known.*--camera FILE.*camera\.json"
+            InputError, match=r"camera is unknown.*--camera FILE.*camera\.json"
         ):
             find_flights([source], None)
 
@@ -177,13 +177,13 @@ def test_photos_may_tell_their_own_focal_length(network, tmp_path):
     image.save(folder / "a.jpg", exif=exif)
     image.save(folder / "b.jpg")
     flights, notes = find_flights([folder], None)
-    assert "focal lengths are those of the photos' own metadata" in notes[0]
+    assert "using focal lengths from the photo metadata" in notes[0]
     camera = flights[0].cameras[0]
     assert camera is not None
     assert camera.focal_px[0] == pytest.approx(28 / 43.267 * 80)
     found = predict(network, flights, tmp_path / "out", silent, facts={})
     assert found.counts == {ESTIMATED: 1, FAILED: 0, UNREADABLE: 1}
-    assert found.reasons == [("its camera is not known: its metadata tells no focal length", 1)]
+    assert found.reasons == [("the camera is unknown: no focal length in the photo metadata", 1)]
 
 
 def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp_path, monkeypatch):
@@ -240,7 +240,7 @@ def test_tum_and_wgs84_hold_the_same_poses(network, photos, tmp_path):
 def test_wgs84_needs_a_place_in_the_world(network, photos, tmp_path):
     """A map of unknown place has no latitude; nothing is written, and what can be is named."""
     lost = replace(network, view=replace(network.view, origin=None))
-    with pytest.raises(StageError, match="wgs84 needs a place in the world"):
+    with pytest.raises(StageError, match="wgs84 needs a georeferenced network"):
         predicted(lost, photos, tmp_path / "out", formats=("csv", "wgs84"))
     assert not (tmp_path / "out").exists()
 
@@ -282,10 +282,10 @@ def test_what_stands_is_not_lost(network, photos, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.txt").write_text("years")
-    with pytest.raises(StageError, match="holds files that are no predicted poses"):
+    with pytest.raises(StageError, match="holds files other than predicted poses"):
         predicted(network, photos, mine)
     predicted(network, photos, tmp_path / "out")
-    with pytest.raises(StageError, match="--overwrite replaces them"):
+    with pytest.raises(StageError, match="use --overwrite to replace them"):
         predicted(network, photos, tmp_path / "out")
     flights, _ = find_flights([photos], CAMERA)
     predict(network, flights, tmp_path / "out", silent, facts={}, overwrite=True)

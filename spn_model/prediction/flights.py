@@ -1,4 +1,4 @@
-"""Images of a flight as a network wants them: rendered into the view that it was trained on."""
+"""Frames of a flight, rendered into the view that a network was trained on."""
 
 from __future__ import annotations
 
@@ -22,29 +22,37 @@ from spn_data.telemetry.exif import telemetry_of_photos
 from spn_model.onboard.view import View
 
 _REMEDY = (
-    "its camera is not known, and without it a pose would be a guess; give it as --camera FILE: "
-    "4-eval/<name>/camera.json of a flight with the same camera, as spn-data register writes it, or a "
+    "the camera is unknown, so its pose cannot be estimated; give it as --camera FILE: "
+    "4-eval/<name>/camera.json of a flight with the same camera (written by spn-data register), or a "
     "calibration"
 )
 
 
-_MOST_LENSES = 16  # whose maps of pixels are kept
+_MAX_RENDERERS = 16  # cameras whose renderers are cached
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameFilter:
-    """Which frames of a video. All of them by default; photos are always taken."""
+    """Which frames of a video to use; all photos are always used.
 
-    every: int = 1  # each so-many-th
-    fps: float | None = None  # at most so many a second, by the container's times
+    Attributes
+    ----------
+    every : int
+        Use every Nth frame.
+    fps : float or None
+        Use at most this many frames per second, by the timestamps of the container; None for no limit.
+    """
+
+    every: int = 1
+    fps: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
     """A source with its cameras, before any pixel is decoded.
 
-    cameras : one a part (video) or photo, None where none is known; camera_source : "given" or "photo
-    metadata"; time_s : (N,) of photos; headers : of photos; expected : frames, a guess for a video.
+    cameras : one per part (video) or photo, None where unknown; camera_source : "given" or "photo metadata";
+    time_s : (N,) times of photos; headers : of photos; expected : number of frames, estimated for a video.
     """
 
     source: Source
@@ -56,10 +64,11 @@ class Flight:
 
 
 @dataclass(frozen=True, eq=False)
-class FlownFrame:
-    """One frame. name : `<sequence>/<frame>.jpg`, as labels have it; source : name of its file.
+class FlightFrame:
+    """One frame, rendered into the view of a network.
 
-    image : (H, W, 3) uint8 RGB in the view, matrix : its K (3, 3); None where problem says why.
+    name : `<sequence>/<frame>.jpg`, as in the labels; source : name of its file. image : (H, W, 3) uint8 RGB
+    in the view, None if `problem` says why; matrix : its camera matrix (3, 3), NaN without an image.
     """
 
     name: str
@@ -73,10 +82,27 @@ class FlownFrame:
 
 
 def find_flights(paths: Sequence[Path], given: Camera | None) -> tuple[list[Flight], list[str]]:
-    """The flights of files and folders, each under a name of its own, and notes.
+    """Find the flights in files and folders.
 
-    given : the camera of all of them. Raises InputError where there is no image, where one cannot be read at
-    all, where the given camera is of another shape, and where a flight's camera is not known.
+    Parameters
+    ----------
+    paths : sequence of Path
+        Photos, videos, or folders of them.
+    given : Camera or None
+        Camera of all flights; None to use the focal lengths in the photo metadata.
+
+    Returns
+    -------
+    flights : list of Flight
+        Flights with unique names.
+    notes : list of str
+        Messages for the user.
+
+    Raises
+    ------
+    InputError
+        If there is no image, if a source cannot be read at all, if the given camera has another aspect ratio,
+        or if the camera of a flight is unknown.
     """
     flights: list[Flight] = []
     notes: list[str] = []
@@ -88,18 +114,16 @@ def find_flights(paths: Sequence[Path], given: Camera | None) -> tuple[list[Flig
             while name.lower() in taken:
                 name, number = f"{source.sequence}-{number}", number + 1
             taken.add(name.lower())
-            flight, told = _flight(replace(source, sequence=name), given)
+            flight, flight_notes = _open_flight(replace(source, sequence=name), given)
             flights.append(flight)
-            notes += told
+            notes += flight_notes
         if found.ignored:
             first, why = found.ignored[0]
-            notes.append(
-                f"{len(found.ignored)} other files are left out, the first {first} ({why})."
-            )
+            notes.append(f"{len(found.ignored)} other files were ignored, e.g. {first} ({why}).")
     return flights, notes
 
 
-def _flight(source: Source, given: Camera | None) -> tuple[Flight, list[str]]:
+def _open_flight(source: Source, given: Camera | None) -> tuple[Flight, list[str]]:
     if source.kind is SourceKind.VIDEO:
         infos = [video.probe(part) for part in source.parts]
         if given is None:
@@ -112,7 +136,7 @@ def _flight(source: Source, given: Camera | None) -> tuple[Flight, list[str]]:
     known = [m for m in headers.metadata if m is not None]
     if not known:
         raise InputError(
-            f"no photo of it can be read: {headers.problem[0]}", path=source.parts[0].parent
+            f"none of its photos can be read: {headers.problem[0]}", path=source.parts[0].parent
         )
     photos = tuple(_photo_camera(headers, row, given) for row in range(len(source.parts)))
     readable = [row for row, metadata in enumerate(headers.metadata) if metadata is not None]
@@ -124,7 +148,7 @@ def _flight(source: Source, given: Camera | None) -> tuple[Flight, list[str]]:
     notes = []
     if given is None:
         notes.append(
-            f"{source.sequence}: focal lengths are those of the photos' own metadata, without distortion: "
+            f"{source.sequence}: using focal lengths from the photo metadata, without distortion; "
             "a registered camera gives better poses."
         )
     origin = "photo metadata" if given is None else "given"
@@ -141,21 +165,24 @@ def _photo_camera(headers: PhotoHeaders, row: int, given: Camera | None) -> Came
     return None if focal_px is None else camera_from_focal_length(focal_px, width, height)
 
 
-class Views:
-    """Renders images of any lens into the view of a network: its one camera, or the lens's own pinhole of the
-    same width where it was trained on those. seen : least share of a view that a lens has filled."""
+class ViewRenderers:
+    """Renders images of any camera into the view of a network.
+
+    The view is the network's one camera or, if its training images each had their own, the pinhole of the
+    lens with the same width. seen : smallest share of a view that a camera has covered so far.
+    """
 
     def __init__(self, view: View):
         self._view = view
         self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
         self.seen = 1.0
 
-    def of(self, camera: Camera) -> PinholeRenderer:
-        """Raises GeometryError where the lens sees nothing of the view."""
+    def renderer(self, camera: Camera) -> PinholeRenderer:
+        """Return the renderer of a camera; raise GeometryError if it sees nothing of the view."""
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         if key not in self._renderers:
-            if len(self._renderers) >= _MOST_LENSES:
-                self._renderers.clear()  # photos whose every zoom differs: memory stays bounded
+            if len(self._renderers) >= _MAX_RENDERERS:
+                self._renderers.clear()  # bounds the memory if the zoom differs in every photo
             target = self._view.camera
             if target is None:
                 width_px = self._view.size[0]
@@ -170,44 +197,49 @@ class Views:
         return self._renderers[key]
 
 
-def frames(flight: Flight, views: Views, choice: FrameFilter) -> Iterator[FlownFrame]:
-    """The chosen frames in their order, rendered one by one; what fails has its reason."""
+def frames(flight: Flight, views: ViewRenderers, choice: FrameFilter) -> Iterator[FlightFrame]:
+    """Yield the chosen frames in order, rendered one by one.
+
+    A frame that cannot be decoded or rendered has a `problem` instead of an image.
+    """
     if flight.source.kind is SourceKind.VIDEO:
-        return _of_video(flight, views, choice)
-    return _of_photos(flight, views)
+        return _video_frames(flight, views, choice)
+    return _photo_frames(flight, views)
 
 
-def _of_video(flight: Flight, views: Views, choice: FrameFilter) -> Iterator[FlownFrame]:
+def _video_frames(
+    flight: Flight, views: ViewRenderers, choice: FrameFilter
+) -> Iterator[FlightFrame]:
     begin_s, count = 0.0, 0
     for part, camera in zip(flight.source.parts, flight.cameras, strict=True):
         assert camera is not None
-        chosen = _Chosen(choice, count, begin_s)
+        chosen = _FrameSelector(choice, count, begin_s)
         times = [0.0, 0.04]
         for frame in video.decode(part, wanted=chosen.wants):
             times = [times[-1], frame.time_s] if frame.index else times
             if frame.index in chosen.latest:
                 index = count + frame.index
-                yield _rendered(
-                    FlownFrame(
+                yield _render(
+                    FlightFrame(
                         f"{flight.source.sequence}/{index:06d}.jpg",
                         flight.source.sequence,
-                        shown(part),
+                        printable_name(part),
                         index,
                         round(begin_s + frame.time_s, 6),
                         frame.image,
                         np.full((3, 3), np.nan),
-                        "the file is damaged here" if frame.damaged else "",
+                        "the video is damaged at this frame" if frame.damaged else "",
                     ),
                     camera,
                     views,
                 )
-        # The next part begins one frame after this one's last.
+        # The next part begins one frame after the last frame of this part.
         begin_s = round(begin_s + times[-1] + max(times[-1] - times[-2], 1e-3), 6)
         count += frame.index + 1
 
 
-class _Chosen:
-    """Which frames of a part are wanted; latest : index of the last one that was."""
+class _FrameSelector:
+    """Selects frames of one part of a video; latest : index of the last frame that was selected."""
 
     def __init__(self, choice: FrameFilter, count: int, begin_s: float):
         self._choice, self._count, self._begin_s = choice, count, begin_s
@@ -226,48 +258,48 @@ class _Chosen:
         return True
 
 
-def _of_photos(flight: Flight, views: Views) -> Iterator[FlownFrame]:
+def _photo_frames(flight: Flight, views: ViewRenderers) -> Iterator[FlightFrame]:
     assert flight.headers is not None
     stems = photo_stems(flight.source.parts)
     for row, (path, stem) in enumerate(zip(flight.source.parts, stems, strict=True)):
         image, problem, camera = None, flight.headers.problem[row], flight.cameras[row]
         if not problem and camera is None:
-            problem = "its camera is not known: its metadata tells no focal length"
+            problem = "the camera is unknown: no focal length in the photo metadata"
         if not problem:
             try:
                 image = decode_photo(path)
             except InputError as error:
                 problem = str(error).removeprefix(f"{path}: ")
-        frame = FlownFrame(
+        frame = FlightFrame(
             f"{flight.source.sequence}/{stem}.jpg",
             flight.source.sequence,
-            shown(path),
+            printable_name(path),
             -1,
             float(flight.time_s[row]),
             image,
             np.full((3, 3), np.nan),
             problem,
         )
-        yield frame if camera is None else _rendered(frame, camera, views)
+        yield frame if camera is None else _render(frame, camera, views)
 
 
-def _rendered(frame: FlownFrame, camera: Camera, views: Views) -> FlownFrame:
+def _render(frame: FlightFrame, camera: Camera, views: ViewRenderers) -> FlightFrame:
     if frame.problem or frame.image is None:
         return replace(frame, image=None)
     if frame.image.shape[:2] != (camera.height, camera.width):
         height, width = frame.image.shape[:2]
-        told = f"is {width}x{height}, where {camera.width}x{camera.height} was expected"
-        return replace(frame, image=None, problem=told)
+        problem = f"is {width}x{height}, expected {camera.width}x{camera.height}"
+        return replace(frame, image=None, problem=problem)
     try:
-        renderer = views.of(camera)
+        renderer = views.renderer(camera)
     except GeometryError as error:
         return replace(frame, image=None, problem=str(error))
     image = cv2.cvtColor(renderer.render(frame.image), cv2.COLOR_BGR2RGB)
     return replace(frame, image=image, matrix=renderer.target.matrix)
 
 
-def shown(path: Path) -> str:
-    """A file's name as text that any file and terminal takes."""
+def printable_name(path: Path) -> str:
+    """Return the name of a file, with characters escaped that files or terminals do not accept."""
     text = path.name.encode("utf-8", "backslashreplace").decode()
     return "".join(
         letter.encode("unicode_escape").decode()
