@@ -1,4 +1,7 @@
-"""Labels: poses of frames relative to a frozen map, with what they rest on; poses.csv and observations."""
+"""Labels (poses of frames in a frozen map, with covariance) and their observations.
+
+Labels are stored as poses.csv, observations as observations.npz.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from spn_data.geometry.pose import Poses, Similarity, canonical_quats
 from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000
-# What NumPy lets through of a damaged archive.
+# Exceptions that NumPy raises for a damaged archive.
 _DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
 _UPPER = np.triu_indices(6)
 
@@ -32,19 +35,37 @@ class LabelStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """N frames of one kind, in the order of sequence and time; a frame without a pose holds NaN.
+    """Labels of N frames of one kind, sorted by sequence and time; numbers of frames without a pose are NaN.
 
-    names : (N,) str, `<sequence>/<frame>.jpg`; unique. sequences, cameras : (N,) str, key of the lens.
-    sources : (N,) str, name of the file that the frame is from; video_frame : (N,) int, index among its
-    decoded frames, -1 for a photo; tracked : (N,) bool, a frame that was not chosen: its pixels are read
-    from the video, those of the others from a stored image.
-    time_s : (N,) seconds since the sequence's first frame.
-    status : (N,) str, a LabelStatus; reason : (N,) str, why it failed, empty else.
-    poses : of the frames in the map's frame (East-North-Up metres once georegistered).
-    covariance : (N, 6, 6) relative to the map, over the centre (east, north, up; metres) and a rotation
-    vector in the camera frame (radians): R_true = exp(v) @ R.
-    inliers : (N,) int, map points that the pose agrees with; coverage : (N,) share of the image that they
-    cover; error_px : (N,) root mean square of their residuals.
+    Attributes
+    ----------
+    names : ndarray of str, shape (N,)
+        `<sequence>/<frame>.jpg`; unique.
+    sequences, cameras : ndarray of str, shape (N,)
+        Sequence, and key of the camera.
+    sources : ndarray of str, shape (N,)
+        Name of the file that the frame is from.
+    video_frame : ndarray of int, shape (N,)
+        Index among the decoded frames of the video, -1 for a photo.
+    tracked : ndarray of bool, shape (N,)
+        Tracked frames, whose pixels are read from the video; chosen frames have a stored image.
+    time_s : ndarray, shape (N,)
+        Seconds since the sequence's first frame.
+    status : ndarray of str, shape (N,)
+        A `LabelStatus`.
+    reason : ndarray of str, shape (N,)
+        Why the frame failed; empty for registered frames.
+    poses : Poses
+        N poses in the map's frame (East-North-Up metres once georeferenced).
+    covariance : ndarray, shape (N, 6, 6)
+        Relative to the map, over the centre (east, north, up; metres) and a rotation vector v in the camera
+        frame (radians): R_true = exp(v) @ R.
+    inliers : ndarray of int, shape (N,)
+        Number of map points that agree with the pose.
+    coverage : ndarray, shape (N,)
+        Share of the image that these points cover.
+    error_px : ndarray, shape (N,)
+        Root mean square of their reprojection errors.
     """
 
     names: np.ndarray
@@ -70,18 +91,18 @@ class Labels:
                     f"{column.name} has {len(getattr(self, column.name))} rows, not {n}"
                 )
         if len(set(self.names.tolist())) != n:
-            raise ValueError("names of frames are not unique")
+            raise ValueError("frame names are not unique")
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def registered(self) -> np.ndarray:
-        """(N,) bool: has a pose."""
+        """Mask (N,) of frames with a pose."""
         return self.status == LabelStatus.REGISTERED
 
     def select(self, index: np.ndarray) -> Labels:
-        """The rows of an index or mask (N,)."""
+        """Return the rows of an index or mask (N,)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @classmethod
@@ -97,7 +118,19 @@ class Labels:
         coverage: np.ndarray,
         error_px: np.ndarray,
     ) -> Labels:
-        """Of all those frames (N) and what became of them; registered are those whose pose is finite."""
+        """Return labels of N frames; frames with a finite pose are registered, the others failed.
+
+        Parameters
+        ----------
+        frames : Frames
+            The N frames.
+        poses : Poses
+            N poses, NaN for failed frames.
+        tracked : bool
+            Whether these are tracked frames.
+        reason, covariance, inliers, coverage, error_px
+            As in the attributes of `Labels`.
+        """
         registered = np.isfinite(poses.centers).all(axis=1)
         return cls(
             names=frames.names,
@@ -118,9 +151,9 @@ class Labels:
 
     @classmethod
     def concatenate(cls, parts: list[Labels]) -> Labels:
-        """The rows of several, one after the other."""
+        """Return the rows of all parts in order."""
         if not parts:
-            raise ValueError("no labels to put together")
+            raise ValueError("no labels to concatenate")
         values: dict[str, Any] = {
             f.name: np.concatenate([getattr(p, f.name) for p in parts])
             for f in fields(cls)
@@ -129,17 +162,36 @@ class Labels:
         return cls(**values, poses=Poses.concatenate(p.poses for p in parts))
 
     def transformed(self, b_from_a: Similarity) -> Labels:
-        """The same labels in another frame of the same map; covariances turn and scale with it."""
+        """Return the same labels in another frame of the same map, with covariances propagated.
+
+        Parameters
+        ----------
+        b_from_a : Similarity
+            From the present frame to the other.
+        """
         has = np.flatnonzero(self.registered)
         poses = b_from_a.apply_to_poses(self.poses[has]).at_rows(has, len(self))
-        jacobian = np.eye(6)  # rotation vectors in the camera frame stay as they are
+        jacobian = np.eye(6)  # rotation vectors in the camera frame do not change
         jacobian[:3, :3] = b_from_a.scale * b_from_a.rotation
         covariance = jacobian @ self.covariance @ jacobian.T
         return replace(self, poses=poses, covariance=covariance)
 
 
 def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) standard deviations of position and rotation (degrees): roots of traces of (N, 6, 6)."""
+    """Return standard deviations of position and rotation.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (N, 6, 6)
+        As in `Labels`.
+
+    Returns
+    -------
+    sigma : ndarray, shape (N,)
+        Square root of the trace of the position block, in the map's unit.
+    sigma_deg : ndarray, shape (N,)
+        Square root of the trace of the rotation block, in degrees.
+    """
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     sigma, sigma_rad = (np.sqrt(part.sum(axis=1)) for part in np.split(variances, 2, axis=1))
     return sigma, np.rad2deg(sigma_rad)
@@ -147,10 +199,16 @@ def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class LabelObservations:
-    """Map points that N frames see, M observations in all, sorted by frame.
+    """M observations of map points in N labelled frames, sorted by frame.
 
-    frame_idx : (M,) row of the frame in its Labels; point_ids : (M,) COLMAP's ids in the map;
-    pixels : (M, 2) where they are seen, COLMAP's pixel convention, in the frame's own (distorted) image.
+    Attributes
+    ----------
+    frame_idx : ndarray of int, shape (M,)
+        Row of the frame in its `Labels`.
+    point_ids : ndarray of int, shape (M,)
+        COLMAP's point ids in the map.
+    pixels : ndarray, shape (M, 2)
+        Keypoints in COLMAP's pixel convention, in the frame's own (distorted) image.
     """
 
     frame_idx: np.ndarray
@@ -164,12 +222,12 @@ class LabelObservations:
             raise ValueError("observations are not sorted by frame")
 
     def of_frame(self, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """(point_ids (K,), pixels (K, 2)) of one frame."""
+        """Return point ids (K,) and pixels (K, 2) of the frame at a row."""
         first, last = np.searchsorted(self.frame_idx, [row, row + 1])
         return self.point_ids[first:last], self.pixels[first:last]
 
     def select(self, rows: np.ndarray) -> LabelObservations:
-        """Those of the frames at `rows`, numbered anew in that order."""
+        """Return the observations of the frames at `rows`, renumbered in that order."""
         starts = np.searchsorted(self.frame_idx, rows)
         ends = np.searchsorted(self.frame_idx, rows, side="right")
         index = np.concatenate(
@@ -189,7 +247,13 @@ _COLUMNS = [
 
 
 def write_labels(path: Path, labels: Labels) -> None:
-    """As poses.csv (docs/formats.md); the file appears whole."""
+    """Write labels as poses.csv (docs/formats.md), atomically.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written.
+    """
     poses = np.concatenate([labels.poses.centers, labels.poses.quats_wxyz], axis=1)
     covariance = labels.covariance[:, _UPPER[0], _UPPER[1]]
     columns: dict[str, list[object]] = {
@@ -211,7 +275,13 @@ def write_labels(path: Path, labels: Labels) -> None:
 
 
 def read_labels(path: Path) -> Labels:
-    """From poses.csv. Raises InputError with the line where it is not what `write_labels` writes."""
+    """Read labels from poses.csv.
+
+    Raises
+    ------
+    InputError
+        If the file is not as written by `write_labels`; with the line if known.
+    """
     table = read_csv(path, _COLUMNS, max_bytes=_MAX_CSV_BYTES)
     rows = [_parse(path, line, row) for line, row in table]
     try:
@@ -231,10 +301,10 @@ def _parse(path: Path, line: int, row: dict[str, Any]) -> dict[str, Any]:
         row["covariance"] = [_number(row[c]) for c in _COVARIANCE_COLUMNS]
         if row["status"] == LabelStatus.REGISTERED:
             if not np.isfinite(row["pose"]).all():
-                raise ValueError("a registered frame without a pose")
+                raise ValueError("a registered frame has no pose")
             row["pose"][3:] = canonical_quats(np.array(row["pose"][3:])).tolist()
         elif np.isfinite(row["pose"]).any():
-            raise ValueError("a failed frame with a pose")
+            raise ValueError("a failed frame has a pose")
         for column in ("inliers", "video_frame", "dense"):
             row[column] = int(row[column])
         for column in ("time_s", "coverage", "error_px"):
@@ -288,7 +358,13 @@ def _number(cell: str) -> float:
 
 
 def write_label_observations(path: Path, seen: LabelObservations) -> None:
-    """As observations.npz, plain arrays; the file appears whole."""
+    """Write observations as observations.npz (plain arrays), atomically.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written.
+    """
     with atomic_writer(path) as file:
         np.savez_compressed(
             file,
@@ -299,12 +375,18 @@ def write_label_observations(path: Path, seen: LabelObservations) -> None:
 
 
 def read_label_observations(path: Path) -> LabelObservations:
-    """Raises InputError where it is not what `write_label_observations` writes. No pickle is opened."""
+    """Read observations.npz; pickled data is refused.
+
+    Raises
+    ------
+    InputError
+        If the file is not as written by `write_label_observations`.
+    """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             seen = LabelObservations(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
     except _DAMAGED as error:
-        raise InputError(f"is no file of observations ({error})", path=path) from error
+        raise InputError(f"is not an observations file ({error})", path=path) from error
     if seen.pixels.shape != (len(seen.frame_idx), 2):
-        raise InputError("is no file of observations (shapes differ)", path=path)
+        raise InputError("is not an observations file (shapes differ)", path=path)
     return seen

@@ -1,4 +1,4 @@
-"""Proof that a map has not changed: a hash of every byte of its files."""
+"""Hash over all files of a map, to prove that it has not changed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def map_hash(folder: Path) -> str:
-    """SHA-256 over the names and contents of all files of a stage of the map, in the order of names."""
+    """Return the SHA-256 over the names, sizes and contents of all files in a folder, sorted by name."""
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         digest.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())

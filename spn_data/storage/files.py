@@ -1,4 +1,4 @@
-"""Files and folders that stand under their name only when complete; locks; CSV read as it is written."""
+"""Files and folders that appear atomically under their name, lock files, and CSV files."""
 
 from __future__ import annotations
 
@@ -19,10 +19,21 @@ LOCK = ".lock"
 
 @contextmanager
 def atomic_writer(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """A file to write ("wb", or "w" for UTF-8 with its line ends as they are) that then takes its name.
+    """Open a temporary file that replaces `path` when the block ends.
 
-    What stood there before stays until then, and of a failure nothing is left. Raises StageError where the
-    disk does not take it.
+    An existing file remains until then; if the block fails, the temporary file is removed.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    mode : str
+        "wb", or "w" for UTF-8 text with line ends as given.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written, e.g. because the disk is full.
     """
     temporary = path.with_name(f".{path.name}.part")
     encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
@@ -41,13 +52,27 @@ def atomic_writer(path: Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """See `atomic_writer`."""
+    """Write text (UTF-8) or bytes with `atomic_writer`.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written.
+    """
     with atomic_writer(path, "w" if isinstance(content, str) else "wb") as file:
         file.write(content)
 
 
 def replace_folder(partial: Path, target: Path) -> None:
-    """Give a complete folder its name; what stood there, if anything, goes only then."""
+    """Rename a complete folder to its final name; an existing folder of that name is removed only then.
+
+    Parameters
+    ----------
+    partial : Path
+        The complete folder, on the same file system.
+    target : Path
+        Its final name.
+    """
     old = target.with_name(f".{target.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     if target.exists():
@@ -58,9 +83,21 @@ def replace_folder(partial: Path, target: Path) -> None:
 
 @contextmanager
 def locked(folder: Path, program: str) -> Iterator[None]:
-    """Only one process at a time works in a folder, which exists: its file LOCK is held.
+    """Hold the lock file of an existing folder, so that only one process at a time works in it.
 
-    Raises InUseError, which names the program, where another does, StageError where nothing can be written.
+    Parameters
+    ----------
+    folder : Path
+        The folder; its file `LOCK` is locked.
+    program : str
+        Name of the program for the error message.
+
+    Raises
+    ------
+    InUseError
+        If another process holds the lock.
+    StageError
+        If the folder cannot be written to.
     """
     try:
         handle = (folder / LOCK).open("w")
@@ -75,7 +112,20 @@ def locked(folder: Path, program: str) -> Iterator[None]:
 
 
 def write_csv(path: Path, columns: Mapping[str, Iterable[object]]) -> None:
-    """Columns of cells, all of one length, under their names; see `atomic_writer`."""
+    """Write columns of cells as a CSV file with a header row, atomically.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    columns : mapping of str to iterable
+        Cells of each column, all of one length.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -86,9 +136,28 @@ def write_csv(path: Path, columns: Mapping[str, Iterable[object]]) -> None:
 def read_csv(
     path: Path, columns: Collection[str], *, max_bytes: int = 500_000_000
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """(line, cells by column) of each row that `write_csv` wrote with these columns.
+    """Read a CSV file written by `write_csv`, row by row.
 
-    Raises InputError, with the line, where it is another file, and beyond `max_bytes`.
+    Parameters
+    ----------
+    path : Path
+        The file to read.
+    columns : collection of str
+        The expected header.
+    max_bytes : int, optional
+        Largest file size accepted.
+
+    Yields
+    ------
+    line : int
+        Line number, counted from 1.
+    cells : dict of str to str
+        The row's cells by column.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is too large, or has another format; with the line if known.
     """
     try:
         if path.stat().st_size > max_bytes:
@@ -97,16 +166,16 @@ def read_csv(
             reader = csv.reader(file, strict=True)
             try:
                 if next(reader, None) != list(columns):
-                    told = f"the header is not that of {path.name}: {','.join(columns)}"
-                    raise InputError(told, path=path, line=1)
+                    message = f"the header is not that of {path.name}: {','.join(columns)}"
+                    raise InputError(message, path=path, line=1)
                 for cells in reader:
                     if len(cells) != len(columns):
-                        told = f"{len(cells)} cells, expected {len(columns)}"
-                        raise InputError(told, path=path, line=reader.line_num)
+                        message = f"{len(cells)} cells, expected {len(columns)}"
+                        raise InputError(message, path=path, line=reader.line_num)
                     yield reader.line_num, dict(zip(columns, cells, strict=True))
             except csv.Error as error:
-                told = f"is not a CSV file: {error}"
-                raise InputError(told, path=path, line=reader.line_num) from error
+                message = f"is not a CSV file: {error}"
+                raise InputError(message, path=path, line=reader.line_num) from error
     except OSError as error:
         raise InputError(f"can't be read: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:

@@ -1,7 +1,7 @@
-"""A long native computation in a child process that talks in JSON lines.
+"""Run long native computations in a child process that communicates in JSON lines.
 
-A native abort there takes no other work along, Ctrl-C reaches it in an orderly way, and it never
-outlives the process that started it.
+A native abort kills only the child, Ctrl-C reaches it in an orderly way, and it never outlives the process
+that started it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,27 @@ from spn_data.errors import StageError
 
 Event = dict[str, Any]
 _FULL_BYTES = 1_000_000
-STOP_WAIT_S = 5  # what a child gets to end by itself
+STOP_WAIT_S = 5  # time for a child to end after SIGINT
 
 
 def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event], None]) -> None:
-    """Run `python -m module` with job on its standard input, and hand each event to on_event.
+    """Run `python -m module` with a job on its standard input and pass on the events that it sends.
 
-    The child's standard error goes to `log`. Raises StageError, with the log's last line, where the
-    child ends otherwise than well.
+    Parameters
+    ----------
+    module : str
+        Full name of the module to run.
+    job : dict
+        JSON-serialisable description of the work.
+    log : Path
+        File that the child's standard error is appended to.
+    on_event : callable
+        Called with each event.
+
+    Raises
+    ------
+    StageError
+        If the child fails or is killed; with the last line of its log.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as errors:
@@ -39,12 +52,12 @@ def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event],
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
-            start_new_session=True,  # Ctrl-C is passed on below, once
+            start_new_session=True,  # Ctrl-C is forwarded below, once
         )
         assert child.stdin is not None
         assert child.stdout is not None
         try:
-            # The pipe stays open: its end tells the child that this process is gone.
+            # The pipe stays open: when it closes, the child knows that this process has ended.
             child.stdin.write(json.dumps(job) + "\n")
             child.stdin.flush()
             for line in child.stdout:
@@ -57,12 +70,12 @@ def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event],
             child.stdin.close()
             child.stdout.close()
     if code != 0:
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        outcome = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         if shutil.disk_usage(log.parent).free < _FULL_BYTES:
-            how += " on a full disk"
+            outcome += " on a full disk"
         raise StageError(
-            f"{module.rpartition('.')[2]} {how}. What was done before is kept: the same command goes on. "
-            f"{log} ends in: {_last_line(log)}"
+            f"{module.rpartition('.')[2]} {outcome}. Finished work is kept: run the same command again to "
+            f"continue. Last line of {log}: {_last_line(log)}"
         )
 
 
@@ -81,7 +94,7 @@ def _last_line(log: Path) -> str:
 
 
 def read_job() -> Event:
-    """In the child: the job; and from here on the process ends when its parent does."""
+    """Read the job (in the child) and exit this process as soon as its parent ends."""
     job: Event = json.loads(sys.stdin.readline())
 
     def watch() -> None:
@@ -93,14 +106,14 @@ def read_job() -> Event:
 
 
 def send(event: Event) -> None:
-    """In the child: one event to the parent."""
+    """Send one event to the parent (in the child)."""
     sys.stdout.write(json.dumps(event) + "\n")
     sys.stdout.flush()
 
 
 @contextmanager
 def cancel_on_interrupt(cancel: Callable[[], None]) -> Iterator[None]:
-    """In the child: SIGINT calls cancel instead of raising wherever Python happens to be."""
+    """Call `cancel` on SIGINT instead of raising KeyboardInterrupt at an arbitrary point (in the child)."""
     before = signal.signal(signal.SIGINT, lambda *_: cancel())
     try:
         yield

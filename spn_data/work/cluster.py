@@ -1,4 +1,4 @@
-"""Batches of pure calls on the workers of a Dask cluster, which need neither the area nor a shared disk."""
+"""Batches of pure function calls on the workers of a Dask cluster, which need no access to the area."""
 
 from __future__ import annotations
 
@@ -18,13 +18,26 @@ from spn_data.work.parallel import Batch, Dispatch, WorkerDiedError, WorkerPool
 
 _CONNECT_S = 10.0
 _WAIT_FOR_WORKERS_S = 30.0
-_AHEAD = 2  # batches that each thread of a worker has, one of them waiting
+_AHEAD = 2  # batches per thread of a worker: one running, one queued
 _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap")
 
 
 @contextmanager
 def dispatch_to(address: str, workers: int) -> Iterator[Dispatch]:
-    """The cluster at an address, or, where that is empty, so many processes of this machine."""
+    """Yield a `Dispatch` to a Dask cluster or to worker processes on this machine.
+
+    Parameters
+    ----------
+    address : str
+        Address of the Dask scheduler; empty for this machine.
+    workers : int
+        Number of worker processes on this machine.
+
+    Raises
+    ------
+    InputError
+        When the dispatch is called: see `run_on_cluster`.
+    """
     if address:
         yield partial(run_on_cluster, address)
     else:
@@ -38,11 +51,25 @@ def run_on_cluster(
     batches: Iterable[Batch],
     on_result: Callable[[Any], None],
 ) -> None:
-    """As `parallel.WorkerPool.run`, by the workers of the scheduler at an address (tcp://host:8786).
+    """Run batches like `parallel.WorkerPool.run`, on the workers of a Dask scheduler.
 
-    Arguments travel with each call and results come back. Calls of a worker that dies are done again by
-    others; WorkerDiedError names a batch that four of them died of. Raises InputError where there is no such
-    cluster, none joins it, or a worker has other code or libraries: its results could differ.
+    Arguments are sent with each call and results are returned. Calls of a worker that dies are repeated by
+    others.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler (tcp://host:8786).
+    function, batches, on_result
+        As in `parallel.WorkerPool.run`.
+
+    Raises
+    ------
+    WorkerDiedError
+        If a batch killed four workers.
+    InputError
+        If there is no such cluster, it has no workers, or a worker has other code or libraries, so that its
+        results could differ.
     """
     with _client(address) as client:
         from distributed import KilledWorker, as_completed
@@ -52,7 +79,7 @@ def run_on_cluster(
         running = as_completed(loop=client.loop)
 
         def fill() -> None:
-            """Workers may have come or gone."""
+            """Submit batches for all threads; workers may have joined or left since the last call."""
             room = max(1, _AHEAD * sum(client.nthreads().values())) - len(labels)
             for label, arguments in islice(pending, max(0, room)):
                 future = client.submit(call, fingerprint(), function, arguments, pure=False)
@@ -71,21 +98,31 @@ def run_on_cluster(
 
 
 def call(expected: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """On a worker: function(*arguments), on one thread. Raises InputError where it is another version."""
+    """Call function(*arguments) on one thread (on a worker).
+
+    Raises
+    ------
+    InputError
+        If the worker's code or libraries differ from those of the program.
+    """
     import cv2
     from threadpoolctl import threadpool_limits
 
-    told = _difference(expected, fingerprint())
-    if told:
-        raise InputError(f"a worker on {platform.node()} has {told}: install the same on both")
+    difference = _difference(expected, fingerprint())
+    if difference:
+        raise InputError(
+            f"a worker on {platform.node()} has {difference}: install the same on both"
+        )
     cv2.setNumThreads(1)
-    with threadpool_limits(1, user_api="blas"):  # sums in another order would differ
+    with threadpool_limits(
+        1, user_api="blas"
+    ):  # other thread counts would change the order of summation
         return function(*arguments)
 
 
 @cache
 def fingerprint() -> dict[str, str]:
-    """Of all that decides what a pure call gives: this package's code, libraries, Python."""
+    """Return what decides the results of a pure call: hash of this package, library and Python versions."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parents[1]
     for path in sorted(package.rglob("*.py")):
@@ -105,7 +142,7 @@ def _difference(expected: dict[str, str], found: dict[str, str]) -> str:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """Connected, with at least one worker, all of this program's version."""
+    """Yield a client of a scheduler that has at least one worker, all with this program's version."""
     try:
         import dask
         from distributed import Client
@@ -113,7 +150,7 @@ def _client(address: str) -> Iterator[Any]:
         raise InputError(
             "--cluster needs Dask: pip install 'squeezeposenet-toolkit[cluster]'"
         ) from error
-    # A batch carries images or descriptors, on purpose; what a dead worker had is computed again.
+    # Batches contain images or descriptors on purpose; the work of a dead worker is repeated.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
     logging.getLogger("distributed").setLevel(logging.ERROR)
     try:
@@ -129,7 +166,7 @@ def _client(address: str) -> Iterator[Any]:
         for worker, answer in answers.items():
             if not isinstance(answer, dict):
                 raise InputError(f"worker {worker} cannot load this program ({answer!r})")
-            told = _difference(fingerprint(), answer)
-            if told:
-                raise InputError(f"worker {worker} has {told}: install the same on both")
+            difference = _difference(fingerprint(), answer)
+            if difference:
+                raise InputError(f"worker {worker} has {difference}: install the same on both")
         yield client

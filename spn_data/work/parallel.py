@@ -1,4 +1,4 @@
-"""Batches of pure function calls, sent to worker processes that can die without taking work along."""
+"""Batches of pure function calls in worker processes; a worker that crashes loses only its own batch."""
 
 from __future__ import annotations
 
@@ -21,22 +21,29 @@ from typing import Any, Self
 from spn_data.errors import SpnError
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Of a worker. The C library's defaults give large blocks back to the system at once, so that each image's
-# pages are mapped anew: a third of the time of finding features in 1600 px. An idle worker gives them back.
+# Environment of a worker. By default the C library returns large blocks to the system at once, so that
+# pages are mapped again for each image: a third of the time of feature detection at 1600 px. An idle worker
+# returns its free memory instead.
 _ENVIRONMENT = dict.fromkeys(THREAD_LIMITS, "1") | {
     "MALLOC_MMAP_MAX_": "0",
     "MALLOC_TRIM_THRESHOLD_": str(2**40),
 }
 _IDLE_S = 0.5
-_LOOK_S = 0.2  # how often a waiting process looks whether it is to stop
+_POLL_S = 0.2  # how often a waiting process checks for an interrupt
 
 Batch = tuple[str, tuple[Any, ...]]
-# Calls a function for each batch and hands each result on: a WorkerPool does here, run_on_cluster elsewhere.
+# Calls a function for each batch and passes on each result: WorkerPool.run locally, run_on_cluster remotely.
 Dispatch = Callable[[Callable[..., Any], Iterable[Batch], Callable[[Any], None]], None]
 
 
 class WorkerDiedError(SpnError):
-    """Raised when one batch killed its worker process twice (a native crash)."""
+    """A batch that killed its worker process twice (a native crash).
+
+    Attributes
+    ----------
+    label : str
+        Label of the batch.
+    """
 
     def __init__(self, label: str):
         super().__init__(
@@ -52,21 +59,40 @@ def run_batches(
     *,
     workers: int,
 ) -> None:
-    """As `WorkerPool.run`, by worker processes that end with it."""
+    """Run batches in worker processes that are started for this call; see `WorkerPool.run`.
+
+    Parameters
+    ----------
+    function : callable
+        Importable, pure function.
+    batches : iterable of (str, tuple)
+        Label and arguments of each call.
+    on_result : callable
+        Called with each result, in order of completion.
+    workers : int
+        Number of worker processes.
+
+    Raises
+    ------
+    WorkerDiedError
+        If a batch kills its worker twice.
+    """
     with WorkerPool(workers) as team:
         team.run(function, batches, on_result)
 
 
 class WorkerPool:
-    """Worker processes that stay from one run to the next: starting one takes most of a second of CPU.
+    """Worker processes that are reused from one run to the next.
 
-    They are started as there is work for them, and end with the team's `with` block.
+    Starting a worker takes most of a second of CPU time. Workers are started as work arrives and end with the
+    pool's `with` block.
     """
 
     def __init__(self, workers: int) -> None:
         self._size = workers
-        # Each worker has a pipe of its own, closed on this side: where it dies, even in the middle of an
-        # answer, reading ends. In concurrent.futures' shared queues such a death can be waited for for ever.
+        # Each worker has its own pipe, whose remote end is closed in this process: if the worker dies, even
+        # in the middle of an answer, reading fails at once. With the shared queues of concurrent.futures such
+        # a death can block forever.
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> Self:
@@ -82,18 +108,32 @@ class WorkerPool:
         batches: Iterable[Batch],
         on_result: Callable[[Any], None],
     ) -> None:
-        """Call function(*arguments) for each (label, arguments) and hand each result to on_result, here.
+        """Call function(*arguments) for each (label, arguments) and pass on each result in this process.
 
-        function must be importable and pure: it runs in another process, each on one thread. Results come
-        in the order of completion. A batch whose worker dies is run once more; batches finished before are
-        never repeated. Raises WorkerDiedError where it dies again. An exception of the function itself is
-        raised here.
+        Parameters
+        ----------
+        function : callable
+            Importable and pure: it runs in another process, on one thread per worker.
+        batches : iterable of (str, tuple)
+            Label and arguments of each call.
+        on_result : callable
+            Called with each result, in order of completion.
+
+        Raises
+        ------
+        WorkerDiedError
+            If the worker of a batch dies twice. After the first time the batch is repeated; finished batches
+            are never repeated.
+
+        Notes
+        -----
+        An exception raised by the function itself is raised here.
         """
-        with _held_back_interrupts() as raise_if_interrupted:
+        with _deferred_interrupts() as raise_if_interrupted:
             try:
                 self._run(function, iter(batches), on_result, raise_if_interrupted)
             except BaseException:
-                # What they compute is not wanted any more, and nobody shall wait for it.
+                # Their results are no longer needed; do not wait for them.
                 for worker in list(self._workers):
                     worker.process.kill()
                     self._dismiss(worker)
@@ -106,7 +146,7 @@ class WorkerPool:
         on_result: Callable[[Any], None],
         raise_if_interrupted: Callable[[], None],
     ) -> None:
-        ready: list[Batch] = []  # made while the workers are busy
+        ready: list[Batch] = []  # generated while the workers are busy
         suspects: set[str] = set()
         exhausted = False
         while True:
@@ -122,13 +162,13 @@ class WorkerPool:
             busy = {worker.connection: worker for worker in self._workers if worker.batch}
             if not busy:
                 return
-            for connection in wait(list(busy), _LOOK_S):
+            for connection in wait(list(busy), _POLL_S):
                 raise_if_interrupted()
                 assert isinstance(connection, Connection)
                 worker = busy[connection]
                 assert worker.batch is not None
                 try:
-                    good, answer, worker.cpu_s = connection.recv()
+                    succeeded, answer, worker.cpu_s = connection.recv()
                 except (EOFError, ConnectionResetError):
                     self._dismiss(worker)
                     label = worker.batch[0]
@@ -138,7 +178,7 @@ class WorkerPool:
                     ready.insert(0, worker.batch)
                     continue
                 worker.batch = None
-                if not good:
+                if not succeeded:
                     raise answer
                 self._hand_out(function, ready)
                 on_result(answer)
@@ -164,14 +204,17 @@ class WorkerPool:
 
 @dataclass(eq=False)
 class _Worker:
+    """A worker process, the pipe to it, and the batch that it is working on."""
+
     process: SpawnProcess
     connection: Connection
     batch: Batch | None = None
-    cpu_s: float = 0.0  # as of its last answer
+    cpu_s: float = 0.0  # at its last answer
 
     def take(self, function: Callable[..., Any], batch: Batch) -> None:
+        """Send a call to the worker."""
         self.batch = batch
-        # A worker that is dead already is found by the end of its pipe.
+        # If the worker is already dead, reading from its pipe will report it.
         with suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send((function, batch[1]))
 
@@ -180,18 +223,18 @@ _living: set[_Worker] = set()
 
 
 def living_workers_cpu_seconds() -> float:
-    """CPU seconds of the workers that have not ended: the system counts children when they end."""
+    """Return CPU seconds of running workers; the operating system counts children only when they end."""
     return sum(worker.cpu_s for worker in _living)
 
 
 def _start_worker() -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    # Started with the first worker, it would lift the mask below.
+    # If it were started with the first worker, it would clear the signal mask set below.
     resource_tracker.ensure_running()
-    # A worker never sees Ctrl-C, not even while it loads.
+    # A worker never receives Ctrl-C, not even while it loads.
     before_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    # It inherits the environment, and BLAS reads its limit when it loads.
+    # Workers inherit the environment; BLAS reads its thread limit when it is loaded.
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)
     try:
@@ -209,7 +252,7 @@ def _start_worker() -> _Worker:
 
 
 def _serve(connection: Connection, parent_pid: int) -> None:
-    """In the worker: answer calls until the other end of the pipe is closed."""
+    """Answer calls until the other end of the pipe is closed (in the worker)."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -217,18 +260,18 @@ def _serve(connection: Connection, parent_pid: int) -> None:
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             if not connection.poll(_IDLE_S):
-                _give_memory_back()
-            # Nothing of a call is kept while the next is waited for.
-            connection.send((*_called(*connection.recv()), time.process_time()))
+                _release_memory()
+            # In one expression, so that no arguments or results are kept while waiting for the next call.
+            connection.send((*_outcome_of(*connection.recv()), time.process_time()))
 
 
-def _give_memory_back() -> None:
-    with suppress(AttributeError):  # other C libraries than glibc have no such call
+def _release_memory() -> None:
+    with suppress(AttributeError):  # only glibc has this function
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
-    """Whether the function came to its end, and what it gave or raised."""
+def _outcome_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+    """Return (True, result) or (False, exception) of a call."""
     try:
         return True, function(*arguments)
     except Exception as error:
@@ -237,8 +280,11 @@ def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[b
 
 
 @contextmanager
-def _held_back_interrupts() -> Iterator[Callable[[], None]]:
-    """Ctrl-C only where the function given is called, not in the middle of a start or of a transfer."""
+def _deferred_interrupts() -> Iterator[Callable[[], None]]:
+    """Defer Ctrl-C: KeyboardInterrupt is raised only when the yielded function is called.
+
+    This keeps it out of the middle of a process start or of a transfer.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
@@ -258,7 +304,7 @@ def _held_back_interrupts() -> Iterator[Callable[[], None]]:
 
 
 def exit_with_parent(parent_pid: int) -> None:
-    """Let this process end within a second of its parent, also when that was killed."""
+    """Exit this process within a second after its parent ends, also if the parent was killed."""
 
     def watch() -> None:
         while os.getppid() == parent_pid:

@@ -1,4 +1,4 @@
-"""Wall and CPU seconds of the steps of a stage, child processes included, and how far it has come."""
+"""Wall and CPU time of the steps of a stage, child processes included, and the progress callback."""
 
 from __future__ import annotations
 
@@ -10,19 +10,26 @@ from dataclasses import dataclass, field
 
 from spn_data.work.parallel import living_workers_cpu_seconds
 
-# Called with the step's name, what is done, and the total (0 where that is not known).
+# Called with the step's name, the amount done, and the total (0 if unknown).
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass
 class Stopwatch:
-    """Seconds by step; a step entered twice adds up."""
+    """Accumulates wall and CPU time by step.
+
+    Attributes
+    ----------
+    seconds, cpu_seconds : dict of str to float
+        Wall and CPU seconds of each step; a step that is entered twice adds up.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
+        """Measure the block as part of a step."""
         wall, cpu = time.perf_counter(), cpu_seconds()
         try:
             yield
@@ -32,6 +39,6 @@ class Stopwatch:
 
 
 def cpu_seconds() -> float:
-    """CPU seconds of this process, of children that have ended, and of workers up to their last answer."""
+    """Return CPU seconds of this process, of ended children, and of workers up to their last answer."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in used) + living_workers_cpu_seconds()

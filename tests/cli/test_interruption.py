@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from spn_data.area.area import GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import GEO, MODEL
 
 OPTIONS = ["--max-features", "800", "--fov", "72"]
 
@@ -143,7 +144,7 @@ def test_a_killed_mapper_is_told_in_one_line_and_the_next_run_finishes(
     assert run.process.wait(30) == 1
     errors = [line for line in run.output.splitlines() if line.startswith("Error")]
     assert len(errors) == 1
-    assert "mapping was killed by signal 9. What was done before is kept" in errors[0]
+    assert "mapping was killed by signal 9. Finished work is kept" in errors[0]
     assert "Traceback" not in run.output
     start().finish()
     assert interruption.difference(finished_area, area).position_m < 0.01

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.area.area import MODEL
+from spn_data.area.names import MODEL
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles
@@ -78,8 +78,8 @@ def test_poses_csv_gives_back_every_bit(tmp_path: Path) -> None:
         ("low/000001.jpg", "../000001.jpg", "poses.csv:3"),
         ("low/000001.jpg", "low/000000.jpg", "names of frames are not unique"),
         ("low.mp4", "../low.mp4", "is not the name of a file"),
-        (",registered,,", ",failed,,", "poses.csv:2: a failed frame with a pose"),
-        (",failed,", ",registered,", "poses.csv:5: a registered frame without a pose"),
+        (",registered,,", ",failed,,", "poses.csv:2: a failed frame has a pose"),
+        (",failed,", ",registered,", "poses.csv:5: a registered frame has no pose"),
         ("0.3333333333333333", "inf", "poses.csv:3: 'inf' is not a finite number"),
         ("low/000002.jpg,", "low/000002.jpg", "poses.csv:4: 38 cells, expected 39"),
     ],
@@ -160,7 +160,7 @@ def test_a_damaged_file_of_observations_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for bad in (whole[:100], b"", b"not an archive", whole[:60] + b"?" * 9 + whole[69:]):
         path.write_bytes(bad)
-        with pytest.raises(InputError, match="is no file of observations"):
+        with pytest.raises(InputError, match="is not an observations file"):
             read_label_observations(path)
     np.savez(path, frame_idx=[0, 1], point_ids=[1, 2], pixels=np.zeros((2, 3)))
     with pytest.raises(InputError, match="shapes differ"):
@@ -169,7 +169,7 @@ def test_a_damaged_file_of_observations_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not sorted"):
         read_label_observations(path)
     np.savez(path, frame_idx=np.array([{}], dtype=object), point_ids=[1], pixels=np.zeros((1, 2)))
-    with pytest.raises(InputError, match="is no file of observations"):
+    with pytest.raises(InputError, match="is not an observations file"):
         read_label_observations(path)
 
 
