@@ -254,7 +254,7 @@ def test_figures_of_the_reconstruction_page_are_the_defaults():
         f"the {pairs.appearance_neighbors} that look most alike",
         f"needs {options.matching.min_inliers} inliers",
         f"fewer than {options.enough_share * 100:g} % are in",
-        f"than {options.usable_share * 100:g} % of them, in one model",
+        f"than {options.usable_share * 100:g} % of all frames",
         f"COLMAP's {options.camera_model} model",
     ):
         assert sentence in text
