@@ -1,6 +1,6 @@
-"""A bundle adjustment at its solution: derivatives of its residuals, points eliminated.
+"""Jacobians of a bundle adjustment at its solution, with the points eliminated (Schur complement).
 
-The unknowns that stay are those of the frames (6 each) and of the lenses that mapping estimated.
+The remaining unknowns are the poses (6 per frame) and the intrinsics that mapping estimated.
 """
 
 from __future__ import annotations
@@ -21,18 +21,24 @@ from spn_data.geometry.least_squares import (
     rows_to_sparse,
 )
 
-GAUGE = 7  # a similarity of everything changes no residual
+GAUGE = 7  # dimension of the gauge: a similarity changes no residual
 
-# Of a point's own information: a point whose rays are parallel has a depth that nothing fixes.
+# Share of the trace of a point's normal matrix: the depth of a point with parallel rays is undetermined.
 _RIDGE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Columns of frames and lenses, `count` in all; those of frame i are 6 i to 6 i + 5.
+    """Columns of poses and intrinsics in the design matrix; frame i has columns 6 i to 6 i + 5.
 
-    lens_columns : by camera id, (L,); lens_jacobian : by camera id, (8, L) from the L parameters that mapping
-    estimated to fx, fy, cx, cy, k1, k2, p1, p2.
+    Attributes
+    ----------
+    count : int
+        Number of columns n.
+    lens_columns : dict of int to ndarray, shape (L,)
+        Columns of the estimated intrinsics, by camera id.
+    lens_jacobian : dict of int to ndarray, shape (8, L)
+        Derivatives of fx, fy, cx, cy, k1, k2, p1, p2 by the L estimated intrinsics, by camera id.
     """
 
     count: int
@@ -41,6 +47,15 @@ class Unknowns:
 
     @classmethod
     def of(cls, scene: Scene, *, refine_principal_point: bool) -> Unknowns:
+        """Return the unknowns of a map.
+
+        Parameters
+        ----------
+        scene : Scene
+            The map.
+        refine_principal_point : bool
+            Whether mapping estimated the principal points.
+        """
         columns, mixing = {}, {}
         count = POSE * len(scene.names)
         for camera_id in np.unique(scene.camera_ids).tolist():
@@ -54,24 +69,35 @@ class Unknowns:
 
 
 def _lens_parameters(camera: Camera, refine_principal_point: bool) -> list[str]:
-    """Those that mapping estimates."""
-    held = () if refine_principal_point else ("cx", "cy")
-    return [name for name in MODELS[camera.model] if name not in held]
+    """Return the names of the intrinsics that mapping estimates."""
+    fixed = () if refine_principal_point else ("cx", "cy")
+    return [name for name in MODELS[camera.model] if name not in fixed]
 
 
 @dataclass(frozen=True, eq=False)
 class LinearizedBundle:
-    """All M measurements of P points, linearised; n is the number of unknowns that stay.
+    """All M measurements of P points, linearised; n is the number of unknowns that remain.
 
-    points : (P,) positions in Scene.points. point : (M,) 0..P-1.
-    design : (2 M, n) sparse, change of the residuals by the unknowns that stay.
-    whitening : (P, 3, 3) Q with Q^T Q = V^-1, where V is the information on a point.
-    whitened : (M, 2, 3), change of the residuals by Q^-T times a change of the point: orthonormal over its
-    measurements.
-    coupling : (3 P, n) sparse, rows 3p..3p+2 are Q W^T, where W is the information that frames and lenses
-    share with point p: changes x of these move the point by -Q^T coupling x.
-    residuals : (2 M,) px, after all that points explain of them.
-    views : (M, 4), unit direction from the frame to the point and logarithm of its distance.
+    Attributes
+    ----------
+    points : ndarray, shape (P,)
+        Rows in `Scene.points`.
+    point : ndarray, shape (M,)
+        Point of each measurement, 0..P-1.
+    design : csr_matrix, shape (2 M, n)
+        Derivatives of the residuals by the remaining unknowns.
+    whitening : ndarray, shape (P, 3, 3)
+        Q with Q^T Q = V^-1, where V is the normal matrix of a point.
+    whitened : ndarray, shape (M, 2, 3)
+        Derivatives of the residuals by the point in whitened coordinates (Q^-T times a change of the point);
+        their columns are orthonormal over the measurements of a point.
+    coupling : csr_matrix, shape (3 P, n)
+        Rows 3p..3p+2 are Q W^T, where W is the off-diagonal block of the normal matrix between the remaining
+        unknowns and point p. A change x of these unknowns moves the point by -Q^T coupling x.
+    residuals : ndarray, shape (2 M,)
+        Residuals in px after projecting out all that the points explain.
+    views : ndarray, shape (M, 4)
+        Unit direction from the frame to the point, and logarithm of the distance.
     """
 
     points: np.ndarray
@@ -84,14 +110,26 @@ class LinearizedBundle:
     views: np.ndarray
 
     def reduced_normal_matrix(self) -> sparse.csr_matrix:
-        """(n, n) on frames and lenses after points are eliminated; singular by the gauge."""
+        """Return the Schur complement (n, n) of the points; singular in the seven gauge directions."""
         return (self.design.T @ self.design - self.coupling.T @ self.coupling).tocsr()
 
 
 def linearize_bundle(
     scene: Scene, seen: MapObservations, unknowns: Unknowns, rows: np.ndarray
 ) -> LinearizedBundle:
-    """At the scene as it is, of the measurements at `rows` (M,): all those of their points, all finite."""
+    """Linearise the bundle adjustment at the scene's current estimate.
+
+    Parameters
+    ----------
+    scene : Scene
+        Poses, cameras and points.
+    seen : MapObservations
+        Measurements of the points.
+    unknowns : Unknowns
+        The unknowns that remain.
+    rows : ndarray, shape (M,)
+        Measurements to use: all those of their points, all finite.
+    """
     frame = seen.image_idx[rows]
     points, point = np.unique(seen.point_idx[rows], return_inverse=True)
     rotations = scene.poses.rotations[frame]
@@ -101,7 +139,7 @@ def linearize_bundle(
     width = max(len(columns) for columns in unknowns.lens_columns.values())
     by_cam = np.empty((len(rows), 2, 3))
     lens = np.zeros((len(rows), 2, width))
-    lens_columns = np.zeros((len(rows), width), dtype=np.int64)  # what is 0 may stand anywhere
+    lens_columns = np.zeros((len(rows), width), dtype=np.int64)  # columns of zeros are arbitrary
     for camera_id in np.unique(ids).tolist():
         own = np.flatnonzero(ids == camera_id)
         by_cam[own], by_lens = projection_jacobians(scene.cameras[camera_id], points_cam[own])
@@ -130,15 +168,28 @@ def linearize_bundle(
 
 
 def gauge_null_space(scene: Scene, unknowns: Unknowns) -> np.ndarray:
-    """(n, 7) changes of the unknowns by moving, turning and scaling the world about its centres."""
+    """Return the null space of the normal matrix: translation, rotation and scale of the world.
+
+    Parameters
+    ----------
+    scene : Scene
+        The map; rotation and scale are about the centroid of its camera centres.
+    unknowns : Unknowns
+        Columns of the normal matrix.
+
+    Returns
+    -------
+    ndarray, shape (n, 7)
+        Derivatives of the unknowns by three translations, three rotations and the scale.
+    """
     centers, rotations = scene.poses.centers, scene.poses.rotations
     offsets = centers - centers.mean(axis=0)
     size = np.sqrt((offsets**2).sum(axis=1).mean())
-    directions = np.zeros((unknowns.count, GAUGE))
-    frames = directions[: POSE * len(centers)].reshape(-1, POSE, GAUGE)
+    null_space = np.zeros((unknowns.count, GAUGE))
+    frames = null_space[: POSE * len(centers)].reshape(-1, POSE, GAUGE)
     for axis, unit in enumerate(np.eye(3)):
         frames[:, axis, axis] = 1.0
         frames[:, :3, 3 + axis] = np.cross(unit, offsets) / size
         frames[:, 3:, 3 + axis] = -rotations @ unit / size
     frames[:, :3, 6] = offsets / size
-    return directions
+    return null_space

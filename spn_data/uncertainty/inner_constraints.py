@@ -1,4 +1,4 @@
-"""The inverse of a map's information, which a similarity leaves singular, under conditions on its centres."""
+"""Inverse of the singular normal matrix of a map under inner constraints (free-network datum)."""
 
 from __future__ import annotations
 
@@ -14,40 +14,73 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.least_squares import POSE
 from spn_data.uncertainty.bundle_jacobians import GAUGE, Unknowns, gauge_null_space
 
-_SMALLEST_PIVOT = 1e-10  # of the information scaled to a unit diagonal: less is rounding
-_UNTIED = "the map's measurements do not tie its frames together"
+_SMALLEST_PIVOT = (
+    1e-10  # of the normal matrix scaled to a unit diagonal; smaller pivots are rounding errors
+)
+_DISCONNECTED = "the map's measurements do not connect all its frames"
 
 
 @dataclass(frozen=True, eq=False)
 class InnerConstraintInverse:
-    """K = T G T^T, the inverse of an information S (n, n) under seven conditions, by a sparse factor.
+    """Generalised inverse K = T G T^T of a reduced normal matrix S (n, n) under seven inner constraints.
 
-    The conditions (the centres together neither move, turn nor scale) are those of a best similarity.
-    G = (S + F F^T)^-1 is a generalised inverse of S: F pins one frame and one coordinate of another, and
-    keeps S sparse. T projects onto the conditions along the gauge.
-    scale : (n,) to a unit diagonal; factor : of the scaled S + F F^T; directions, conditions : (n, 7);
-    inner : (7, 7).
+    The constraints fix the translation, rotation and scale of the camera centres as a whole, like a best-fit
+    similarity over these centres.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (n,)
+        Scaling of S to a unit diagonal.
+    factor : SuperLU
+        Sparse factorisation of the scaled S + F F^T.
+    null_space : ndarray, shape (n, 7)
+        Null space of S.
+    constraints : ndarray, shape (n, 7)
+        Coefficients of the inner constraints: the null space, restricted to the camera centres.
+    inner : ndarray, shape (7, 7)
+        Inverse of constraints^T null_space.
+
+    Notes
+    -----
+    G = (S + F F^T)^-1 is a generalised inverse of S: F pins one frame and one coordinate of another (a
+    minimal datum), which keeps S sparse. T is the S-transformation that projects onto the constraints along
+    the gauge.
     """
 
     scale: np.ndarray
     factor: Any
-    directions: np.ndarray
-    conditions: np.ndarray
+    null_space: np.ndarray
+    constraints: np.ndarray
     inner: np.ndarray
 
     @classmethod
     def of(
-        cls, information: sparse.csr_matrix, scene: Scene, unknowns: Unknowns
+        cls, normal_matrix: sparse.csr_matrix, scene: Scene, unknowns: Unknowns
     ) -> InnerConstraintInverse:
-        """Raises GeometryError where more than a similarity is free."""
-        diagonal = information.diagonal()
+        """Factorise a reduced normal matrix.
+
+        Parameters
+        ----------
+        normal_matrix : csr_matrix, shape (n, n)
+            Reduced normal matrix.
+        scene : Scene
+            The map.
+        unknowns : Unknowns
+            Its columns.
+
+        Raises
+        ------
+        GeometryError
+            If the rank defect is larger than the seven degrees of freedom of a similarity.
+        """
+        diagonal = normal_matrix.diagonal()
         if not np.all(diagonal > 0):
             frame = int(np.argmin(diagonal > 0)) // POSE
             name = scene.names[frame] if frame < len(scene.names) else "a lens"
-            raise GeometryError(f"{name} is not fixed by the map's measurements")
+            raise GeometryError(f"{name} is not determined by the map's measurements")
         scale = 1 / np.sqrt(diagonal)
         scaling = sparse.diags(scale)
-        pinned = scaling @ information @ scaling + sparse.diags(_pins(scene, len(scale)))
+        pinned = scaling @ normal_matrix @ scaling + sparse.diags(_pins(scene, len(scale)))
         try:
             factor = splu(
                 pinned.tocsc(),
@@ -56,24 +89,28 @@ class InnerConstraintInverse:
                 options={"SymmetricMode": True},
             )
         except RuntimeError as error:
-            raise GeometryError(_UNTIED) from error
+            raise GeometryError(_DISCONNECTED) from error
         if float(np.min(factor.U.diagonal())) < _SMALLEST_PIVOT:
-            raise GeometryError(_UNTIED)
-        directions = gauge_null_space(scene, unknowns)
-        conditions = np.zeros_like(directions)
+            raise GeometryError(_DISCONNECTED)
+        null_space = gauge_null_space(scene, unknowns)
+        constraints = np.zeros_like(null_space)
         centers = (POSE * np.arange(len(scene.names))[:, None] + np.arange(3)).ravel()
-        conditions[centers] = directions[centers]
-        return cls(scale, factor, directions, conditions, np.linalg.inv(conditions.T @ directions))
+        constraints[centers] = null_space[centers]
+        return cls(
+            scale, factor, null_space, constraints, np.linalg.inv(constraints.T @ null_space)
+        )
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """K right, (n, r)."""
-        right = right - self.conditions @ (self.inner.T @ (self.directions.T @ right))
-        solved = self.scale[:, None] * self.factor.solve(self.scale[:, None] * right)
-        return solved - self.directions @ (self.inner @ (self.conditions.T @ solved))
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Return K right_side, shape (n, r)."""
+        right_side = right_side - self.constraints @ (
+            self.inner.T @ (self.null_space.T @ right_side)
+        )
+        solved = self.scale[:, None] * self.factor.solve(self.scale[:, None] * right_side)
+        return solved - self.null_space @ (self.inner @ (self.constraints.T @ solved))
 
 
 def _pins(scene: Scene, unknowns: int) -> np.ndarray:
-    """(n,) one on the unknowns that fix the gauge: a frame at the rim, and a coordinate of another."""
+    """Return 1 for the unknowns (n,) of a minimal datum: a frame at the rim and one coordinate of another."""
     assert GAUGE == POSE + 1
     centers = scene.poses.centers
     first = int(np.argmax(((centers - centers.mean(axis=0)) ** 2).sum(axis=1)))

@@ -1,14 +1,20 @@
-"""How uncertain a frozen map is in itself: covariances of its frames, lenses and points.
+"""Covariance of a frozen map in its own gauge: of its poses, intrinsics and points.
 
-A map is free to move, turn and scale; what is given here is its error after its own best similarity to the
-truth (over the centres of its frames), for which there is nothing else to know than its residuals.
+The gauge of a map is free (translation, rotation, scale). The covariance here is that of the error after the
+map's own best-fit similarity to the truth over its camera centres (inner constraints), which can be estimated
+from the residuals alone.
 
-With errors that are independent, bundle adjustment leaves the frames and lenses with the covariance
-s^2 S^+, where S is their information after points are eliminated. Errors of features are not independent:
-a feature that drifts as the view changes drifts alike in neighbouring frames, and one spot gives several
-features. Only the pulls of whole clusters of measurements on the unknowns are taken as independent, and the
-covariance is S^+ M S^+ with M summed over clusters (Liang and Zeger 1986, after Huber 1967 and White 1980).
-A point's own error, which its few residuals cannot tell, is that of a model of the drift (track_noise).
+If measurement errors were independent, poses and intrinsics would have the covariance s^2 S^+ after bundle
+adjustment, where S is the normal matrix reduced by the points (Schur complement). Keypoint errors are not
+independent: a keypoint that drifts as the view changes drifts alike in neighbouring frames, and one spot
+gives several keypoints. Therefore only the scores (J^T r) of whole clusters of measurements are taken as
+independent, and the covariance is the cluster-robust (sandwich) estimate S^+ M S^+ with M summed over
+clusters. A point's own error, for which its few residuals are not enough, is predicted by a model of the
+drift (`track_noise`).
+
+References
+----------
+Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using generalized linear models".
 """
 
 from __future__ import annotations
@@ -29,29 +35,44 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
-from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, own_errors
+from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, whitened_point_covariances
 
 _FRAMES_AT_ONCE = 32
 _MEASUREMENTS_AT_ONCE = 200_000
-_SPOT_PX = 1.0  # features of one spot differ in scale and orientation, not in place
-_NOISE_SAMPLE = 6000  # points, of which long tracks are chosen
+_SPOT_PX = 1.0  # keypoints of one spot differ in scale and orientation, not in position
+_NOISE_SAMPLE = 6000  # points, among which long tracks are selected
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapCovarianceOptions:
-    """What is known of how the map was made, and what is taken for independent."""
+    """How the map was made, and which errors are taken as independent.
 
-    refine_principal_point: bool = False  # whether mapping estimated it
-    clustered: bool = True  # only clusters of measurements are independent; False: each one is
+    Attributes
+    ----------
+    refine_principal_point : bool
+        Whether mapping estimated the principal points.
+    clustered : bool
+        Whether only clusters of measurements are independent; False: every measurement is.
+    """
+
+    refine_principal_point: bool = False
+    clustered: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Functional:
-    """A linear function, of r values, of positions of the map's points and of one of its lenses.
+    """A linear function with r values of some of the map's points and of one of its lenses.
 
-    point_idx : (K,) positions in Scene.points; by_points : (r, K, 3), derivatives by their positions.
-    camera_id, by_lens : (r, 8), derivatives by its fx, fy, cx, cy, k1, k2, p1, p2; None where no lens of the
-    map matters.
+    Attributes
+    ----------
+    point_idx : ndarray, shape (K,)
+        Rows in `Scene.points`.
+    by_points : ndarray, shape (r, K, 3)
+        Derivatives by the positions of these points.
+    camera_id : int or None
+        The lens; None if the function depends on none.
+    by_lens : ndarray, shape (r, 8), or None
+        Derivatives by fx, fy, cx, cy, k1, k2, p1, p2 of this lens.
     """
 
     point_idx: np.ndarray
@@ -62,10 +83,14 @@ class Functional:
 
 @dataclass(frozen=True, eq=False)
 class MapCovariance:
-    """The uncertainty of a map, ready to be asked; all in the scene's own frame and unit.
+    """Factorised covariance of a map, in the scene's own frame and unit.
 
-    sigma_px : root mean square of one residual component, for its degrees of freedom.
-    noise : how the errors of one track hang together, None where all are taken as independent.
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of one residual component: root of the residual sum of squares over the redundancy.
+    noise : TrackNoise or None
+        Correlation of the errors along a track; None if all errors are taken as independent.
     """
 
     sigma_px: float
@@ -73,21 +98,31 @@ class MapCovariance:
     _unknowns: Unknowns
     _frames: int
     _inverse: InnerConstraintInverse
-    _pull: sparse.csr_matrix  # (n, n), M
-    _place: (
-        np.ndarray
-    )  # (P,) of each point of the scene in the following, -1 of one that nothing measures
-    _whitening: np.ndarray  # (p, 3, 3), see Bundle
-    _coupling: sparse.csr_matrix  # (3p, n), see Bundle
-    _own: np.ndarray  # (p, 3, 3), see own_errors
+    _meat: sparse.csr_matrix  # (n, n), M
+    _point_row: np.ndarray  # (P,) rows of scene points in the arrays below, -1 if unmeasured
+    _whitening: np.ndarray  # (p, 3, 3), see LinearizedBundle
+    _coupling: sparse.csr_matrix  # (3p, n), see LinearizedBundle
+    _own: np.ndarray  # (p, 3, 3), see whitened_point_covariances
 
     @classmethod
     def of(
         cls, scene: Scene, seen: MapObservations, options: MapCovarianceOptions | None = None
     ) -> MapCovariance:
-        """Of a map that bundle adjustment has brought to its least squares, and all its measurements.
+        """Compute the covariance of a map at its bundle adjustment solution.
 
-        Raises GeometryError where the measurements do not fix the map up to a similarity.
+        Parameters
+        ----------
+        scene : Scene
+            The map.
+        seen : MapObservations
+            All its measurements.
+        options : MapCovarianceOptions, optional
+            How it was made.
+
+        Raises
+        ------
+        GeometryError
+            If the measurements do not determine the map up to a similarity.
         """
         options = options or MapCovarianceOptions()
         unknowns = Unknowns.of(scene, refine_principal_point=options.refine_principal_point)
@@ -99,62 +134,97 @@ class MapCovariance:
             sample = np.random.default_rng(0).permutation(len(scene.points))[:_NOISE_SAMPLE]
             some = rows[np.isin(seen.point_idx[rows], sample)]
             noise = fit_track_noise(linearize_bundle(scene, seen, unknowns, some))
-        information = sparse.csr_matrix((unknowns.count, unknowns.count))
-        pull = sparse.csr_matrix((unknowns.count, unknowns.count))
+        normal_matrix = sparse.csr_matrix((unknowns.count, unknowns.count))
+        meat = sparse.csr_matrix((unknowns.count, unknowns.count))
         squares, parts = 0.0, []
         for part in _parts(rows, cluster[seen.point_idx[rows]]):
             bundle = linearize_bundle(scene, seen, unknowns, part)
-            information = information + bundle.reduced_normal_matrix()
+            normal_matrix = normal_matrix + bundle.reduced_normal_matrix()
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
-                pull = pull + _clustered_pull(bundle, cluster[bundle.points])
+                meat = meat + _clustered_meat(bundle, cluster[bundle.points])
             parts.append(
-                (bundle.points, bundle.whitening, bundle.coupling, own_errors(bundle, noise))
+                (
+                    bundle.points,
+                    bundle.whitening,
+                    bundle.coupling,
+                    whitened_point_covariances(bundle, noise),
+                )
             )
         points = np.concatenate([part[0] for part in parts])
         after_points = 2 * len(rows) - 3 * len(points)
-        freedom = after_points - unknowns.count + GAUGE
-        if freedom <= 0:
+        redundancy = after_points - unknowns.count + GAUGE
+        if redundancy <= 0:
             raise GeometryError("the map has no more measurements than unknowns")
-        variance = squares / freedom
+        variance = squares / redundancy
         own = np.concatenate([part[3] for part in parts])
-        # Residuals are smaller than errors by what frames and lenses took of them.
-        pull = after_points / freedom * pull if options.clustered else variance * information
-        place = np.full(len(scene.points), -1)
-        place[points] = np.arange(len(points))
+        # Residuals are smaller than errors because poses and intrinsics absorbed a part of them.
+        meat = after_points / redundancy * meat if options.clustered else variance * normal_matrix
+        point_row = np.full(len(scene.points), -1)
+        point_row[points] = np.arange(len(points))
         return cls(
             float(np.sqrt(variance)),
             noise,
             unknowns,
             len(scene.names),
-            InnerConstraintInverse.of(information, scene, unknowns),
-            pull.tocsr(),
-            place,
+            InnerConstraintInverse.of(normal_matrix, scene, unknowns),
+            meat.tocsr(),
+            point_row,
             np.concatenate([part[1] for part in parts]),
             sparse.vstack([part[2] for part in parts], format="csr"),
             own if options.clustered else variance * own,
         )
 
     def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
-        """(r, r) each: through frames and lenses, which all points share, and of each point by itself."""
+        """Return the covariance of each functional.
+
+        It is the sum of two parts: the errors of poses and intrinsics, which all points share, and the own
+        error of each point.
+
+        Parameters
+        ----------
+        functionals : sequence of Functional
+            Functions with r values each.
+
+        Returns
+        -------
+        list of ndarray, shape (r, r)
+            One covariance per functional.
+
+        Raises
+        ------
+        ValueError
+            If a functional depends on a point without measurements.
+        """
         if not functionals:
             return []
         sides = [self._right_side(functional) for functional in functionals]
         solved = self._inverse.solve(np.concatenate([right for _, right in sides], axis=1))
-        pulled = self._pull @ solved
+        weighted = self._meat @ solved
         ends = np.cumsum([0] + [right.shape[1] for _, right in sides])
-        found = []
+        covariances = []
         for (by_own, _), functional, a, b in zip(
             sides, functionals, ends[:-1], ends[1:], strict=True
         ):
-            errors = self._own[self._place[functional.point_idx]]
+            errors = self._own[self._point_row[functional.point_idx]]
             each = np.einsum("rki,kij->rkj", by_own, errors)
             of_points = np.tensordot(each, by_own, axes=((1, 2), (1, 2)))
-            found.append(solved[:, a:b].T @ pulled[:, a:b] + of_points)
-        return found
+            covariances.append(solved[:, a:b].T @ weighted[:, a:b] + of_points)
+        return covariances
 
     def pose_covariances(self, frames: np.ndarray | None = None) -> np.ndarray:
-        """(F, 6, 6) of the mapping frames at `frames` (F,), of all if None; axes and order as in Labels."""
+        """Return the covariances of mapping frames.
+
+        Parameters
+        ----------
+        frames : ndarray, shape (F,), optional
+            Rows of the frames; all by default.
+
+        Returns
+        -------
+        ndarray, shape (F, 6, 6)
+            Axes and order as in `Labels`.
+        """
         wanted = np.arange(self._frames) if frames is None else np.asarray(frames)
         found = np.empty((len(wanted), POSE, POSE))
         n = self._unknowns.count
@@ -164,19 +234,19 @@ class MapCovariance:
             right = np.zeros((n, len(columns)))
             right[columns, np.arange(len(columns))] = 1.0
             solved = self._inverse.solve(right)
-            pulled = (self._pull @ solved).reshape(n, len(some), POSE)
+            weighted = (self._meat @ solved).reshape(n, len(some), POSE)
             solved = solved.reshape(n, len(some), POSE)
-            found[first : first + len(some)] = np.einsum("nfi,nfj->fij", solved, pulled)
+            found[first : first + len(some)] = np.einsum("nfi,nfj->fij", solved, weighted)
         return found
 
     def _right_side(self, functional: Functional) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives by the points' own whitened errors (r, K, 3), and by frames and lenses (n, r)."""
-        place = self._place[functional.point_idx]
-        if np.any(place < 0):
-            raise ValueError("a point that nothing in the map measures has no covariance")
-        by_own = np.einsum("rki,kji->rkj", functional.by_points, self._whitening[place])
-        rows = (3 * place[:, None] + np.arange(3)).ravel()
-        right = -(self._coupling[rows].T @ by_own.reshape(len(by_own), 3 * len(place)).T)
+        """Return derivatives by the points' whitened errors (r, K, 3), and by poses and intrinsics (n, r)."""
+        row = self._point_row[functional.point_idx]
+        if np.any(row < 0):
+            raise ValueError("a point without measurements has no covariance")
+        by_own = np.einsum("rki,kji->rkj", functional.by_points, self._whitening[row])
+        rows = (3 * row[:, None] + np.arange(3)).ravel()
+        right = -(self._coupling[rows].T @ by_own.reshape(len(by_own), 3 * len(row)).T)
         if functional.camera_id is not None and functional.by_lens is not None:
             mixing = self._unknowns.lens_jacobian[functional.camera_id]
             right[self._unknowns.lens_columns[functional.camera_id]] += (
@@ -186,7 +256,10 @@ class MapCovariance:
 
 
 def _clusters_of_points(seen: MapObservations, rows: np.ndarray, points: int) -> np.ndarray:
-    """(P,) cluster of each point: those of one spot of the image that first saw them; -1 where none did."""
+    """Return the cluster (P,) of each point, -1 without measurements.
+
+    Points that were first seen at the same spot of the same image share a cluster.
+    """
     order = rows[np.lexsort((seen.image_idx[rows], seen.point_idx[rows]))]
     point, first = np.unique(seen.point_idx[order], return_index=True)
     first = order[first]
@@ -201,7 +274,7 @@ def _clusters_of_points(seen: MapObservations, rows: np.ndarray, points: int) ->
 
 
 def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
-    """Pieces of rows that are sorted by cluster, none of which is cut."""
+    """Yield pieces of rows sorted by cluster without splitting a cluster."""
     first = 0
     while first < len(rows):
         last = min(first + _MEASUREMENTS_AT_ONCE, len(rows))
@@ -210,8 +283,8 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
         first = last
 
 
-def _clustered_pull(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
-    """(n, n) sum over clusters of the outer product of their pull on frames and lenses."""
+def _clustered_meat(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
+    """Return the meat (n, n) of the sandwich: the sum over clusters of the outer products of their scores."""
     cluster = np.unique(cluster_of_point, return_inverse=True)[1]
-    pulls = cluster_scores(bundle.residuals, cluster[bundle.point], bundle.design)
-    return (pulls.T @ pulls).tocsr()
+    scores = cluster_scores(bundle.residuals, cluster[bundle.point], bundle.design)
+    return (scores.T @ scores).tocsr()

@@ -1,10 +1,14 @@
-"""How the errors of one track hang together: features drift as the view of them changes.
+"""Correlated measurement errors along a track: keypoints drift as their view changes.
 
-Model of the n errors of a track, in each of x and y: variance s^2 sigma^2 (w + (1 - w) exp(-change / length))
-between two of its frames (w only of one with itself), where the change of view is that of the direction to
-the point in radians and of the logarithm of its distance, and s^2 is of the track: inverse gamma with mean
-near 1, so that errors have the tails of Student's t. Restricted likelihood: of residuals after the point
-itself (Patterson and Thompson 1971; Lange, Little and Taylor 1989 for t).
+Model of the n errors of a track, in each of x and y: covariance
+s^2 sigma^2 (w + (1 - w) exp(-change / length)) between two of its frames, with w only for a frame with
+itself. The change of view combines the change of the direction to the point (radians) and of the logarithm of
+its distance. s^2 varies between tracks: inverse gamma with mean near 1, so that errors have the tails of
+Student's t. Estimated by restricted maximum likelihood (REML): from residuals after the point is eliminated.
+
+References
+----------
+Patterson and Thompson 1971 (REML); Lange, Little and Taylor 1989 (Student's t).
 """
 
 from __future__ import annotations
@@ -18,18 +22,29 @@ from scipy.special import gammaln
 
 from spn_data.uncertainty.bundle_jacobians import LinearizedBundle
 
-# Much more than any track sees: what a drift does over a track's views grows with their change. It is not
-# estimated, as only its ratio to the variance matters then.
+# Much longer than the views of any track, so that drift grows linearly with the change of view. It is not
+# estimated because only its ratio to the variance matters then.
 _LENGTH = 3.0
-_RIDGE = 1e-9  # of a point whose rays are parallel: its depth explains no residual
+_RIDGE = 1e-9  # for points with parallel rays, whose depth explains no residual
 _FITTED_TRACKS = 1000
-_TRACK_LENGTHS = (4, 30)  # of tracks that are fitted: shorter ones tell nothing of drift
+_TRACK_LENGTHS = (4, 30)  # of the tracks to fit; shorter ones contain no information on drift
 
 
 @dataclass(frozen=True, eq=False)
 class TrackNoise:
-    """sigma_px : deviation of one component in a usual track; apart : w, the share that no neighbour has;
-    length : change of view over which the rest fades; tails : degrees of freedom of Student's t."""
+    """Parameters of the noise model.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of one component in a typical track.
+    apart : float
+        w, the uncorrelated share of the variance.
+    length : float
+        Change of view over which the correlation of the rest decays.
+    tails : float
+        Degrees of freedom of Student's t.
+    """
 
     sigma_px: float
     apart: float
@@ -37,7 +52,7 @@ class TrackNoise:
     tails: float
 
     def correlations(self, views: np.ndarray) -> np.ndarray:
-        """(..., n, n) between the errors of a track seen in views (..., n, 4)."""
+        """Return the correlations (..., n, n) between the errors of a track seen in views (..., n, 4)."""
         squared = np.zeros((*views.shape[:-1], views.shape[-2]))
         for axis in range(views.shape[-1]):
             column = views[..., axis]
@@ -48,7 +63,19 @@ class TrackNoise:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """T tracks of n measurements: point (T,), views (T, n, 4), whitened (T, n, 2, 3), residuals (T, n, 2)."""
+    """T tracks of n measurements each.
+
+    Attributes
+    ----------
+    point : ndarray, shape (T,)
+        Their points.
+    views : ndarray, shape (T, n, 4)
+        As in `LinearizedBundle`.
+    whitened : ndarray, shape (T, n, 2, 3)
+        As in `LinearizedBundle`.
+    residuals : ndarray, shape (T, n, 2)
+        Residuals in px.
+    """
 
     point: np.ndarray
     views: np.ndarray
@@ -57,7 +84,7 @@ class _Tracks:
 
 
 def fit_track_noise(bundle: LinearizedBundle) -> TrackNoise:
-    """Most likely noise of a bundle's tracks, from a sample of them."""
+    """Fit the maximum-likelihood noise model to a sample of a bundle's tracks."""
     lengths = np.bincount(bundle.point)
     usable = np.flatnonzero((lengths >= _TRACK_LENGTHS[0]) & (lengths <= _TRACK_LENGTHS[1]))
     if len(usable) == 0:
@@ -80,10 +107,20 @@ def fit_track_noise(bundle: LinearizedBundle) -> TrackNoise:
     return _noise(found.x)
 
 
-def own_errors(bundle: LinearizedBundle, noise: TrackNoise | None) -> np.ndarray:
-    """(P, 3, 3) F, with Q^T F Q the covariance of a point by its own errors (Q of Bundle.whitening).
+def whitened_point_covariances(bundle: LinearizedBundle, noise: TrackNoise | None) -> np.ndarray:
+    """Return the covariances of the points' own errors in whitened coordinates.
 
-    Without a model of noise: of independent errors of 1 px.
+    Parameters
+    ----------
+    bundle : LinearizedBundle
+        The measurements.
+    noise : TrackNoise or None
+        The noise model; None for independent errors of 1 px.
+
+    Returns
+    -------
+    ndarray, shape (P, 3, 3)
+        F, with Q^T F Q the covariance of a point due to its own measurement errors (Q is `bundle.whitening`).
     """
     own = np.zeros_like(bundle.whitening)
     if noise is None:
@@ -95,15 +132,15 @@ def own_errors(bundle: LinearizedBundle, noise: TrackNoise | None) -> np.ndarray
             tracks.whitened,
             np.einsum("tmn,tnki->tmki", correlations, tracks.whitened, optimize=True),
         )
-        # Zero but for a point whose rays are parallel: its depth stays as open as it is.
-        open_ = np.eye(3) - np.einsum("tnki,tnkj->tij", tracks.whitened, tracks.whitened)
+        # Zero except for points with parallel rays, whose depth remains undetermined.
+        undetermined = np.eye(3) - np.einsum("tnki,tnkj->tij", tracks.whitened, tracks.whitened)
         misfit, _ = _misfit(tracks, correlations)
-        freedom = 2 * tracks.views.shape[1] - 3
-        # The variance of this track that its residuals and those of all others tell.
+        redundancy = 2 * tracks.views.shape[1] - 3
+        # Posterior mean of this track's variance: its own residuals and the distribution over all tracks.
         variance = (noise.tails * noise.sigma_px**2 + misfit) / max(
-            noise.tails + freedom - 2, noise.tails / 2
+            noise.tails + redundancy - 2, noise.tails / 2
         )
-        own[tracks.point] = variance[:, None, None] * (shape + open_)
+        own[tracks.point] = variance[:, None, None] * (shape + undetermined)
     return own
 
 
@@ -118,7 +155,7 @@ def _noise(x: np.ndarray) -> TrackNoise:
 
 
 def _tracks(bundle: LinearizedBundle, points: np.ndarray) -> Iterator[_Tracks]:
-    """The tracks of some points, by their length."""
+    """Yield the tracks of some points, grouped by length."""
     order = np.argsort(bundle.point, kind="stable")
     starts = np.searchsorted(bundle.point[order], points)
     lengths = np.searchsorted(bundle.point[order], points, side="right") - starts
@@ -130,24 +167,27 @@ def _tracks(bundle: LinearizedBundle, points: np.ndarray) -> Iterator[_Tracks]:
 
 
 def _misfit(tracks: _Tracks, correlations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(T,) squares of the residuals in units of their model, points out; (T,) log of its determinant."""
+    """Return the squared Mahalanobis norm of the residuals (T,) and the log determinant (T,).
+
+    The points are eliminated.
+    """
     count, n = correlations.shape[:2]
     root = np.linalg.cholesky(correlations)
     values = np.concatenate([tracks.whitened, tracks.residuals[..., None]], axis=3)
     scaled = np.linalg.solve(root, values.reshape(count, n, 8)).reshape(count, 2 * n, 4)
     products = np.swapaxes(scaled, 1, 2) @ scaled
-    by_point, pull = products[:, :3, :3], products[:, :3, 3]
-    trace = np.trace(by_point, axis1=1, axis2=2)
-    by_point = by_point + (_RIDGE * trace)[:, None, None] * np.eye(3)
+    normal, right_side = products[:, :3, :3], products[:, :3, 3]
+    trace = np.trace(normal, axis1=1, axis2=2)
+    normal = normal + (_RIDGE * trace)[:, None, None] * np.eye(3)
     misfit = products[:, 3, 3] - np.einsum(
-        "ti,ti->t", pull, np.linalg.solve(by_point, pull[..., None])[..., 0]
+        "ti,ti->t", right_side, np.linalg.solve(normal, right_side[..., None])[..., 0]
     )
     log_det = 4 * np.log(np.einsum("tii->ti", root)).sum(axis=1)
-    return np.maximum(misfit, 0.0), log_det + np.linalg.slogdet(by_point)[1]
+    return np.maximum(misfit, 0.0), log_det + np.linalg.slogdet(normal)[1]
 
 
 def _minus_log_likelihood(tracks: _Tracks, noise: TrackNoise) -> float:
-    """Of Student's t, whose constants depend on its tails."""
+    """Return the negative log-likelihood under Student's t, with the constants that depend on its tails."""
     misfit, log_det = _misfit(tracks, noise.correlations(tracks.views))
     m, v = 2 * tracks.views.shape[1] - 3, noise.tails
     variance = noise.sigma_px**2

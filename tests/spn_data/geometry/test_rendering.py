@@ -214,7 +214,7 @@ def test_no_points_move_to_no_points():
 
 def test_an_image_of_another_size_is_our_mistake():
     """The camera of another image is noticed."""
-    with pytest.raises(ValueError, match="960x540 for a camera of 1280x720"):
+    with pytest.raises(ValueError, match="960x540, the camera is for 1280x720"):
         PinholeRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).render(
             np.zeros((540, 960, 3), np.uint8)
         )

@@ -76,7 +76,7 @@ def test_poses_csv_gives_back_every_bit(tmp_path: Path) -> None:
         ("name,time_s", "nom,time_s", "poses.csv:1: the header is not that of poses.csv"),
         (",registered,,", ",perhaps,,", "poses.csv:2: status 'perhaps' is none of"),
         ("low/000001.jpg", "../000001.jpg", "poses.csv:3"),
-        ("low/000001.jpg", "low/000000.jpg", "names of frames are not unique"),
+        ("low/000001.jpg", "low/000000.jpg", "frame names are not unique"),
         ("low.mp4", "../low.mp4", "is not the name of a file"),
         (",registered,,", ",failed,,", "poses.csv:2: a failed frame has a pose"),
         (",failed,", ",registered,", "poses.csv:5: a registered frame has no pose"),

@@ -384,5 +384,5 @@ def test_a_map_in_two_pieces_is_refused() -> None:
     part = MapObservations(
         seen.image_idx[keep], seen.point_idx[keep], seen.pixels[keep], seen.residuals_px[keep]
     )
-    with pytest.raises(GeometryError, match="tie"):
+    with pytest.raises(GeometryError, match="connect"):
         MapCovariance.of(whole.scene, part)
