@@ -54,11 +54,11 @@ class GivenFrames:
 
 def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
     parts = labelled.parts()
-    kept = [np.flatnonzero(split.of(labels.names) != LEFT_OUT) for labels, _ in parts]
+    kept = [np.flatnonzero(split.groups_of(labels.names) != LEFT_OUT) for labels, _ in parts]
     labels = Labels.concatenate([p.select(rows) for (p, _), rows in zip(parts, kept, strict=True)])
     order = np.lexsort((labels.time_s, labels.sequences))
     labels = labels.select(order)
-    group = split.of(labels.names)
+    group = split.groups_of(labels.names)
     strata = np.full(len(labels), "", dtype="<U6")
     if labelled.units == "m":
         others = group != TRAIN

@@ -22,23 +22,23 @@ from spn_data.split.audit import (
     AuditVerdict,
     MapHashes,
     check_blocks,
-    check_copies,
-    check_fresh,
+    check_duplicates,
     check_gap,
     check_map_unchanged,
-    check_marks,
     check_not_in_map,
     check_revisits,
-    check_test_is_apart,
+    check_test_independence,
+    check_training_marks,
     check_training_points,
+    check_up_to_date,
 )
 from spn_data.split.audit_files import (
     PoseList,
     check_cambridge,
-    check_covered,
+    check_completeness,
     check_dataset,
     check_labels,
-    check_measured,
+    check_nvm_measurements,
 )
 from spn_data.split.groups import TRAIN, Split
 from spn_data.split.split_file import read_split
@@ -51,7 +51,7 @@ def audit(area: Area) -> tuple[AuditFinding, ...]:
     """Check the area's split as it lies on the disk. Raises StageError where there is none."""
     area.record(SPLIT)
     return (
-        check_fresh(area.stale_because(SPLIT)),
+        check_up_to_date(area.stale_because(SPLIT)),
         *audit_folder(area, read_labelled_area(area), area.folder(SPLIT)),
     )
 
@@ -60,14 +60,14 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Audi
     """Check a split in a folder against the area's labels."""
     split = read_split(folder / SPLIT_FILE)
     parts = {"mapping": labelled.mapping, "tracked": labelled.tracked, **labelled.evaluation}
-    covered = check_covered(parts, split)
+    covered = check_completeness(parts, split)
     findings = [
         _check_not_in_map(area, labelled),
-        *_check_copies(labelled),
+        *_check_duplicates(labelled),
         _check_map_unchanged(area),
         check_labels(parts),
         covered,
-        check_test_is_apart(split),
+        check_test_independence(split),
     ]
     if (
         covered.verdict is AuditVerdict.FAIL
@@ -94,12 +94,12 @@ def _check_not_in_map(area: Area, labelled: LabelledArea) -> AuditFinding:
     )
 
 
-def _check_copies(labelled: LabelledArea) -> list[AuditFinding]:
+def _check_duplicates(labelled: LabelledArea) -> list[AuditFinding]:
     """Only where lengths are metres and there is something to compare."""
     if labelled.units != "m" or not labelled.evaluation:
         return []
     mapping = Labels.concatenate([labelled.mapping, labelled.tracked])
-    return [check_copies(mapping, labelled.evaluation)]
+    return [check_duplicates(mapping, labelled.evaluation)]
 
 
 def _sources(area: Area, stage: str) -> dict[str, str]:
@@ -124,7 +124,7 @@ def _check_files(
         findings = [
             check_dataset(lists, parts, split),
             check_training_points(given, labelled.mapping, labelled.mapping_seen, split),
-            check_marks(marks),
+            check_training_marks(marks),
         ]
         if (folder / CAMBRIDGE).is_dir():
             findings += _check_cambridge(folder / CAMBRIDGE, lists, tracked, split)
@@ -163,10 +163,10 @@ def _check_cambridge(
     for group, each in sorted(stored.items()):
         kept = each.select(np.flatnonzero(~tracked[group] | with_tracked))
         file = list_of(group)
-        wanted[file] = kept if file not in wanted else wanted[file].with_more(kept)
+        wanted[file] = kept if file not in wanted else wanted[file].appended(kept)
     model = read_nvm(folder / NVM)
     measured = [model.names[k] for k in np.unique(model.image_idx)]
-    return [check_cambridge(found, wanted), check_measured(measured, split)]
+    return [check_cambridge(found, wanted), check_nvm_measurements(measured, split)]
 
 
 def _check_map_unchanged(area: Area) -> AuditFinding:

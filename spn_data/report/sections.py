@@ -15,7 +15,7 @@ from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
 from spn_data.split import audit
 from spn_data.split.groups import LEFT_OUT
-from spn_data.split.split_file import statements
+from spn_data.split.split_file import limitations
 from spn_data.storage.stage_record import StageRecord
 
 _REASONS_SHOWN = 6  # of one sequence
@@ -203,7 +203,7 @@ def split(data: ReportData) -> str:
         "<section><h2>Split and audit</h2>",
         _table(("group", "frames"), [(group, f"{n:,}") for group, n in rows], "groups"),
     ]
-    said = (*data.split.notes, *statements(data.split))
+    said = (*data.split.notes, *limitations(data.split))
     parts += [f'<p class="note">{escape(note)}</p>' for note in said]
     return "".join(parts) + "".join(_check(check) for check in data.audit or ()) + "</section>"
 

@@ -1,4 +1,4 @@
-"""Whether a data set keeps what it promises: each promise is checked, with the evidence."""
+"""Leakage checks of a split: training, validation and test frames, map points, and the map itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spn_data.split.groups import (
     TRAIN,
     VALIDATION,
     Split,
-    seconds_apart,
+    seconds_to_held_out,
 )
 
 REVISIT_M, REVISIT_DEG = 1.0, 10.0
@@ -26,12 +26,12 @@ COPY_M, COPY_DEG = 0.05, 0.5
 _COPY_FRAMES, _COPY_SHARE = 3, 0.05
 _COPIES = "no copy of a mapping flight"
 _NOT_IN_MAP = "no evaluation frame in the map"
-# Views of a point by training frames from which on it may be given for training.
+# Minimum number of training frames that must see a point for it to be used in training.
 MIN_TRAINING_VIEWS = 2
 
 
 class AuditVerdict(StrEnum):
-    """What a check found. A notice is no fault; the user should know it."""
+    """Verdict of a check. A notice is not a failure, but the user should know about it."""
 
     PASS = "pass"
     FAIL = "fail"
@@ -40,7 +40,19 @@ class AuditVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class AuditFinding:
-    """One check: its name, what it found in a sentence, and the evidence (one line each)."""
+    """Result of one check.
+
+    Attributes
+    ----------
+    check : str
+        Name of the check.
+    verdict : AuditVerdict
+        Verdict.
+    text : str
+        What was found, in one sentence.
+    evidence : tuple of str
+        Evidence, one line each.
+    """
 
     check: str
     verdict: AuditVerdict
@@ -50,14 +62,14 @@ class AuditFinding:
 
 @dataclass(frozen=True)
 class MapHashes:
-    """Hash of the map before and after a sequence was registered in it."""
+    """Hashes of the map before and after a sequence was registered in it."""
 
     before: str
     after: str
 
 
-def finding_of(check: str, bad: Sequence[str], good_text: str, bad_text: str) -> AuditFinding:
-    """Failed where there is anything bad, with that as evidence."""
+def make_finding(check: str, bad: Sequence[str], good_text: str, bad_text: str) -> AuditFinding:
+    """Return a failure with `bad` as evidence, or a pass if `bad` is empty."""
     if bad:
         return AuditFinding(check, AuditVerdict.FAIL, bad_text, tuple(bad))
     return AuditFinding(check, AuditVerdict.PASS, good_text)
@@ -69,10 +81,23 @@ def check_not_in_map(
     evaluation: Mapping[str, Labels],
     evaluation_sources: Mapping[str, Mapping[str, str]],
 ) -> AuditFinding:
-    """(a) No evaluation frame is in the map, and no file of an evaluation sequence was mapped.
+    """Check (a) that no evaluation frame is in the map and no evaluation file was used for mapping.
 
-    map_names : images of the model; mapping_sources, evaluation_sources[sequence] : content fingerprint by
-    file, as the stages recorded them.
+    Parameters
+    ----------
+    map_names : sequence of str
+        Images of the model.
+    mapping_sources : mapping of str to str
+        Content fingerprint by file of the mapping flights, as recorded by the stages.
+    evaluation : mapping of str to Labels
+        Labels by evaluation sequence.
+    evaluation_sources : mapping of str to mapping
+        Content fingerprint by file, by evaluation sequence.
+
+    Returns
+    -------
+    AuditFinding
+        Finding of the check.
     """
     in_map = set(map_names)
     mapped = {fingerprint: name for name, fingerprint in mapping_sources.items()}
@@ -85,104 +110,118 @@ def check_not_in_map(
             if fingerprint in mapped:
                 bad.append(f"{sequence}: {file} is the mapping source {mapped[fingerprint]}")
         if sequence not in evaluation_sources:
-            bad.append(f"{sequence}: its source is not recorded")
+            bad.append(f"{sequence}: its source files are not recorded")
     frames = sum(len(labels) for labels in evaluation.values())
     if not evaluation:
         return AuditFinding(_NOT_IN_MAP, AuditVerdict.PASS, "there is no evaluation sequence")
-    return finding_of(
+    return make_finding(
         _NOT_IN_MAP,
         bad,
         f"none of {frames} evaluation frames is among the map's {len(in_map)} images or from its sources",
-        "the map has seen what it is to be tested on",
+        "the map contains data it is to be tested on",
     )
 
 
-def check_copies(mapping: Labels, evaluation: Mapping[str, Labels]) -> AuditFinding:
-    """(a) No evaluation sequence looks like a mapping flight itself, encoded anew: that no fingerprint tells.
+def check_duplicates(mapping: Labels, evaluation: Mapping[str, Labels]) -> AuditFinding:
+    """Check (a) that no evaluation sequence is a re-encoded mapping flight, which fingerprints cannot detect.
 
-    Two flights do not meet within centimetres and fractions of a degree, again and again.
+    Frames of two different flights do not repeatedly coincide within centimetres and fractions of a degree.
     """
-    here = mapping.poses[mapping.registered]
-    tree = cKDTree(here.centers)
+    mapped = mapping.poses[mapping.registered]
+    tree = cKDTree(mapped.centers)
     suspects = []
     for sequence, labels in evaluation.items():
         poses = labels.poses[labels.registered]
         apart_m, nearest = tree.query(poses.centers)
-        turned_deg = rotation_errors_deg(poses.quats_wxyz, here.quats_wxyz[nearest])
+        turned_deg = rotation_errors_deg(poses.quats_wxyz, mapped.quats_wxyz[nearest])
         same = int(((apart_m <= COPY_M) & (turned_deg <= COPY_DEG)).sum())
         if same >= max(_COPY_FRAMES, _COPY_SHARE * len(poses)):
             suspects.append(f"{sequence}: {same} of {len(poses)} frames")
-    meet = f"within {COPY_M * 100:g} cm and {COPY_DEG:g} deg of a mapping frame"
+    near_text = f"within {COPY_M * 100:g} cm and {COPY_DEG:g} deg of a mapping frame"
     if not suspects:
-        return AuditFinding(_COPIES, AuditVerdict.PASS, f"no sequence lies again and again {meet}")
+        return AuditFinding(_COPIES, AuditVerdict.PASS, f"no sequence is repeatedly {near_text}")
     return AuditFinding(
         _COPIES,
         AuditVerdict.NOTICE,
-        f"frames lie {meet}: is it a mapping flight under another name, cut or encoded anew?",
+        f"frames are {near_text}: this may be a mapping flight under another name, cut or re-encoded",
         tuple(suspects),
     )
 
 
 def check_map_unchanged(now: str, registrations: Mapping[str, MapHashes]) -> AuditFinding:
-    """The map is, bit for bit, the one that every sequence was registered in."""
+    """Check that the map is bit for bit the one every sequence was registered in.
+
+    Parameters
+    ----------
+    now : str
+        Current hash of the map.
+    registrations : mapping of str to MapHashes
+        Hashes recorded at registration, by sequence.
+
+    Returns
+    -------
+    AuditFinding
+        Finding of the check.
+    """
     bad = []
     for sequence, at in registrations.items():
         if at.before != at.after:
             bad.append(f"{sequence}: {at.before} before its registration, {at.after} after")
         elif at.after != now:
             bad.append(f"{sequence}: {at.after} at its registration, {now} now")
-    return finding_of(
+    return make_finding(
         "map unchanged",
         bad,
-        f"its hash is {now[:16]}…, as before and after each of {len(registrations)} registrations"
+        f"the map's hash is {now[:16]}…, as before and after each of {len(registrations)} registrations"
         if registrations
-        else "nothing was registered in it",
-        "the map is not the one that sequences were registered in",
+        else "no sequence was registered in the map",
+        "the map is not the one that the sequences were registered in",
     )
 
 
 def check_blocks(labels: Labels, split: Split) -> AuditFinding:
-    """(b) Chosen and tracked frames obey the same blocks. labels : of the mapping flights."""
-    group = split.of(labels.names)
+    """Check (b) that chosen and tracked frames of the mapping flights (`labels`) obey the same blocks."""
+    group = split.groups_of(labels.names)
     wrong = np.zeros(len(labels), dtype=bool)
     for block in split.blocks:
-        wrong |= block.holds(labels) & (group == TRAIN)
+        wrong |= block.contains(labels) & (group == TRAIN)
     unblocked = np.isin(group, (VALIDATION, TEST))
     for block in split.blocks:
-        unblocked &= ~(block.holds(labels) & (group == block.group))
-    return finding_of(
+        unblocked &= ~(block.contains(labels) & (group == block.group))
+    return make_finding(
         "chosen and tracked frames obey the blocks",
-        [f"{name} trains and lies in a held-out block" for name in labels.names[wrong]]
-        + [f"{name} is held out and lies in no block" for name in labels.names[unblocked]],
-        f"{len(split.blocks)} blocks hold {int(np.isin(group, (VALIDATION, TEST)).sum())} frames, "
-        "none of which trains",
-        "frames are on the wrong side of a block",
+        [f"{name} is a training frame inside a held-out block" for name in labels.names[wrong]]
+        + [f"{name} is held out but in no block" for name in labels.names[unblocked]],
+        f"{len(split.blocks)} blocks contain {int(np.isin(group, (VALIDATION, TEST)).sum())} frames, "
+        "none of them used for training",
+        "frames and held-out blocks disagree",
     )
 
 
 def check_gap(labels: Labels, split: Split) -> AuditFinding:
-    """(b) No training frame is nearer to a held-out frame of its sequence than the gap."""
-    group, gap_s = split.of(labels.names), split.options.gap_s
+    """Check (b) that no training frame is nearer than the gap to a held-out frame of its sequence."""
+    group, gap_s = split.groups_of(labels.names), split.options.gap_s
     held = np.isin(group, (VALIDATION, TEST))
-    apart = np.where(group == TRAIN, seconds_apart(labels, held), np.inf)
+    apart = np.where(group == TRAIN, seconds_to_held_out(labels, held), np.inf)
     near = apart < gap_s - SLACK
     nearest = float(apart.min()) if len(apart) else float("inf")
-    told = f"; the nearest is {nearest:.3f} s away" if np.isfinite(nearest) else ""
-    return finding_of(
+    nearest_text = f"; the nearest is {nearest:.3f} s away" if np.isfinite(nearest) else ""
+    return make_finding(
         "guard gap",
         [
             f"{labels.names[k]} is {apart[k]:.3f} s from a held-out frame"
             for k in np.flatnonzero(near)
         ],
-        f"no training frame is nearer than {gap_s:g} s to a held-out frame of its sequence{told}",
-        f"training frames lie within {gap_s:g} s of a held-out frame",
+        f"no training frame is nearer than {gap_s:g} s to a held-out frame of its sequence"
+        f"{nearest_text}",
+        f"training frames are nearer than {gap_s:g} s to a held-out frame",
     )
 
 
 def check_revisits(labels: Labels, split: Split) -> AuditFinding:
-    """(b) Lists training frames within 1 m and 10 degrees of a held-out frame, the nearest of each."""
+    """List (b) for each held-out frame the nearest training frame within 1 m and 10 degrees."""
     check = "revisits"
-    group = split.of(labels.names)
+    group = split.groups_of(labels.names)
     held = np.flatnonzero(np.isin(group, (VALIDATION, TEST)))
     trained = np.flatnonzero(group == TRAIN)
     if not len(held) or not len(trained):
@@ -208,23 +247,38 @@ def check_revisits(labels: Labels, split: Split) -> AuditFinding:
     near_text = f"within {REVISIT_M:g} m and {REVISIT_DEG:g} deg of a training frame"
     if not listed:
         return AuditFinding(
-            check, AuditVerdict.PASS, f"none of {len(held)} held-out frames lies {near_text}"
+            check, AuditVerdict.PASS, f"none of {len(held)} held-out frames is {near_text}"
         )
     return AuditFinding(
         check,
         AuditVerdict.NOTICE,
-        f"{len(listed)} of {len(held)} held-out frames lie {near_text}: the flight came back there",
+        f"{len(listed)} of {len(held)} held-out frames are {near_text}: the flight returned to that place",
         tuple(listed),
     )
 
 
 def training_points(labels: Labels, seen: LabelObservations, split: Split) -> np.ndarray:
-    """Ids, ascending, of map points that at least two chosen training frames see.
+    """Return the sorted ids of map points seen by at least two chosen training frames.
 
-    labels, seen : the chosen frames of the mapping flights, whose tracks made the points. A point that only
-    one of them sees owes its place to frames that are held out.
+    Parameters
+    ----------
+    labels : Labels
+        Labels of the chosen frames of the mapping flights.
+    seen : LabelObservations
+        Observations of map points in those frames, which are the tracks the points were triangulated from.
+    split : Split
+        The split.
+
+    Returns
+    -------
+    ndarray of int, shape (K,)
+        Point ids in ascending order.
+
+    Notes
+    -----
+    The position of a point that only one training frame sees was determined by held-out frames.
     """
-    trained = split.of(labels.names) == TRAIN
+    trained = split.groups_of(labels.names) == TRAIN
     pairs = np.column_stack([seen.point_ids, seen.frame_idx])[trained[seen.frame_idx]]
     ids, views = np.unique(np.unique(pairs, axis=0)[:, 0], return_counts=True)
     return np.asarray(ids[views >= MIN_TRAINING_VIEWS])
@@ -233,19 +287,19 @@ def training_points(labels: Labels, seen: LabelObservations, split: Split) -> np
 def check_training_points(
     given: np.ndarray, labels: Labels, seen: LabelObservations, split: Split
 ) -> AuditFinding:
-    """(c) Points given for training are seen by at least two training frames. given : their ids."""
+    """Check (c) that points provided for training (ids `given`) are seen by at least two training frames."""
     unseen = np.setdiff1d(given, training_points(labels, seen, split))
-    return finding_of(
+    return make_finding(
         "points for training",
         [f"point {k} is seen by fewer than {MIN_TRAINING_VIEWS} training frames" for k in unseen],
-        f"all {len(np.unique(given))} points given for training are seen by at least "
+        f"all {len(np.unique(given))} points provided for training are seen by at least "
         f"{MIN_TRAINING_VIEWS} training frames",
-        "points were given for training that held-out frames made",
+        "points provided for training depend on held-out frames",
     )
 
 
-def check_marks(for_training: Mapping[str, bool]) -> AuditFinding:
-    """(d) Points of no group but train are marked for training. for_training : mark by group."""
+def check_training_marks(for_training: Mapping[str, bool]) -> AuditFinding:
+    """Check (d) that only points of group train are marked for training; `for_training`: mark by group."""
     bad = [
         f"points of group {name} are marked for training"
         for name in sorted(for_training)
@@ -254,32 +308,35 @@ def check_marks(for_training: Mapping[str, bool]) -> AuditFinding:
     if not for_training.get(TRAIN, False):
         bad.append("points of group train are not marked for training")
     others = ", ".join(name for name in for_training if name != TRAIN) or "no other group"
-    return finding_of(
+    return make_finding(
         "points marked not for training",
         bad,
         f"points of {others} are marked not for training",
-        "points carry the wrong mark",
+        "points are marked incorrectly",
     )
 
 
-def check_test_is_apart(split: Split) -> AuditFinding:
-    """Whether the test frames are of another flight than the training frames."""
+def check_test_independence(split: Split) -> AuditFinding:
+    """Check whether the test frames come from a different flight than the training frames."""
     check = "test apart from training"
     if split.optimistic:
         return AuditFinding(check, AuditVerdict.NOTICE, OPTIMISTIC)
     tests = ", ".join(name for name in split.groups() if name not in (TRAIN, VALIDATION))
-    return AuditFinding(check, AuditVerdict.PASS, f"evaluation sequences of their own: {tests}")
+    return AuditFinding(
+        check, AuditVerdict.PASS, f"test frames come from separate evaluation sequences: {tests}"
+    )
 
 
-def check_fresh(reason: str | None) -> AuditFinding:
-    """The split is made from the area as it is now. reason : why not."""
-    return finding_of(
+def check_up_to_date(reason: str | None) -> AuditFinding:
+    """Check that the split was made from the current state of the area; `reason` states why it was not."""
+    return make_finding(
         "up to date",
         [] if reason is None else [reason],
-        "the split was made from the area as it is",
+        "the split was made from the current state of the area",
         "the split is stale; run spn-data split again",
     )
 
 
 def has_failed(findings: Sequence[AuditFinding]) -> bool:
+    """Return whether any finding is a failure."""
     return any(finding.verdict is AuditVerdict.FAIL for finding in findings)

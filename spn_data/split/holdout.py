@@ -1,4 +1,4 @@
-"""Choice of the blocks that are held out of the mapping flights, and the groups that follow."""
+"""Selection of held-out blocks in the mapping flights, and the resulting split."""
 
 from __future__ import annotations
 
@@ -24,23 +24,22 @@ from spn_data.split.groups import (
     Policy,
     Split,
     SplitOptions,
+    adjacent_to_held_out,
     cells_of,
-    next_to,
-    seconds_apart,
+    seconds_to_held_out,
 )
 
-# Of the frames that a block is taken from, so many must stay with training where that can be had.
+# Share of the frames a block is taken from that should remain for training, if possible.
 _ENOUGH_LEFT = 0.5
-# A block in time has so many frames, where validation has as many at all: photos are seconds apart.
+# Minimum number of frames of a block in time, if validation has that many; photos are seconds apart.
 _MIN_FRAMES = 4
-# What leaves more frames to training when it is smaller.
-_NARROWER = {
+# Options to reduce in order to leave more frames for training.
+_OPTIONS_TO_REDUCE = {
     Policy.TIME: "--gap or --validation-share",
     Policy.SPACE: "--gap, --guard-distance or --validation-share",
     Policy.HEIGHT: "--gap, --guard-height or --validation-share",
 }
-# So many places for a block are tried at most.
-_MAX_CANDIDATES = 64
+_MAX_CANDIDATES = 64  # positions of a block that are tried
 
 
 def make_split(
@@ -51,26 +50,55 @@ def make_split(
     *,
     metric: bool = True,
 ) -> Split:
-    """Mapping frames train, but for held-out blocks; each evaluation sequence is a group of its own.
+    """Split frames into groups.
 
-    mapping : chosen frames of the mapping flights; tracked : their other frames; evaluation : by sequence.
-    metric : whether the poses are in metres with a known up.
-    Where no evaluation frame has a pose, one block in time is held out as "test". The same frames, options
-    and seed give the same split, whatever their order; a sequence's blocks do not depend on the others'.
-    Raises GeometryError where a group would stay empty.
+    Mapping frames are used for training except for held-out blocks and their guard bands. Each evaluation
+    sequence forms its own group.
+
+    Parameters
+    ----------
+    mapping : Labels
+        Chosen frames of the mapping flights.
+    tracked : Labels
+        Tracked frames of the mapping flights.
+    evaluation : mapping of str to Labels
+        Frames of the evaluation sequences, by name.
+    options : SplitOptions
+        Options.
+    metric : bool
+        Whether the poses are in metres with a known direction of up.
+
+    Returns
+    -------
+    Split
+        The split. If no evaluation frame has a pose, one block in time is held out as "test".
+
+    Raises
+    ------
+    GeometryError
+        If a group would remain empty, or if the policy needs metres and `metric` is false.
+    StageError
+        If an evaluation sequence has the name of a group.
+
+    Notes
+    -----
+    The split depends only on frames, options and seed, not on the order of the frames. With blocks in time,
+    the blocks of a sequence do not depend on the other sequences.
     """
     for name in evaluation:
         if name in GROUPS:
-            raise StageError(f"an evaluation sequence may not be called {name!r}: that is a group")
+            raise StageError(
+                f"an evaluation sequence may not be called {name!r}: this is the name of a group"
+            )
     if options.validation is not Policy.TIME and not metric:
         raise GeometryError(
-            f"--validation {options.validation} needs metres and a known up; the model is in its own "
-            "gauge: use --validation time, or run spn-data georegister first"
+            f"--validation {options.validation} needs metres and a known direction of up, but the model is "
+            "in its own gauge: use --validation time, or run spn-data georegister first"
         )
     flights = Labels.concatenate([mapping, tracked])
     plan = _Plan(flights, options, *_columns(flights, TRAIN, options))
     if not plan.trained.any():
-        raise GeometryError("no mapping frame has a pose; nothing can be trained on")
+        raise GeometryError("no mapping frame has a pose, so there are no training frames")
     tested = {name: labels for name, labels in evaluation.items() if labels.registered.any()}
     if not tested:
         plan = _hold_out_test(plan)
@@ -93,7 +121,7 @@ def make_split(
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A split of the mapping flights in the making."""
+    """Split of the mapping flights under construction."""
 
     flights: Labels
     options: SplitOptions
@@ -104,21 +132,21 @@ class _Plan:
 
     @property
     def trained(self) -> np.ndarray:
-        """(N,) bool: chosen frames that train as yet."""
+        """Mask (N,) of chosen frames that are still used for training."""
         return np.asarray((self.group == TRAIN) & ~self.flights.tracked)
 
     def rng(self, purpose: str) -> np.random.Generator:
-        """Of its own for each purpose, so that one draw does not move another."""
+        """Return a separate generator for each purpose, so that draws are independent of each other."""
         return np.random.default_rng([self.options.seed, zlib.crc32(purpose.encode())])
 
     def with_block(self, block: HeldOutBlock) -> _Plan:
-        """The plan with a block held out, and its guard left out."""
-        held = block.holds(self.flights) & (self.group == TRAIN)
+        """Return the plan with a block held out and its guard band left out."""
+        held = block.contains(self.flights) & (self.group == TRAIN)
         group = np.where(held, block.group, self.group)
         reason = self.reason.copy()
-        near = seconds_apart(self.flights, held) < self.options.gap_s - SLACK
+        near = seconds_to_held_out(self.flights, held) < self.options.gap_s - SLACK
         if self.options.gap_s > 0:
-            near |= next_to(self.flights, held)
+            near |= adjacent_to_held_out(self.flights, held)
         for left_out, why in (
             (near, GUARD_GAP),
             (_within_guard(self.flights, held, block, self.options), GUARD_DISTANCE),
@@ -131,7 +159,7 @@ class _Plan:
 def _within_guard(
     flights: Labels, held: np.ndarray, block: HeldOutBlock, options: SplitOptions
 ) -> np.ndarray:
-    """(N,) bool: nearer to a held frame than a block in space or height allows."""
+    """Return a mask (N,) of frames within the guard band of a block in space or height."""
     near = np.zeros(len(flights), dtype=bool)
     if block.seconds is not None or not held.any():
         return near
@@ -148,7 +176,7 @@ def _within_guard(
 
 
 def _columns(labels: Labels, group: str, options: SplitOptions) -> tuple[np.ndarray, np.ndarray]:
-    """(group, reason), each (N,) object: every frame that has a pose is of `group`."""
+    """Return group and reason (N,), dtype object, with all frames that have a pose in `group`."""
     failed = [f"failed: {why}" if why else "failed" for why in labels.reason.tolist()]
     reason = np.where(labels.registered, "", np.array(failed, dtype=object))
     groups = np.where(labels.registered, np.array(group, dtype=object), LEFT_OUT)
@@ -159,7 +187,7 @@ def _columns(labels: Labels, group: str, options: SplitOptions) -> tuple[np.ndar
 
 
 def _hold_out_test(plan: _Plan) -> _Plan:
-    """One block in time, from the sequence with most frames."""
+    """Hold out one test block in time from the sequence with the most frames."""
     names, counts = np.unique(plan.flights.sequences[plan.trained], return_counts=True)
     sequence = str(names[np.argmax(counts)])
     wanted = round(plan.options.test_share * counts.sum())
@@ -171,7 +199,7 @@ def _hold_out_test(plan: _Plan) -> _Plan:
 
 
 def _hold_out_in_time(plan: _Plan) -> _Plan:
-    """Blocks of each sequence, one in each of as many equal parts of it."""
+    """Hold out validation blocks in each sequence, one in each of several equal parts."""
     before, short = plan, []
     sequences = np.unique(plan.flights.sequences[plan.trained]).tolist()
     for sequence in sequences:
@@ -181,19 +209,19 @@ def _hold_out_in_time(plan: _Plan) -> _Plan:
             plan = following
         else:
             short.append(sequence)
-    if len(short) == len(sequences):  # rather a little training than no validation
+    if len(short) == len(sequences):  # prefer few training frames to no validation
         longest = max(sequences, key=lambda s: int(before.trained[_rows(before, s)].sum()))
         short.remove(longest)
         plan = _validate_sequence(before, longest)
     notes = tuple(
-        f"{sequence} is too short for a validation block with its guard: all of it trains"
+        f"{sequence} is too short for a validation block and its guard: all its frames are used for training"
         for sequence in short
     )
     return replace(plan, notes=(*plan.notes, *notes))
 
 
 def _validate_sequence(plan: _Plan, sequence: str) -> _Plan:
-    """The plan with the validation blocks of one sequence."""
+    """Return the plan with the validation blocks of one sequence held out."""
     options, rng = plan.options, plan.rng(f"validation {sequence}")
     rows = _rows(plan, sequence)
     free = rows[plan.trained[rows]]
@@ -207,7 +235,7 @@ def _validate_sequence(plan: _Plan, sequence: str) -> _Plan:
 
 
 def _rows(plan: _Plan, sequence: str) -> np.ndarray:
-    """Chosen frames of a sequence that have a pose, by time."""
+    """Return the rows of a sequence's chosen frames that have a pose, sorted by time."""
     flights = plan.flights
     rows = np.flatnonzero((flights.sequences == sequence) & flights.registered & ~flights.tracked)
     return np.asarray(rows[np.lexsort((flights.names[rows], flights.time_s[rows]))])
@@ -216,7 +244,7 @@ def _rows(plan: _Plan, sequence: str) -> np.ndarray:
 def _windows(
     plan: _Plan, rows: np.ndarray, part: np.ndarray, group: str, size: int
 ) -> list[HeldOutBlock]:
-    """Every stretch of `size` frames in succession that all train as yet and lie in `part` of `rows`."""
+    """Return all blocks of `size` consecutive frames of `rows` that are in `part` and still in training."""
     flights = plan.flights
     free = plan.trained[rows] & np.isin(rows, part)
     starts = np.flatnonzero(np.convolve(free, np.ones(size), "valid") > size - 0.5)
@@ -233,18 +261,17 @@ def _windows(
 def _hold_out_one(
     plan: _Plan, blocks: Sequence[HeldOutBlock], rng: np.random.Generator, rows: np.ndarray
 ) -> _Plan:
-    """Hold out one of the blocks: any of those that leave enough of `rows` to training, else the best.
+    """Hold out a random block among those that leave enough of `rows` for training.
 
-    As it is where there is no block.
+    If none does, hold out the one that leaves the most. Without blocks, the plan is returned unchanged.
     """
     if not blocks:
         return plan
     if len(blocks) > _MAX_CANDIDATES:
         picked = np.linspace(0, len(blocks) - 1, _MAX_CANDIDATES).round().astype(int)
         blocks = [blocks[k] for k in picked]
-    chosen = np.flatnonzero(
-        ~plan.flights.tracked
-    )  # the others, often many more, decide nothing here
+    # Tracked frames, which are often far more numerous, do not affect the choice.
+    chosen = np.flatnonzero(~plan.flights.tracked)
     small = replace(
         plan,
         flights=plan.flights.select(chosen),
@@ -259,7 +286,7 @@ def _hold_out_one(
 
 
 def _hold_out_in_space(plan: _Plan) -> _Plan:
-    """Cells that touch each other, grown from one of them until they hold the share wanted."""
+    """Hold out a region of adjacent cells, grown from one cell until it contains the validation share."""
     cells = cells_of(plan.flights.select(plan.trained), plan.options.cell_m)
     found, counts = np.unique(np.array(cells, dtype=np.int64), axis=0, return_counts=True)
     occupied = {(int(i), int(j)): int(n) for (i, j), n in zip(found, counts, strict=True)}
@@ -276,7 +303,7 @@ def _hold_out_in_space(plan: _Plan) -> _Plan:
 def _grown(
     start: tuple[int, int], occupied: Mapping[tuple[int, int], int], wanted: float
 ) -> tuple[tuple[int, int], ...]:
-    """Occupied cells around `start`, each touching one before it; () if half is not reached."""
+    """Grow a connected region of occupied cells around `start`; () if it stays below half the target."""
     region, held = [start], occupied[start]
     while held < wanted:
         border = {
@@ -292,7 +319,7 @@ def _grown(
 
 
 def _hold_out_in_height(plan: _Plan) -> _Plan:
-    """A band of heights that holds the share wanted."""
+    """Hold out a band of heights that contains the validation share."""
     heights = np.sort(plan.flights.poses.centers[plan.trained, 2])
     size = max(1, round(plan.options.validation_share * len(heights)))
     blocks = [
@@ -316,6 +343,6 @@ def _check_filled(plan: _Plan, groups: Sequence[str]) -> None:
             registered = int((plan.flights.registered & ~plan.flights.tracked).sum())
             raise GeometryError(
                 f"--validation {options.validation} with a gap of {options.gap_s:g} s leaves no frame for "
-                f"{group}, of {registered} mapping frames with a pose; try a smaller "
-                f"{_NARROWER[options.validation]}, or another --validation"
+                f"{group} out of {registered} mapping frames with a pose; try a smaller "
+                f"{_OPTIONS_TO_REDUCE[options.validation]}, or another --validation"
             )

@@ -1,4 +1,4 @@
-"""split.json: a split as a file, with what it cannot promise said in words."""
+"""Reading and writing of split.json, including the known limitations of a split in words."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from spn_data.split.groups import (
 from spn_data.storage.json_files import VERSION, read_json, write_json
 from spn_data.storage.stage_record import current_options
 
-_NOT_FREE = (
-    "Validation frames were bundle-adjusted jointly with the training frames: poses and points of both "
-    "fitted each other, and the points that they see are partly the same ones.",
-    "Validation is of the same flights as training (same light, same day, same camera). It serves to "
-    "choose between networks; what a network does on another flight, only an evaluation sequence tells.",
-    "The guard keeps frames apart within a sequence. A flight that comes back to a place is not cut: "
-    "audit.json lists the training frames near a held-out one.",
+_VALIDATION_LIMITATIONS = (
+    "Validation frames were bundle-adjusted jointly with the training frames: their poses and points were "
+    "estimated together, and they share some map points.",
+    "Validation frames come from the same flights as training (same light, same day, same camera). Use them "
+    "to choose between networks; only an evaluation sequence shows how a network performs on another flight.",
+    "The guard separates training from held-out frames within a sequence. It does not exclude frames if a "
+    "flight returns to the same place: audit.json lists training frames near a held-out frame.",
 )
-_TEST_NOT_FREE = (
-    f"{OPTIMISTIC}. No evaluation sequence had a pose, so that the test frames are a block of a mapping "
-    "flight; they were bundle-adjusted jointly with the training frames too."
+_TEST_LIMITATION = (
+    f"{OPTIMISTIC}. No evaluation sequence had a pose, so the test frames are a block of a mapping flight; "
+    "they were also bundle-adjusted jointly with the training frames."
 )
 
 
-def statements(split: Split) -> tuple[str, ...]:
-    """What the groups cannot be free of, as sentences for split.json and the report."""
-    said = _NOT_FREE if VALIDATION in split.groups() else ()
-    return (_TEST_NOT_FREE, *said) if split.optimistic else said
+def limitations(split: Split) -> tuple[str, ...]:
+    """Return the known limitations of a split as sentences for split.json and the report."""
+    sentences = _VALIDATION_LIMITATIONS if VALIDATION in split.groups() else ()
+    return (_TEST_LIMITATION, *sentences) if split.optimistic else sentences
 
 
 def write_split(path: Path, split: Split) -> None:
-    """As split.json (docs/split.md); the file appears whole."""
+    """Write split.json (docs/split.md) atomically."""
     names, group = split.names.tolist(), split.group.tolist()
     left_out = {
         name: reason
@@ -56,7 +56,7 @@ def write_split(path: Path, split: Split) -> None:
             "version": VERSION,
             "options": asdict(split.options),
             "optimistic": split.optimistic,
-            "not_free_of": list(statements(split)),
+            "not_free_of": list(limitations(split)),
             "counts": {**split.counts(), "left_out": len(left_out)},
             "blocks": [_block_to_json(block) for block in split.blocks],
             "groups": {own: split.names[split.group == own].tolist() for own in split.groups()},
@@ -67,7 +67,10 @@ def write_split(path: Path, split: Split) -> None:
 
 
 def read_split(path: Path) -> Split:
-    """The frames by group, those left out last. Raises FormatError where it is not of `write_split`."""
+    """Read split.json; frames are sorted by group, left-out frames last.
+
+    Raises FormatError if the file was not written by `write_split`.
+    """
     table = read_json(path)
     try:
         options = current_options(table["options"])
@@ -92,7 +95,7 @@ def read_split(path: Path) -> Split:
             notes=tuple(str(note) for note in table["notes"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FormatError(f"{path}: is no split of this program ({error!r})") from error
+        raise FormatError(f"{path}: is not a split written by this program ({error!r})") from error
     return split
 
 

@@ -261,7 +261,7 @@ def swap_a_point(area: Path) -> None:
     """A training frame is given a point that only held-out frames see."""
     labelled = read_labelled_area(Area(area))
     split = read_split(area / SPLIT / "split.json")
-    trained = split.of(labelled.mapping.names) == TRAIN
+    trained = split.groups_of(labelled.mapping.names) == TRAIN
     seen = labelled.mapping_seen
     by_training = np.unique(seen.point_ids[trained[seen.frame_idx]])
     (never, *_) = np.setdiff1d(seen.point_ids, by_training)

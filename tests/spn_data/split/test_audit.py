@@ -109,18 +109,18 @@ def test_an_evaluation_sequence_of_unknown_source_is_found(mapping, evaluation):
 
 def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
     """Every fourth frame of the flight, 2 cm off, as labels of a copy are; another flight passes."""
-    assert audit.check_copies(mapping, evaluation).verdict is AuditVerdict.PASS
+    assert audit.check_duplicates(mapping, evaluation).verdict is AuditVerdict.PASS
     rows = np.arange(0, 100, 4)
     copy = frames("copy", 100).select(rows)
     copy = replace(copy, poses=Poses(copy.poses.centers + 0.01, copy.poses.quats_wxyz))
-    found = audit.check_copies(mapping, {**evaluation, "copy": copy})
+    found = audit.check_duplicates(mapping, {**evaluation, "copy": copy})
     assert found.verdict is AuditVerdict.NOTICE
     assert found.evidence == ("copy: 25 of 25 frames",)
     crossing = frames("crossing", 20, north_m=3.0)
     centers = crossing.poses.centers.copy()
     centers[:2] = mapping.poses.centers[:2]
     crossing = replace(crossing, poses=Poses(centers, crossing.poses.quats_wxyz))
-    assert audit.check_copies(mapping, {"crossing": crossing}).verdict is AuditVerdict.PASS
+    assert audit.check_duplicates(mapping, {"crossing": crossing}).verdict is AuditVerdict.PASS
 
 
 def test_a_map_hash_that_changed_is_found():
@@ -139,20 +139,22 @@ def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
 @pytest.mark.parametrize("tracked", [False, True])
 def test_a_training_frame_within_a_block_is_found(mapping, split, tracked):
     """Chosen or tracked: it lies in a held-out block, and nearer than the gap to its frames."""
-    held = mapping.names[(split.of(mapping.names) == VALIDATION) & (mapping.tracked == tracked)]
+    held = mapping.names[
+        (split.groups_of(mapping.names) == VALIDATION) & (mapping.tracked == tracked)
+    ]
     planted = regrouped(split, held[len(held) // 2], TRAIN)
     assert_fails(audit.check_blocks(mapping, planted), held[len(held) // 2])
     assert_fails(audit.check_gap(mapping, planted), held[len(held) // 2])
 
 
 def test_a_held_out_frame_outside_all_blocks_is_found(mapping, split):
-    outside = mapping.names[split.of(mapping.names) == TRAIN][0]
+    outside = mapping.names[split.groups_of(mapping.names) == TRAIN][0]
     assert_fails(audit.check_blocks(mapping, regrouped(split, outside, VALIDATION)), outside)
 
 
 def test_a_dense_training_frame_in_the_guard_gap_is_found(mapping, split):
     """One tracked frame of the guard that trains is named, with its distance in seconds."""
-    guard = mapping.names[(split.of(mapping.names) == LEFT_OUT) & mapping.tracked][0]
+    guard = mapping.names[(split.groups_of(mapping.names) == LEFT_OUT) & mapping.tracked][0]
     assert_fails(audit.check_gap(mapping, regrouped(split, guard, TRAIN)), guard, "s from")
 
 
@@ -164,7 +166,7 @@ def test_a_gap_smaller_than_the_stated_one_is_found(mapping, split):
 
 def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping, split):
     """0.5 m and 5 degrees off, a minute later; one that looks elsewhere is not."""
-    row = np.flatnonzero((split.of(mapping.names) == VALIDATION) & ~mapping.tracked)[0]
+    row = np.flatnonzero((split.groups_of(mapping.names) == VALIDATION) & ~mapping.tracked)[0]
     center = mapping.poses.centers[row] + [0.0, 0.5, 0.0]
     for heading_deg, listed in ((5.0, True), (40.0, False)):
         there = rotations_from_angles(np.array([[heading_deg, -20.0, 0.0]]))
@@ -194,7 +196,7 @@ def seen_points(mapping: Labels, views: dict[int, list[str]]) -> LabelObservatio
 def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
     """Point 1 has two training frames, point 2 one and two validation frames, point 3 none."""
     chosen = mapping.select(~mapping.tracked)
-    group = split.of(chosen.names)
+    group = split.groups_of(chosen.names)
     train, held = chosen.names[group == TRAIN], chosen.names[group == VALIDATION]
     views = {
         1: [train[0], train[1], held[0]],
@@ -212,7 +214,7 @@ def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
 def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
     """Two pixels of one training frame are no second view."""
     chosen = mapping.select(~mapping.tracked)
-    row = np.flatnonzero(split.of(chosen.names) == TRAIN)[0]
+    row = np.flatnonzero(split.groups_of(chosen.names) == TRAIN)[0]
     seen = LabelObservations(np.array([row, row]), np.array([7, 7]), np.zeros((2, 2)))
     assert len(audit.training_points(chosen, seen, split)) == 0
 
@@ -228,9 +230,9 @@ def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
 )
 def test_a_wrong_mark_is_found(marks, word):
     """Only the training group's points are for training."""
-    sound = audit.check_marks({"train": True, "validation": False, "medium": False})
+    sound = audit.check_training_marks({"train": True, "validation": False, "medium": False})
     assert sound.verdict is AuditVerdict.PASS
-    assert_fails(audit.check_marks(marks), word)
+    assert_fails(audit.check_training_marks(marks), word)
 
 
 def test_labels_that_are_not_finite_are_found(parts):
@@ -259,41 +261,41 @@ def test_labels_that_are_not_finite_are_found(parts):
 
 
 def test_a_frame_that_the_split_lacks_or_holds_twice_is_found(parts, split):
-    assert audit_files.check_covered(parts, split).verdict is AuditVerdict.PASS
+    assert audit_files.check_completeness(parts, split).verdict is AuditVerdict.PASS
     name = split.names[0]
     missing = replace(split, names=split.names[1:], group=split.group[1:], reason=split.reason[1:])
-    assert_fails(audit_files.check_covered(parts, missing), name, "missing")
+    assert_fails(audit_files.check_completeness(parts, missing), name, "missing")
     twice = replace(
         split,
         names=np.append(split.names, name),
         group=np.append(split.group, TRAIN),
         reason=np.append(split.reason, ""),
     )
-    assert_fails(audit_files.check_covered(parts, twice), name, "2 times")
+    assert_fails(audit_files.check_completeness(parts, twice), name, "2 times")
 
 
 def test_a_frame_in_a_group_that_is_not_its_own_is_found(parts, split):
     """An evaluation frame that trains, a mapping frame in a test set, one without a pose, one of nowhere."""
     for name, group in (("medium/f00003.jpg", TRAIN), ("one/f00003.jpg", "medium")):
-        assert_fails(audit_files.check_covered(parts, regrouped(split, name, group)), name)
+        assert_fails(audit_files.check_completeness(parts, regrouped(split, name, group)), name)
     medium = parts["medium"]
     status = medium.status.copy()
     status[2] = LabelStatus.FAILED
     lost = {**parts, "medium": replace(medium, status=status)}
-    assert_fails(audit_files.check_covered(lost, split), "medium/f00002.jpg", "no pose")
+    assert_fails(audit_files.check_completeness(lost, split), "medium/f00002.jpg", "no pose")
     fewer = {**parts, "medium": medium.select(np.arange(29))}
-    assert_fails(audit_files.check_covered(fewer, split), "medium/f00029.jpg", "no frame")
+    assert_fails(audit_files.check_completeness(fewer, split), "medium/f00029.jpg", "not a frame")
 
 
 def test_a_frame_left_out_without_a_reason_is_found(parts, split):
     bare = regrouped(split, "one/f00000.jpg", LEFT_OUT)
-    assert_fails(audit_files.check_covered(parts, bare), "one/f00000.jpg", "without a reason")
+    assert_fails(audit_files.check_completeness(parts, bare), "one/f00000.jpg", "without a reason")
 
 
 def lists(parts: dict[str, Labels], split: Split) -> dict[str, PoseList]:
     """What a sound dataset.h5 holds, by group."""
     labels = Labels.concatenate(list(parts.values()))
-    group = split.of(labels.names)
+    group = split.groups_of(labels.names)
     return {
         name: PoseList(tuple(labels.names[group == name].tolist()), labels.poses[group == name])
         for name in split.groups()
@@ -341,23 +343,25 @@ def test_lists_that_differ_from_the_data_set_are_found(parts, split):
 
 def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split):
     """A validation frame and one of the evaluation sequence, beside training frames."""
-    group = split.of(mapping.names)
+    group = split.groups_of(mapping.names)
     train, held = mapping.names[group == TRAIN][:5].tolist(), mapping.names[group == VALIDATION][0]
     png = [name.replace(".jpg", ".png") for name in train]
-    assert audit_files.check_measured(png, split).verdict is AuditVerdict.PASS
-    assert_fails(audit_files.check_measured([*png, held], split), held)
-    assert_fails(audit_files.check_measured([*png, "medium/f00001.png"], split), "medium/f00001")
+    assert audit_files.check_nvm_measurements(png, split).verdict is AuditVerdict.PASS
+    assert_fails(audit_files.check_nvm_measurements([*png, held], split), held)
+    assert_fails(
+        audit_files.check_nvm_measurements([*png, "medium/f00001.png"], split), "medium/f00001"
+    )
 
 
 def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
-    assert audit.check_test_is_apart(split).verdict is AuditVerdict.PASS
+    assert audit.check_test_independence(split).verdict is AuditVerdict.PASS
     chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
     alone = make_split(chosen, tracked, {}, SplitOptions())
-    found = audit.check_test_is_apart(alone)
+    found = audit.check_test_independence(alone)
     assert found.verdict is AuditVerdict.NOTICE
     assert found.text == "same flight as training: optimistic"
 
 
 def test_a_stale_split_fails():
-    assert audit.check_fresh(None).verdict is AuditVerdict.PASS
-    assert audit.has_failed([audit.check_fresh("3-geo was made anew since")])
+    assert audit.check_up_to_date(None).verdict is AuditVerdict.PASS
+    assert audit.has_failed([audit.check_up_to_date("3-geo was made anew since")])

@@ -91,7 +91,7 @@ def evaluation() -> dict[str, Labels]:
 
 def nearest_s(labels: Labels, split: Split) -> float:
     """Seconds between a training frame and the nearest held-out frame of its sequence, the slow way."""
-    group = split.of(labels.names)
+    group = split.groups_of(labels.names)
     return min(
         float(np.abs(labels.time_s[k] - labels.time_s[held]).min())
         for k in np.flatnonzero(group == TRAIN)
@@ -107,12 +107,12 @@ def test_mapping_frames_train_and_each_evaluation_sequence_is_a_group(area, eval
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     assert split.groups() == (TRAIN, VALIDATION, "medium")
     assert not split.optimistic
-    assert (split.of(evaluation["medium"].names) == "medium").all()
+    assert (split.groups_of(evaluation["medium"].names) == "medium").all()
     for sequence, count in (("one", 200), ("two", 120)):
         names = mapping.names[mapping.sequences == sequence]
-        held = (split.of(names) == VALIDATION).sum()
+        held = (split.groups_of(names) == VALIDATION).sum()
         assert held == pytest.approx(0.11 * count, abs=1.5)
-        assert (split.of(names) == TRAIN).sum() >= 0.7 * count
+        assert (split.groups_of(names) == TRAIN).sum() >= 0.7 * count
 
 
 def test_blocks_in_time_have_about_the_length_wanted(area, evaluation):
@@ -124,8 +124,8 @@ def test_blocks_in_time_have_about_the_length_wanted(area, evaluation):
     for block in mine:
         first, last = block.seconds
         assert 4 <= last - first <= 6
-        inside = block.holds(mapping)
-        assert (split.of(mapping.names[inside]) == VALIDATION).all()
+        inside = block.contains(mapping)
+        assert (split.groups_of(mapping.names[inside]) == VALIDATION).all()
 
 
 def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
@@ -135,8 +135,8 @@ def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
     everything = Labels.concatenate([mapping, tracked])
     held = np.zeros(len(everything), bool)
     for block in split.blocks:
-        held |= block.holds(everything)
-    group = split.of(everything.names)
+        held |= block.contains(everything)
+    group = split.groups_of(everything.names)
     assert (group[held] == VALIDATION).all()
     assert (group[~held] != VALIDATION).all()
     assert (everything.tracked & (group == VALIDATION)).sum() > 50
@@ -163,11 +163,11 @@ def test_without_an_evaluation_sequence_one_block_is_held_out_and_said_to_be_opt
     assert split.optimistic
     (block,) = (b for b in split.blocks if b.group == TEST)
     assert (split.group == TEST).sum() == round(0.15 * 320)
-    tested = split.of(mapping.names) == TEST
+    tested = split.groups_of(mapping.names) == TEST
     assert set(mapping.sequences[tested]) == {block.sequence} == {"one"}
     first, last = block.seconds
     near = (mapping.sequences == "one") & (mapping.time_s > first - 2) & (mapping.time_s < last + 2)
-    assert set(split.of(mapping.names[near])) == {TEST, LEFT_OUT}
+    assert set(split.groups_of(mapping.names[near])) == {TEST, LEFT_OUT}
 
 
 def test_an_evaluation_sequence_of_which_every_frame_failed_is_no_test(area, evaluation):
@@ -184,7 +184,7 @@ def test_a_frame_without_a_pose_is_in_no_group(area, evaluation):
     mapping = failed(area[0], slice(0, 320, 7), "too few matches")
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     lost = mapping.names[~mapping.registered]
-    assert (split.of(lost) == LEFT_OUT).all()
+    assert (split.groups_of(lost) == LEFT_OUT).all()
     assert set(split.reason[np.isin(split.names, lost)]) == {"failed: too few matches"}
 
 
@@ -195,10 +195,10 @@ def test_the_same_input_gives_the_same_split_in_any_order(area, evaluation):
     split = make_split(mapping, tracked, evaluation, options)
     shuffled = mapping.select(np.random.default_rng(0).permutation(len(mapping)))
     again = make_split(shuffled, tracked, evaluation, options)
-    assert (again.of(split.names) == split.group).all()
+    assert (again.groups_of(split.names) == split.group).all()
     alone = mapping.select(mapping.sequences == "one")
     of_one = make_split(alone, nothing(), evaluation, options)
-    assert (of_one.of(alone.names) == split.of(alone.names)).all()
+    assert (of_one.groups_of(alone.names) == split.groups_of(alone.names)).all()
     others = [make_split(mapping, tracked, evaluation, replace(options, seed=s)) for s in range(4)]
     assert len({other.blocks for other in others}) > 2
 
@@ -207,16 +207,16 @@ def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
     """Photos 10 s apart: blocks of several, and the photo on each side is left out, though 10 s away."""
     photos = flight("photos", line(100, step_m=10.0), every_s=10.0)
     split = make_split(photos, nothing(), evaluation, SplitOptions())
-    group = split.of(photos.names)
+    group = split.groups_of(photos.names)
     assert len(split.blocks) == 2
     for block in split.blocks:
-        inside = np.flatnonzero(block.holds(photos))
+        inside = np.flatnonzero(block.contains(photos))
         assert len(inside) >= 4
         beside = [k for k in (inside[0] - 1, inside[-1] + 1) if 0 <= k < 100]
         assert (group[beside] == LEFT_OUT).all()
     assert (group == LEFT_OUT).sum() <= 4
     without = make_split(photos, nothing(), evaluation, SplitOptions(gap_s=0.0))
-    assert (without.of(photos.names) != LEFT_OUT).all()
+    assert (without.groups_of(photos.names) != LEFT_OUT).all()
 
 
 def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
@@ -231,7 +231,7 @@ def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluat
     for seed in range(60):
         split = make_split(chosen, hover, evaluation, SplitOptions(seed=seed))
         if any(block.seconds[1] == 14.5 for block in split.blocks):
-            assert TRAIN not in split.of(hover.names)
+            assert TRAIN not in split.groups_of(hover.names)
             return
     pytest.fail("no seed placed a block before the hover")
 
@@ -240,7 +240,7 @@ def test_a_short_flight_beside_a_long_one_trains_as_a_whole(area, evaluation):
     """Of 3 s, block and guard would leave nothing: the flight gives no block, and a note says so."""
     mapping = Labels.concatenate([area[0], flight("short", line(6, north_m=40.0))])
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
-    assert (split.of(mapping.names[mapping.sequences == "short"]) == TRAIN).all()
+    assert (split.groups_of(mapping.names[mapping.sequences == "short"]) == TRAIN).all()
     assert any(note.startswith("short is too short") for note in split.notes)
 
 
@@ -271,7 +271,7 @@ def test_left_out_dense_frames_are_in_no_group(area, evaluation):
     both = {"medium": Labels.concatenate([evaluation["medium"], more])}
     split = make_split(mapping, tracked, both, SplitOptions(tracked=False))
     for names in (tracked.names, more.names):
-        assert (split.of(names) == LEFT_OUT).all()
+        assert (split.groups_of(names) == LEFT_OUT).all()
     assert split.counts()["medium"] == 50
 
 
@@ -295,7 +295,7 @@ def test_blocks_in_space_touch_and_keep_their_distance(evaluation):
     mapping = raster()
     options = SplitOptions(validation=Policy.SPACE)
     split = make_split(mapping, nothing(), evaluation, options)
-    group = split.of(mapping.names)
+    group = split.groups_of(mapping.names)
     held, trained = group == VALIDATION, group == TRAIN
     assert 0.08 <= held.mean() <= 0.2
     plan_view = mapping.poses.centers[:, :2]
@@ -336,7 +336,7 @@ def test_a_band_of_heights_is_held_out(evaluation):
     climb[:, 2] = np.linspace(2, 42, 400)
     mapping = flight("climb", climb)
     split = make_split(mapping, nothing(), evaluation, SplitOptions(validation=Policy.HEIGHT))
-    group, height = split.of(mapping.names), mapping.poses.centers[:, 2]
+    group, height = split.groups_of(mapping.names), mapping.poses.centers[:, 2]
     held = height[group == VALIDATION]
     assert len(held) == 44
     trained = height[group == TRAIN]
@@ -365,7 +365,7 @@ def test_a_split_comes_back_from_its_file(area, evaluation, policy, tmp_path: Pa
     split = make_split(mapping, nothing(), evaluation, SplitOptions(validation=policy, seed=3))
     write_split(tmp_path / "split.json", split)
     again = read_split(tmp_path / "split.json")
-    assert (again.of(split.names) == split.group).all()
+    assert (again.groups_of(split.names) == split.group).all()
     assert len(again.names) == len(split.names)
     assert dict(zip(again.names, again.reason, strict=True)) == dict(
         zip(split.names, split.reason, strict=True)
@@ -409,5 +409,5 @@ def test_a_file_that_is_no_split_is_refused(area, evaluation, tmp_path: Path, be
     "wrong", [{"validation_share": 0.0}, {"test_share": 1.0}, {"gap_s": -1.0}, {"cell_m": 0.0}]
 )
 def test_options_that_mean_nothing_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"lies between|at least"):
+    with pytest.raises(ValueError, match=r"must be between|at least"):
         SplitOptions(**wrong)
