@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.networks.imagenet import MEAN, STD
-from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
+from spn_model.networks.normalization import InsertedBatchNorm, initialize_as_identity
 from spn_model.networks.registry import build
 from spn_model.networks.regressor import Regressor
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
@@ -90,7 +90,7 @@ def main() -> None:
     # Statistics of the batch, not running ones: the state in which training would begin.
     table.add_row(*row("slope 0.01, fresh normalisation", features(ours.train()), plain))
     ours = squeezeposenet(0.01, normalised=True)
-    start_as_identity(ours, images.split(10))
+    initialize_as_identity(ours, images.split(10))
     table.add_row(*row("slope 0.01, identity, in use", features(ours.eval()), plain))
     table.add_row(*row("slope 0.01, identity, in training", features(ours.train()), plain))
     console = Console()

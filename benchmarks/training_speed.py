@@ -48,10 +48,10 @@ from spn_model.models.pose_model import Batch, PoseModel
 from spn_model.models.registry import make
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.training.batches import rows_of_step
-from spn_model.training.gradients import Gradients, gradients
-from spn_model.training.machine import PRECISIONS, Machine, Ranks, choose, prepared
+from spn_model.training.gradients import Gradients, gradient_workers
+from spn_model.training.machine import PRECISIONS, Machine, Ranks, choose, limited_threads
 from spn_model.training.recipe import Stage, read_recipe
-from spn_model.training.train import made_part, optimizer_of, run_stage
+from spn_model.training.train import make_part, optimizer_of, run_stage
 from spn_model.training.training_record import Files, Record
 from spn_model.training.training_state import Position
 
@@ -101,17 +101,17 @@ class Contest:
         return [self.part(number) for number in range(first, first + self.stage.parts)]
 
     def part(self, number: int) -> Batch:
-        made = made_part(self.model, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
+        made = make_part(self.model, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
         return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
 
     def step(self, gradient: Gradients, parts: list[Batch]) -> None:
         """What one step computes."""
-        gradient.of(parts)
+        gradient.compute(parts)
         nn.utils.clip_grad_norm_(self.parameters, self.stage.clip or float("inf"))
         self.optimizer.step()
 
     def computing(self) -> AbstractContextManager[Gradients]:
-        return gradients(self.model, self.parameters, self.stage.parts, self.machine)
+        return gradient_workers(self.model, self.parameters, self.stage.parts, self.machine)
 
     def loop(self, record: Record) -> None:
         run_stage(
@@ -226,7 +226,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     machine = choose(given.device, given.threads, given.precision, makes_batches=True)
-    with prepared(machine):
+    with limited_threads(machine):
         found = measure(given.area, given.recipe, machine, given.steps, given.rounds)
     loops = found["loops"]
     columns = ("loop", "images/s", "of bare", "ms an image, stepping", "all threads")

@@ -17,7 +17,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 
-from spn_model.pretrained.weights import SHIPPED, of_name
+from spn_model.pretrained.weights import SHIPPED, by_name
 
 ABOUT = "SqueezeNet 1.1 features, ImageNet, rounded to float16; "
 
@@ -37,7 +37,7 @@ def main() -> None:
     )
     parser.add_argument("source", type=Path)
     content = shipped(parser.parse_args().source)
-    target = SHIPPED / of_name("squeezenet1_1-features").file
+    target = SHIPPED / by_name("squeezenet1_1-features").file
     target.write_bytes(content)
     print(f"{target}: {len(content)} bytes, sha256 {hashlib.sha256(content).hexdigest()}")
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from spn_cli import console, options
+from spn_data.area.names import DATASET
 
 
 @click.command()
@@ -75,10 +76,14 @@ def run(
     seed: int,
 ) -> None:
     from spn_cli import page, show_networks
-    from spn_data.area import area as names_of
+    from spn_data.area import names as names_of
     from spn_data.errors import InputError, StageError
     from spn_data.storage.fingerprints import content_fingerprint
-    from spn_model.evaluation.comparison_files import network_facts, of_network, write_comparison
+    from spn_model.evaluation.comparison_files import (
+        network_facts,
+        select_network,
+        write_comparison,
+    )
     from spn_model.evaluation.evaluate import EvaluateOptions, compare
     from spn_model.models.checkpoint import load
     from spn_model.training import machine
@@ -102,7 +107,7 @@ def run(
     )
     if dataset is None:
         area.check_fresh(names_of.SPLIT)
-    path = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
+    path = dataset or area.folder(names_of.SPLIT) / DATASET
     runs = area.root / names_of.RUNS
     with machine.limited_threads(chosen):
         networks = {name: load(file, chosen.device) for name, file in files.items()}
@@ -130,7 +135,7 @@ def run(
             "checkpoint": content_fingerprint(files[name]),
             "course": None if course is None else course.facts(),
         }
-    parts = [(folders[name], of_network(found, name), {name: facts[name]}) for name in files]
+    parts = [(folders[name], select_network(found, name), {name: facts[name]}) for name in files]
     if len(files) > 1:
         parts.append((runs / names_of.COMPARED, found, facts))
     for folder, part, of in parts:

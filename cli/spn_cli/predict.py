@@ -103,12 +103,12 @@ def run(
 ) -> None:
     import os
 
-    from spn_data.area.area import CHECKPOINT
+    from spn_data.area.names import CHECKPOINT
     from spn_data.errors import StageError
     from spn_data.geometry.camera_file import camera_to_json, read_camera
     from spn_data.storage.fingerprints import content_fingerprint
     from spn_model.models.checkpoint import load
-    from spn_model.prediction.flown import FrameFilter, find_flights
+    from spn_model.prediction.flights import FrameFilter, find_flights
     from spn_model.prediction.predict import PredictOptions, check_target
     from spn_model.prediction.predict import predict as work
     from spn_model.training import machine

@@ -32,7 +32,7 @@ class Following:
 
     def __init__(self, recipe: Recipe, unit: str, *, shows: bool):
         self._stages = {stage.name: k for k, stage in enumerate(recipe.stages)}
-        self._shares = recipe.shares
+        self._shares = recipe.budget_shares
         self._unit, self._shows = unit, shows
         self._stop = False
         self._judged: list[tuple[str, ...]] = []

@@ -40,10 +40,10 @@ def fetch(name: str) -> None:
     Example:
         spn-model weights fetch googlenet
     """
+    from spn_model.pretrained.weights import by_name
     from spn_model.pretrained.weights import fetch as download
-    from spn_model.pretrained.weights import of_name
 
-    entry = of_name(name)
+    entry = by_name(name)
     with console.progress() as progress:
         path = download(entry, progress)
     console.out.print(f"{path}: {entry.holds}; {entry.licence}.")

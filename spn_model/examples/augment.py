@@ -30,7 +30,7 @@ class WarpOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LookOptions:
+class PhotometricOptions:
     """How far the look of a training image is changed."""
 
     exposure: float = 0.35  # standard deviation of the log of the gain
@@ -135,8 +135,8 @@ def random_warp(
     return Warp(rotations_from_vectors(turn[None])[0], np.asarray(matrix), virtual, width, height)
 
 
-def change_look(
-    image: np.ndarray, generator: np.random.Generator, options: LookOptions
+def augment_photometrically(
+    image: np.ndarray, generator: np.random.Generator, options: PhotometricOptions
 ) -> np.ndarray:
     """The same view (H, W, 3) uint8 in other light, blurred, noisy, partly hidden. A new array."""
     gain = generator.normal(0.0, options.exposure) + generator.normal(0.0, options.tint, 3)

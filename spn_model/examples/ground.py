@@ -29,11 +29,11 @@ class Ground:
     corner: np.ndarray
     cell: float
 
-    def has(self, xyz: np.ndarray) -> np.ndarray:
+    def is_at_or_below(self, xyz: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) that lie no higher than on it."""
         return xyz[:, 2] < self.height + self.thick
 
-    def met_by(self, center: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    def intersect(self, center: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """(N,) lengths, in rays (N, 3) of the world, after which they meet it from above; NaN where not."""
         rows, columns = self.near.shape
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -51,7 +51,7 @@ class Ground:
         return np.column_stack([plan, np.full(len(plan), self.height)])
 
 
-def level_ground(xyz: np.ndarray, spread: float) -> Ground | None:
+def fit_level_ground(xyz: np.ndarray, spread: float) -> Ground | None:
     """The ground of a scene whose z points up, from its map points (N, 3); None where it has no level one.
 
     In each cell in plan the lowest point counts, where none lies clearly higher: a facade has points at all

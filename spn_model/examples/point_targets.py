@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
-from spn_data.dataset.hdf5_reader import DatasetGroup, FramePoints
+from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.pose import Poses
 
 
@@ -127,20 +127,3 @@ def surface(
     weights = np.concatenate([first, 1 - first.sum(axis=1, keepdims=True)], axis=1)
     inverse[hit] = (weights * values[mesh.simplices[triangle[hit]]]).sum(axis=1)
     return Surface(inverse.reshape(rows, columns).astype(np.float32), options.step_px, pose, matrix)
-
-
-def training_surfaces(group: DatasetGroup, options: SurfaceOptions) -> list[Surface]:
-    """Of every frame of a group whose points are for training. Raises InputError for any other group."""
-    size = group.image_size
-    if size is None:
-        raise ValueError(f"group {group.name} holds no images")
-    return [
-        surface(
-            group.training_points(k),
-            group.poses[k : k + 1],
-            group.intrinsics[k],
-            size,
-            options,
-        )
-        for k in range(len(group))
-    ]

@@ -50,7 +50,7 @@ class TrainingSet:
         self._valid = None if every_pixel else [group.valid(k) for group, k in self._rows]
         self.has_points = groups[0].points_for_training
         self._points = (
-            [_points_to_learn(group, k) for group, k in self._rows] if self.has_points else []
+            [_points_to_train_on(group, k) for group, k in self._rows] if self.has_points else []
         )
 
     def __len__(self) -> int:
@@ -74,6 +74,6 @@ class TrainingSet:
         return self._points[row]
 
 
-def _points_to_learn(group: DatasetGroup, row: int) -> FramePoints:
+def _points_to_train_on(group: DatasetGroup, row: int) -> FramePoints:
     """Of validation frames all points: they were made of images that are learnt with them."""
     return group.points(row) if group.role is Role.VALIDATION else group.training_points(row)

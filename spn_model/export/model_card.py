@@ -1,4 +1,4 @@
-"""MODEL_CARD.md of a bundle: what the network is, what it was found to be worth, and its limits."""
+"""MODEL_CARD.md of a bundle: the network, its measured errors, and its limits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from spn_data.errors import InputError
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
-from spn_model.pretrained.weights import of_name
+from spn_model.pretrained.weights import by_name
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_checks import GroupErrors
@@ -22,14 +22,17 @@ def model_card(
     facts: Mapping[str, Any],
     metrics: Mapping[str, Any] | None,
 ) -> str:
-    """Markdown. metrics : of the run's evaluation, as metrics.json has it; None: says that there is none."""
+    """Return the model card as Markdown.
+
+    metrics : evaluation of the run, as in metrics.json; if None, the card says that there is none.
+    """
     view, model = checkpoint.view, checkpoint.model
     unit = "m" if view.units == "m" else "units of the model"
     parameters = sum(p.numel() for p in model.network.parameters())
     place = view.origin
     parts = [
         f"# {facts.get('run', 'Network')}",
-        f"Pose of a camera from one image, in one area: a network of kind {model.kind} with "
+        f"Estimates the camera pose from a single image in one area: a network of kind {model.kind} with "
         f"{parameters:,} parameters.",
         _list(
             f"Input: {view.size[0]} x {view.size[1]} px, horizontal field of view "
@@ -38,11 +41,11 @@ def model_card(
                 if view.camera is None
                 else f"{view.camera.horizontal_fov_deg:.1f} deg"
             )
-            + "; the program on board renders a flying camera's images into it.",
+            + "; the onboard program renders the images of the flying camera into this view.",
             f"Output: camera centre in {unit}, orientation, 6 x 6 covariance.",
             "World: "
             + (
-                "without a known place."
+                "not georeferenced."
                 if place is None
                 else f"East, North, Up about latitude {place.lat_deg:.7f}, longitude {place.lon_deg:.7f}, "
                 f"height {place.alt_m:.2f} m ({place.height_reference.value})."
@@ -54,29 +57,42 @@ def model_card(
             ),
         ),
         "## Errors",
-        *_evaluated(metrics, str(facts.get("run", "")), unit, facts.get("trained_on", ())),
-        "## What the bundle loses",
-        f"On {made.parity.images} images, outputs of the float32 graph differ from PyTorch's by at most "
-        f"{made.parity.output:.1e} of an output's largest value; half of the poses by at most "
-        f"{made.parity.position:.1e} {unit} and {made.parity.rotation_deg:.1e} deg, all by at most "
+        *_error_section(metrics, str(facts.get("run", "")), unit, facts.get("trained_on", ())),
+        "## Accuracy of the bundle",
+        f"On {made.parity.images} images, the outputs of the float32 graph differ from PyTorch's by at most "
+        f"{made.parity.output:.1e} of the output's largest value. Half of the poses differ by at most "
+        f"{made.parity.position:.1e} {unit} and {made.parity.rotation_deg:.1e} deg, all of them by at most "
         f"{made.parity.largest_sigmas:.1e} of their own standard deviations.",
-        _loss(made.errors, unit),
+        _bundle_errors(made.errors, unit),
         "## Limits",
         _list(
-            "Poses are right in the area that the training images show, and nowhere else.",
-            "Light, season and moved things that no training image shows were not measured.",
-            "A covariance tells how sure the network is of what it knows; it does not notice every view "
-            "that it has never seen.",
-            "Not certified for any use in which an error endangers people.",
+            "Poses are valid only in the area that the training images show.",
+            "Light, seasons and moved objects that no training image shows were not evaluated.",
+            "A covariance expresses the uncertainty of views that the network knows; it does not flag every "
+            "view that the network has never seen.",
+            "Not certified for any use in which an error may endanger people.",
         ),
-        "## Licence of the weights that training started from",
+        "## Licence of the initial weights",
         _licence(checkpoint, facts),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def loss_percent(errors: Sequence[GroupErrors], group: str) -> tuple[float, float] | None:
-    """By how much int8 raises the median errors of a group, position and rotation; None without int8."""
+def int8_error_increase(errors: Sequence[GroupErrors], group: str) -> tuple[float, float] | None:
+    """Return by how many percent int8 raises the median position and rotation errors of a group.
+
+    Parameters
+    ----------
+    errors : sequence of GroupErrors
+        Errors of all groups and precisions.
+    group : str
+        Name of the group.
+
+    Returns
+    -------
+    tuple of float or None
+        Position and rotation; NaN if not defined. None without an int8 graph.
+    """
     by = {one.precision: one for one in errors if one.group == group}
     if len(by) < 2:
         return None
@@ -93,20 +109,20 @@ def _percent(before: float, after: float) -> float:
     return 100 * (after / before - 1)
 
 
-def _evaluated(
-    metrics: Mapping[str, Any] | None, run: str, unit: str, learnt: Collection[str]
+def _error_section(
+    metrics: Mapping[str, Any] | None, run: str, unit: str, trained_on: Collection[str]
 ) -> list[str]:
     if metrics is None:
         return [
-            "The run was not evaluated: `spn-model evaluate` measures it, and another export tells it."
+            "The run was not evaluated: run `spn-model evaluate`, then export it again with `--overwrite`."
         ]
     rows = [
         (
-            f"{group} (trained on)" if group in learnt else group,
+            f"{group} (trained on)" if group in trained_on else group,
             str(found["frames"]),
             str(found["located"]),
-            *(_figure(found["position"][name]) for name in ("median", "mean", "p95")),
-            *(_figure(found["rotation_deg"][name]) for name in ("median", "mean", "p95")),
+            *(_number(found["position"][name]) for name in ("median", "mean", "p95")),
+            *(_number(found["rotation_deg"][name]) for name in ("median", "mean", "p95")),
         )
         for group, methods in metrics["groups"].items()
         if (found := methods.get(run)) is not None
@@ -118,25 +134,25 @@ def _evaluated(
         *(f"{n}, {unit}" for n in ("median", "mean", "p95")),
     )
     return [
-        "As `spn-model evaluate` found them with PyTorch; without any alignment.",
+        "Measured by `spn-model evaluate` with PyTorch, without any alignment.",
         _table((*header, "median, deg", "mean, deg", "p95, deg"), rows),
     ]
 
 
-def _loss(errors: Sequence[GroupErrors], unit: str) -> str:
+def _bundle_errors(errors: Sequence[GroupErrors], unit: str) -> str:
     rows = []
     for one in errors:
-        percent = loss_percent(errors, one.group) if one.precision == INT8 else None
-        told = "" if percent is None else f"{percent[0]:+.1f} %, {percent[1]:+.1f} %"
+        percent = int8_error_increase(errors, one.group) if one.precision == INT8 else None
+        increase = "" if percent is None else f"{percent[0]:+.1f} %, {percent[1]:+.1f} %"
         rows.append(
             (
                 one.group,
                 one.precision,
                 str(one.images),
                 str(one.located),
-                _figure(one.position),
-                _figure(one.rotation_deg),
-                told,
+                _number(one.position),
+                _number(one.rotation_deg),
+                increase,
             )
         )
     header = ("group", "graph", "images", "with a pose", f"median, {unit}", "median, deg")
@@ -152,14 +168,14 @@ def _licence(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> str:
         return "None: training started from random weights."
     name = checkpoint.model.weights_name if weights == "published" else str(weights)
     try:
-        known = of_name(name)
+        known = by_name(name)
     except InputError:
-        return f"Training started from a file of the user, {name}: its licence holds."
+        return f"Training started from a user-supplied file, {name}: its licence applies."
     return f"{known.holds} ({known.name}): {known.licence}."
 
 
-def _figure(value: float | None) -> str:
-    """Infinite, which JSON has as null: too few frames have a pose."""
+def _number(value: float | None) -> str:
+    """Format a number; infinity (null in JSON) means that too few frames have a pose."""
     return "none" if value is None or not math.isfinite(value) else f"{value:.3f}"
 
 

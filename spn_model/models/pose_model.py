@@ -11,11 +11,11 @@ import numpy as np
 from torch import Tensor, nn
 
 from spn_data.geometry.pose import Poses
+from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.unseen_views import UnseenViews
 
 Batch = dict[str, Tensor]
-ANY_NUMBER = 10**12  # of images, where it is not known how many are drawn
+UNKNOWN_COUNT = 10**12  # of images, where it is not known how many are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class PoseModel(ABC):
 
     @abstractmethod
     def begin_stage(
-        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
         """Freeze and thaw, choose loss and augmentation, as the options of a recipe's stage say.
 
@@ -108,7 +108,7 @@ class PoseModel(ABC):
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
         """Poses of images (B, H, W, 3) uint8 RGB without distortion, K (B, 3, 3). In eval mode."""
 
-    def unseen_views(self, data: TrainingSet, count: int) -> UnseenViews | None:
+    def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
         """Up to `count` images like those that the stage renders of its data, none of which it ever draws.
 
         None where the stage renders none.

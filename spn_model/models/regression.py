@@ -14,18 +14,23 @@ from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.option_parsing import from_mapping
-from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
+from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.regression_examples import (
     FeatureCache,
-    example,
+    augmented_example,
     input_size,
     resized,
     visible_points,
 )
 from spn_model.models.regression_options import RegressionOptions, RegressionStageOptions
 from spn_model.networks.imagenet import MEAN, STD
-from spn_model.networks.normalization import start_as_identity
-from spn_model.networks.pose_loss import beta_weighted, laplace, reprojection, residuals
+from spn_model.networks.normalization import initialize_as_identity
+from spn_model.networks.pose_loss import (
+    beta_weighted_loss,
+    laplace_nll,
+    pose_residuals,
+    reprojection_loss,
+)
 from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
 from spn_model.pretrained import weights
@@ -96,12 +101,12 @@ class RegressionModel(PoseModel):
         if network.is_started:
             return
         _, quats = network.targets.encode(data.poses)
-        network.start_heads(torch.from_numpy(quats.mean(axis=0)))
-        start_as_identity(network.regressor, self._measured(data))
+        network.initialize_heads(torch.from_numpy(quats.mean(axis=0)))
+        initialize_as_identity(network.regressor, self._measured(data))
         network.is_started.fill_(True)
 
     def begin_stage(
-        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
         chosen = from_mapping(RegressionStageOptions, stage, f"stage of {self.kind}")
         if chosen.loss == "reprojection" and not data.has_points:
@@ -118,7 +123,10 @@ class RegressionModel(PoseModel):
         network = self.network
         network.regressor.freeze_trunk(chosen.freeze_trunk)
         network.weighting.requires_grad_(chosen.loss == "learned")
-        network.drops, network.normalizes_by_batch = chosen.dropout, chosen.batch_statistics
+        network.dropout_active, network.batch_statistics_active = (
+            chosen.dropout,
+            chosen.batch_statistics,
+        )
         network.train(network.training)
         if chosen.cached_features:
             self._cache = self._cached(data, chosen.cached_features)
@@ -182,8 +190,8 @@ class RegressionModel(PoseModel):
             ]
         ).sum()
         x, q = outputs.estimates[0]
-        errors = residuals(x.detach(), q.detach(), batch["x"], batch["q"])
-        likelihood = laplace(errors, outputs.log_std).mean()
+        errors = pose_residuals(x.detach(), q.detach(), batch["x"], batch["q"])
+        likelihood = laplace_nll(errors, outputs.log_std).mean()
         figures = {
             "distance": errors[:, :3].norm(dim=1).median(),
             "angle_deg": torch.rad2deg(errors[:, 3:].norm(dim=1).median()),
@@ -224,11 +232,11 @@ class RegressionModel(PoseModel):
     def _pose_loss(self, x: Tensor, q: Tensor, batch: Batch) -> Tensor:
         stage, true = self._stage, (batch["x"], batch["q"])
         if stage.loss == "beta":
-            return beta_weighted(x, q, *true, stage.beta)
+            return beta_weighted_loss(x, q, *true, stage.beta)
         if stage.loss == "learned":
             weighted: Tensor = self.network.weighting(x, q, *true)
             return weighted
-        return reprojection(x, q, *true, batch["points"], batch["seen"], batch["matrices"])
+        return reprojection_loss(x, q, *true, batch["points"], batch["seen"], batch["matrices"])
 
     def _features(self, batch: Batch) -> tuple[Tensor, ...]:
         if "images" in batch:
@@ -261,7 +269,7 @@ class RegressionModel(PoseModel):
     ) -> tuple[np.ndarray, Poses]:
         """Images (B, h, w, 3) uint8 and poses of rows of the training set, varied as the stage says."""
         made = [
-            example(data, int(row), self._options.width, self._stage, generator)
+            augmented_example(data, int(row), self._options.width, self._stage, generator)
             for row, generator in wanted
         ]
         return np.stack([image for image, _ in made]), Poses.concatenate(pose for _, pose in made)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model.examples.augment import LookOptions, change_look, random_warp
+from spn_model.examples.augment import PhotometricOptions, augment_photometrically, random_warp
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.regression_options import RegressionStageOptions
 
@@ -30,7 +30,7 @@ def resized(image: np.ndarray, wanted_width: int) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
 
-def example(
+def augmented_example(
     data: TrainingSet,
     row: int,
     wanted_width: int,
@@ -50,7 +50,7 @@ def example(
         warp = random_warp(generator, matrix, (width, height), options.warp, zoom=1.0)
         image, pose = warp.image(image), warp.pose(pose)
     if options.augmentation and options.look:
-        image = change_look(image, generator, LookOptions())
+        image = augment_photometrically(image, generator, PhotometricOptions())
     return image, pose
 
 

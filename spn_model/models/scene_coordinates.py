@@ -14,11 +14,11 @@ from torch.nn import functional
 
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
+from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.option_parsing import from_mapping
-from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
-from spn_model.models.scene_examples import Examples, SceneStageOptions
+from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
+from spn_model.models.scene_examples import SceneExamples, SceneStageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
@@ -58,8 +58,8 @@ class SceneCoordinatesModel(PoseModel):
     def __init__(self, network: SceneCoordinates, decoding: DecodingOptions):
         self.network = network
         self.decoding = decoding
-        self._stage, self._images = SceneStageOptions(), ANY_NUMBER
-        self._examples: tuple[TrainingSet, Examples] | None = None
+        self._stage, self._images = SceneStageOptions(), UNKNOWN_COUNT
+        self._examples: tuple[TrainingSet, SceneExamples] | None = None
         self._making_examples = Lock()
 
     @classmethod
@@ -101,7 +101,7 @@ class SceneCoordinatesModel(PoseModel):
         self.network.measure_features(_normalised(torch.from_numpy(images)))
 
     def begin_stage(
-        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
         self._stage = from_mapping(SceneStageOptions, stage, f"stage of {self.kind}")
         self._images = images
@@ -121,7 +121,7 @@ class SceneCoordinatesModel(PoseModel):
     ) -> Batch:
         """images (N, h, w, 3) uint8, targets (N, 3, r, c), known (N, r, c).
 
-        See `Examples.batch`: all images have one zoom, and smaller ones are more than the rows.
+        See `SceneExamples.batch`: all images have one zoom, and smaller ones are more than the rows.
         """
         images, targets, known = self._examples_of(data).batch(rows, generator, progress)
         return {
@@ -130,14 +130,14 @@ class SceneCoordinatesModel(PoseModel):
             "known": torch.from_numpy(known),
         }
 
-    def unseen_views(self, data: TrainingSet, count: int) -> UnseenViews | None:
-        return self._examples_of(data).unseen_views(count)
+    def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
+        return self._examples_of(data).held_out_views(count)
 
-    def _examples_of(self, data: TrainingSet) -> Examples:
+    def _examples_of(self, data: TrainingSet) -> SceneExamples:
         with self._making_examples:  # once, whichever thread comes first: it may take seconds
             if self._examples is None or self._examples[0] is not data:
                 center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
-                made = Examples(
+                made = SceneExamples(
                     data, self._stage, center, spread, self.network.shrink, self._images
                 )
                 self._examples = (data, made)

@@ -9,8 +9,20 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
-from spn_model.examples.augment import LookOptions, WarpOptions, change_look, random_warp
-from spn_model.examples.fused_views import fused_view
+from spn_model.examples.augment import (
+    PhotometricOptions,
+    WarpOptions,
+    augment_photometrically,
+    random_warp,
+)
+from spn_model.examples.held_out_views import HeldOutViews
+from spn_model.examples.novel_view_fusion import fused_view
+from spn_model.examples.novel_views import (
+    NovelViewOptions,
+    nearby_pose,
+    overhead_pose,
+    warp_to_pose,
+)
 from spn_model.examples.point_targets import (
     Surface,
     SurfaceOptions,
@@ -18,10 +30,8 @@ from spn_model.examples.point_targets import (
     cell_targets,
     surface,
 )
+from spn_model.examples.source_images import SourceImages
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.unseen_views import UnseenViews
-from spn_model.examples.view_sources import ViewSources
-from spn_model.examples.virtual_views import NovelViewOptions, high_place, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -92,7 +102,7 @@ class SceneStageOptions:
             raise InputError("views_share needs surfaces: views are rendered from them")
 
 
-class Examples:
+class SceneExamples:
     """Examples of one data set, as one stage varies them; surfaces and views are kept once they are made.
 
     center (3,), spread : of the scene; shrink : factor by which the network's images are smaller than the
@@ -129,10 +139,10 @@ class Examples:
         worth = max(_FIRST_VIEWS, images // _IMAGES_A_VIEW)
         self._view_count = min(options.views, kept, worth)
         self._views: dict[int, tuple[np.ndarray, Surface]] = {}
-        self._sources: ViewSources | None = None
+        self._sources: SourceImages | None = None
         self._looks_down = False
         if options.views_share and options.views_fused:
-            self._sources = ViewSources(data, center, spread, _FAR * spread)
+            self._sources = SourceImages(data, center, spread, _FAR * spread)
             lies_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
             self._looks_down = data.up_is_known and bool(lies_below.any())
 
@@ -189,7 +199,7 @@ class Examples:
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
         image = warp.image(image, (red, green, blue))
         if self._options.look:
-            image = change_look(image, generator, LookOptions())
+            image = augment_photometrically(image, generator, PhotometricOptions())
         grid = grid_size(*size)
         if seen is not None:
             cells = cell_centers(*grid, FIRST_CELL_PX, STRIDE_PX)
@@ -246,7 +256,7 @@ class Examples:
         share = min(1.0, progress / _ALL_VIEWS_AT)
         return min(self._view_count, max(_FIRST_VIEWS, round(self._view_count * share)))
 
-    def unseen_views(self, count: int) -> UnseenViews | None:
+    def held_out_views(self, count: int) -> HeldOutViews | None:
         """Up to `count` views that no batch has; None where the stage renders none."""
         if not self._options.views_share:
             return None
@@ -256,7 +266,7 @@ class Examples:
             return None
         enlarged = self._view_shrink
         larger = np.diag([enlarged, enlarged, 1.0])
-        return UnseenViews(
+        return HeldOutViews(
             Poses.concatenate(seen.pose for _, seen in made),
             np.stack([larger @ seen.matrix for _, seen in made]),
             [image for image, _ in made],
@@ -285,9 +295,9 @@ class Examples:
         for _ in range(_ATTEMPTS):
             if high:
                 centers, scene = self._data.poses.centers, self._sources.samples
-                place = high_place(generator, centers, scene, self._view_options)
+                place = overhead_pose(generator, centers, scene, self._view_options)
             else:
-                place = random_place(generator, seen, self._view_options)
+                place = nearby_pose(generator, seen, self._view_options)
             red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
             image, fused = fused_view(
                 self._data,
@@ -306,9 +316,9 @@ class Examples:
     def _moved(
         self, row: int, seen: Surface, generator: np.random.Generator
     ) -> tuple[np.ndarray, Surface]:
-        place = random_place(generator, seen, self._view_options)
+        place = nearby_pose(generator, seen, self._view_options)
         red, green, blue = (int(v) for v in generator.integers(0, 256, 3))
-        image, moved = view_from(self._image(row), seen, place, (red, green, blue))
+        image, moved = warp_to_pose(self._image(row), seen, place, (red, green, blue))
         if self._view_shrink == 1:
             return image, moved
         by = self._view_shrink

@@ -1,4 +1,4 @@
-"""Batch normalisation put into a pretrained network without changing what the network computes."""
+"""Batch normalisation inserted into a pretrained network without changing what the network computes."""
 
 from __future__ import annotations
 
@@ -10,29 +10,40 @@ from torch import Tensor, nn
 
 
 class InsertedBatchNorm(nn.BatchNorm2d):
-    """A batch normalisation that the pretrained network did not have."""
+    """Batch normalisation layer that the pretrained network does not have."""
 
 
 def normalized_leaky_relu(channels: int, slope: float) -> nn.Sequential:
-    """What stands in the place of a ReLU: a batch normalisation of its convolution, and a Leaky ReLU."""
+    """Return the replacement of a ReLU: batch normalisation of the convolution's output, and a Leaky ReLU."""
     return nn.Sequential(InsertedBatchNorm(channels), nn.LeakyReLU(slope, inplace=True))
 
 
 @torch.no_grad()
-def start_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
-    """Make every inserted batch normalisation of a network the identity, in eval mode, on all inputs.
+def initialize_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
+    """Initialise every inserted batch normalisation of a network so that, in eval mode, it is the identity.
 
-    images : batches (B, 3, H, W) of training images, on the network's device. The running statistics become
-    those of the normalisation's input over all of them (variance over all pixels), the weight
-    sqrt(variance + eps) and the bias the mean, so that pretrained features pass as they are, and training
-    mode starts beside them too. Networks without an inserted normalisation are left alone.
-    Raises ValueError without images, or where activations aren't finite.
+    The running statistics are set to those of the layer's input over all images (variance over all pixels),
+    the weight to sqrt(variance + eps) and the bias to the mean. Pretrained features therefore pass
+    unchanged, and training mode starts close to the identity too. A network without inserted normalisations
+    is left alone.
+
+    Parameters
+    ----------
+    network : nn.Module
+        Network that may contain `InsertedBatchNorm` layers.
+    images : iterable of Tensor, shape (B, 3, H, W)
+        Batches of training images, on the network's device.
+
+    Raises
+    ------
+    ValueError
+        If there are no images, or if activations are not finite.
     """
     layers = [module for module in network.modules() if isinstance(module, InsertedBatchNorm)]
     if not layers:
         return
     measured = {layer: _Moments() for layer in layers}
-    # A hook's value replaces the layer's output: what is measured is the network without the layers.
+    # A hook's return value replaces the layer's output, so the network is measured without these layers.
     hooks = [layer.register_forward_hook(measured[layer]) for layer in layers]
     was_training = network.training
     network.eval()
@@ -43,8 +54,8 @@ def start_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
         for hook in hooks:
             hook.remove()
         network.train(was_training)
-    found = {layer: moments.mean_and_variance() for layer, moments in measured.items()}
-    for layer, (mean, variance) in found.items():
+    statistics = {layer: moments.mean_and_variance() for layer, moments in measured.items()}
+    for layer, (mean, variance) in statistics.items():
         layer.running_mean.copy_(mean)  # type: ignore[union-attr]
         layer.running_var.copy_(variance)  # type: ignore[union-attr]
         layer.weight.copy_((variance + layer.eps).sqrt())
@@ -52,7 +63,7 @@ def start_as_identity(network: nn.Module, images: Iterable[Tensor]) -> None:
 
 
 class _Moments:
-    """Count, mean and squared deviations by channel; batches are joined in float64.
+    """Count, mean and sum of squared deviations by channel, accumulated over batches in float64.
 
     Chan, Golub, LeVeque 1979, "Updating formulae and a pairwise algorithm", equation 2.1.
     """
@@ -75,9 +86,10 @@ class _Moments:
         return given[0]
 
     def mean_and_variance(self) -> tuple[Tensor, Tensor]:
+        """Return mean and variance by channel. Raises ValueError without images or if they are not finite."""
         if not isinstance(self.mean, Tensor) or not isinstance(self.deviation, Tensor):
-            raise ValueError("no images to measure statistics on")
+            raise ValueError("no images to compute batch normalisation statistics from")
         variance = self.deviation / self.count
         if not (torch.isfinite(self.mean).all() and torch.isfinite(variance).all()):
-            raise ValueError("activations on these images are not finite")
+            raise ValueError("activations on the training images are not finite")
         return self.mean, variance

@@ -1,4 +1,4 @@
-"""What a pose regressor aims at: positions about the centre of the training poses, and quaternions."""
+"""Targets of a pose regressor: positions about the centre of the training poses, and quaternions."""
 
 from __future__ import annotations
 
@@ -8,16 +8,23 @@ from torch import Tensor, nn
 
 from spn_data.geometry.pose import Poses, canonical_quats
 
-_ONE_PLACE = 1e-6  # spread, in the world's unit, below which all poses are at one place
+_ONE_PLACE = 1e-6  # spread, in the world's unit, below which all poses count as one place
 
 
 class PoseTargets(nn.Module):
-    """Centre and spread of the training poses, as buffers: they travel with the network's state.
+    """Centre and spread of the training poses, kept as buffers so that they are part of the network's state.
 
-    center : (3,) float64, mean of the centres; scale : () float64, root mean square distance from it, 1
-    where all lie at one place. The heads answer in units of `scale` about `center`, so that they are near 1
-    whatever the size of the area; losses are in the world's unit. hemisphere : (4,) float64, the mean
-    orientation: of q and -q, which are one rotation, the target is that which lies nearer to it.
+    The heads regress in units of `scale` about `center`, so that their outputs are near 1 whatever the size
+    of the area; losses are in the world's unit.
+
+    Attributes
+    ----------
+    center : Tensor, float64, shape (3,)
+        Mean of the camera centres.
+    scale : Tensor, float64, shape ()
+        Root mean square distance from `center`; 1 if all poses are at one place.
+    hemisphere : Tensor, float64, shape (4,)
+        Mean orientation. Since q and -q are the same rotation, the target is the one nearer to it.
     """
 
     center: Tensor
@@ -31,10 +38,11 @@ class PoseTargets(nn.Module):
         self.register_buffer("hemisphere", torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
 
     def fit(self, poses: Poses) -> None:
-        """Measure them on poses (N), N >= 1, all finite.
+        """Compute centre, scale and mean orientation from poses (N), N >= 1, all finite.
 
-        The mean orientation is the eigenvector of the largest eigenvalue of the sum of q q^T: Markley et al.
-        2007, "Averaging quaternions", equation 12. It has no sign, and needs none of its q.
+        The mean orientation is the eigenvector of the largest eigenvalue of the sum of q q^T (Markley et
+        al. 2007, "Averaging quaternions", equation 12), which does not depend on the signs of the
+        quaternions.
         """
         center = poses.centers.mean(axis=0)
         spread = float(np.sqrt(((poses.centers - center) ** 2).sum(axis=1).mean()))
@@ -44,16 +52,16 @@ class PoseTargets(nn.Module):
         self.hemisphere.copy_(torch.from_numpy(canonical_quats(mean)))
 
     def encode(self, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets (N, 3) from the centre in the world's unit, unit quaternions (N, 4); float32."""
+        """Return offsets (N, 3) from the centre (world's unit) and unit quaternions (N, 4), float32."""
         offsets = poses.centers - self.center.cpu().numpy()
         quats = canonical_quats(poses.quats_wxyz)
         quats *= np.where(quats @ self.hemisphere.cpu().numpy() < 0, -1.0, 1.0)[:, None]
         return offsets.astype(np.float32), quats.astype(np.float32)
 
     def decode(self, offsets: np.ndarray, quats: np.ndarray) -> Poses:
-        """The way back from offsets (N, 3) and quaternions (N, 4) of any length and sign.
+        """Return the poses of offsets (N, 3) and quaternions (N, 4) of any length and sign.
 
-        NaN where a value is not finite, or a quaternion has no direction.
+        A pose is NaN if a value is not finite or its quaternion has no direction.
         """
         offsets, quats = np.asarray(offsets, np.float64), np.asarray(quats, np.float64)
         poses = Poses.unknown(len(offsets))

@@ -1,16 +1,17 @@
 """PoseNet (Kendall, Grimes, Cipolla 2015): GoogLeNet with its three classifiers replaced by regressors.
 
-A fully connected layer of 2048 neurons follows the pooling, and `x` and `q` follow that. The two auxiliary
-classifiers of GoogLeNet regress the pose too, and count 0.3 each in the loss; they exist for training.
+A fully connected layer of 2048 neurons follows the pooling, followed by the heads `x` and `q`. GoogLeNet's
+two auxiliary classifiers regress the pose too, with a weight of 0.3 each in the loss; they are used in
+training only.
 
-Where we differ from the authors' Caffe network, so that torchvision's weights load (Places weights of
+Differences from the authors' Caffe network, so that torchvision's weights can be loaded (Places weights of
 GoogLeNet exist for Caffe only):
 
-- GoogLeNet is torchvision's: batch normalisation in each block, 3 x 3 filters in the branch that has 5 x 5
-  in the paper.
-- Its pooling is global, and the auxiliary heads pool into 4 x 4 cells: the input size is free.
-- Its weights were made for images in -1..1: the network rescales its input itself.
-- The auxiliary heads start untrained: torchvision's file holds them, but they were never trained.
+- GoogLeNet is torchvision's: batch normalisation in each block, and 3 x 3 filters in the branch that has 5
+  x 5 filters in the paper.
+- Its pooling is global, and the auxiliary heads pool to 4 x 4 cells, so that the input size is free.
+- Its weights were trained on images in -1..1; the network rescales its input accordingly.
+- The auxiliary heads start untrained: torchvision's file contains them, but they were never trained.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from spn_model.networks.imagenet import MEAN, STD
-from spn_model.networks.regressor import Estimate, Regressor, he_start, heads
+from spn_model.networks.regressor import Estimate, Regressor, initialize_he, make_heads
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseNetOptions:
-    """Rates of the authors' network."""
+    """Dropout rates of the authors' network."""
 
-    dropout: float = 0.5  # share of the 2048 neurons dropped in training
-    auxiliary_dropout: float = 0.7  # share of the auxiliary heads' 1024 neurons
+    dropout: float = 0.5  # fraction of the 2048 neurons dropped in training
+    auxiliary_dropout: float = 0.7  # fraction of the auxiliary heads' 1024 neurons
 
     def __post_init__(self) -> None:
         if not (0 <= self.dropout < 1 and 0 <= self.auxiliary_dropout < 1):
-            raise ValueError("rates of dropout lie from 0 to below 1")
+            raise ValueError("dropout and auxiliary_dropout need to be in [0, 1)")
 
 
 class Convolution(nn.Module):
@@ -46,11 +47,12 @@ class Convolution(nn.Module):
         self.bn = nn.BatchNorm2d(out, eps=0.001)
 
     def forward(self, maps: Tensor) -> Tensor:
+        """Return feature maps (B, out, H', W') of (B, channels, H, W)."""
         return F.relu(self.bn(self.conv(maps)), inplace=True)
 
 
 class Inception(nn.Module):
-    """Four branches side by side; the arguments are the columns of GoogLeNet's table 1."""
+    """Inception block of four parallel branches; the arguments are the columns of GoogLeNet's table 1."""
 
     def __init__(
         self,
@@ -67,7 +69,7 @@ class Inception(nn.Module):
         self.branch2 = nn.Sequential(
             Convolution(channels, reduce3x3, 1), Convolution(reduce3x3, n3x3, 3, padding=1)
         )
-        # 3 x 3 as in torchvision, whose weights are loaded.
+        # 3 x 3 instead of 5 x 5, as in torchvision, whose weights are loaded.
         self.branch3 = nn.Sequential(
             Convolution(channels, reduce5x5, 1), Convolution(reduce5x5, n5x5, 3, padding=1)
         )
@@ -76,31 +78,31 @@ class Inception(nn.Module):
         )
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(B, n1x1 + n3x3 + n5x5 + pool, H, W) from (B, channels, H, W)."""
+        """Return (B, n1x1 + n3x3 + n5x5 + pool, H, W) from (B, channels, H, W)."""
         branches = (self.branch1, self.branch2, self.branch3, self.branch4)
         return torch.cat([branch(maps) for branch in branches], 1)
 
 
 class AuxiliaryHead(nn.Module):
-    """A pose from inner feature maps, pooled into 4 x 4 cells."""
+    """Pose regressor on intermediate feature maps, pooled to 4 x 4 cells."""
 
     def __init__(self, channels: int, dropout: float):
         super().__init__()
         self.conv = Convolution(channels, 128, 1)
         self.fc1 = nn.Linear(128 * 4 * 4, 1024)
         self.dropout = nn.Dropout(dropout)
-        he_start(self, 0.0)
-        self.x, self.q = heads(1024)
+        initialize_he(self, 0.0)
+        self.x, self.q = make_heads(1024)
 
     def forward(self, cells: Tensor) -> Estimate:
-        """x (B, 3), q (B, 4) from (B, channels, 4, 4)."""
+        """Return x (B, 3) and q (B, 4) from (B, channels, 4, 4)."""
         maps = self.conv(cells)  # (B, 128, 4, 4)
         kept = self.dropout(F.relu(self.fc1(maps.flatten(1)), inplace=True))  # (B, 1024)
         return self.x(kept), self.q(kept)
 
 
 class PoseNet(Regressor):
-    """GoogLeNet, `fc1` of 2048 neurons, `x`, `q`, two auxiliary heads: 12 million parameters, 48 MB."""
+    """GoogLeNet with `fc1` of 2048 neurons, heads and two auxiliary heads: 12 million parameters, 48 MB."""
 
     min_side_px = 15
     added = ("fc1", "dropout", "x", "q", "aux1", "aux2")
@@ -113,7 +115,7 @@ class PoseNet(Regressor):
     def __init__(self, options: PoseNetOptions | None = None):
         super().__init__()
         self.options = options = options or PoseNetOptions()
-        # Sizes are those for 224 x 224.
+        # Sizes are for a 224 x 224 input.
         self.conv1 = Convolution(3, 64, 7, stride=2, padding=3)  # (B, 64, 112, 112)
         self.maxpool1 = nn.MaxPool2d(3, stride=2, ceil_mode=True)
         self.conv2 = Convolution(64, 64, 1)  # (B, 64, 56, 56)
@@ -132,8 +134,8 @@ class PoseNet(Regressor):
         self.inception5b = Inception(832, 384, 192, 384, 48, 128, 128)  # (B, 1024, 7, 7)
         self.fc1 = nn.Linear(1024, 2048)
         self.dropout = nn.Dropout(options.dropout)
-        he_start(self, 0.0)
-        self.x, self.q = heads(2048)
+        initialize_he(self, 0.0)
+        self.x, self.q = make_heads(2048)
         self.aux1 = AuxiliaryHead(512, options.auxiliary_dropout)
         self.aux2 = AuxiliaryHead(528, options.auxiliary_dropout)
         shift, scale = torch.tensor(MEAN), torch.tensor(STD)
@@ -141,6 +143,7 @@ class PoseNet(Regressor):
         self.register_buffer("_shift", (2 * shift - 1)[:, None, None], persistent=False)
 
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Return the pooled features (B, 1024), in training mode also two maps for the auxiliary heads."""
         maps = images * self._scale + self._shift  # -1..1
         maps = self.maxpool1(self.conv1(maps))
         maps = self.maxpool2(self.conv3(self.conv2(maps)))
@@ -154,8 +157,10 @@ class PoseNet(Regressor):
         return pooled, F.adaptive_avg_pool2d(after4a, 4), F.adaptive_avg_pool2d(after4d, 4)
 
     def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        """Return the output of `fc1`, (B, 2048)."""
         return self.dropout(F.relu(self.fc1(features[0]), inplace=True))  # (B, 2048)
 
     def auxiliary(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
+        """Return the estimates of the two auxiliary heads in training mode, none in eval mode."""
         cells = zip((self.aux1, self.aux2), features[1:], strict=False)
         return tuple(head(maps) for head, maps in cells)

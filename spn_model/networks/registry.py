@@ -1,4 +1,4 @@
-"""Networks by name, as recipes and checkpoints have them."""
+"""Pose regressors by the names that recipes and checkpoints use."""
 
 from __future__ import annotations
 
@@ -22,13 +22,24 @@ REGRESSORS: dict[str, tuple[Callable[[Any], Regressor], type[Any]]] = {
 
 
 def build(name: str, options: Mapping[str, Any] | None = None, *, seed: int = 0) -> Regressor:
-    """A network with weights drawn from a seed; torch's own random state is left as it was.
+    """Build a network with random weights drawn from a seed; torch's global random state is not changed.
 
-    options : by name, as TOML or JSON has them; what is left out has its default.
-    Raises InputError for a name, an option or a value that there isn't.
+    Parameters
+    ----------
+    name : str
+        A key of `REGRESSORS`.
+    options : mapping, optional
+        Options by name, as read from TOML or JSON; missing ones take their defaults.
+    seed : int
+        Random seed of the weights.
+
+    Raises
+    ------
+    InputError
+        If the name, an option or a value is not known.
     """
     if name not in REGRESSORS:
-        raise InputError(f"there is no network {name!r}; there are {', '.join(REGRESSORS)}")
+        raise InputError(f"unknown network {name!r}; choose one of {', '.join(REGRESSORS)}")
     network, kind = REGRESSORS[name]
     chosen = _options(name, kind, dict(options or {}))
     with torch.random.fork_rng(devices=[]):
@@ -37,7 +48,7 @@ def build(name: str, options: Mapping[str, Any] | None = None, *, seed: int = 0)
 
 
 def options_of(network: Regressor) -> dict[str, Any]:
-    """What `build` needs to make a network of the same kind."""
+    """Return the options with which `build` makes a network of the same architecture."""
     return asdict(network.options)
 
 
@@ -46,16 +57,16 @@ def _options(name: str, kind: type[Any], given: dict[str, Any]) -> Any:
     for option, value in given.items():
         if option not in defaults:
             raise InputError(
-                f"network {name} has no option {option!r}; it has {', '.join(defaults)}"
+                f"network {name} has no option {option!r}; its options are {', '.join(defaults)}"
             )
         wanted = type(defaults[option])
         if wanted is float and type(value) is int:
             given[option] = float(value)
         elif type(value) is not wanted:
             raise InputError(
-                f"option {option} of network {name} is {value!r}, not of type {wanted.__name__}"
+                f"option {option} of network {name} is {value!r}, needs to be of type {wanted.__name__}"
             )
     try:
         return kind(**given)
     except ValueError as error:
-        raise InputError(f"network {name} can't be made so: {error}") from error
+        raise InputError(f"invalid options of network {name}: {error}") from error

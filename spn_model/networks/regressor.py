@@ -1,4 +1,4 @@
-"""What all pose regressors have in common: an image in, a position and a quaternion out."""
+"""Base class of pose regressors: from an image to a position and a quaternion."""
 
 from __future__ import annotations
 
@@ -11,22 +11,39 @@ Estimate = tuple[Tensor, Tensor]  # x (B, 3), q (B, 4)
 
 
 class Regressor(nn.Module, ABC):
-    """A classification network whose end is replaced by two heads, `x` and `q`.
+    """Classification network whose classifier is replaced by two heads, `x` and `q`.
 
-    Images are (B, 3, H, W) float, RGB, normalised with the mean and standard deviation of ImageNet; H and W
-    are free, from `min_side_px` on. Position and quaternion come in the units of the targets; the quaternion
-    (w, x, y, z) isn't normalised here, nor in the paper's loss.
+    Images are (B, 3, H, W) float RGB, normalised with the mean and standard deviation of ImageNet; H and W
+    are free, from `min_side_px` upwards. Position and quaternion are in the units of the targets; the
+    quaternion (w, x, y, z) is normalised neither here nor in the paper's loss.
 
-    A network is its trunk, which has the names and shapes of torchvision's parameters so that published
-    weights load, and the layers that are added to it. Trunk and added layers can be called apart: where the
-    trunk is frozen, what it makes of an image may be stored and trained on.
+    A network consists of a trunk, whose parameters have torchvision's names and shapes so that published
+    weights can be loaded, and of added layers. The two can be called separately: the features of a frozen
+    trunk may be cached and trained on.
+
+    Attributes
+    ----------
+    min_side_px : int
+        Smallest height and width; below it, pooling leaves nothing.
+    added : tuple of str
+        Names of modules without pretrained weights.
+    replaced : tuple of str
+        Prefixes of published parameter names that have no counterpart here.
+    estimate_weights : tuple of float
+        Weight of each estimate in the loss, the main one first.
+    options : dataclass
+        Frozen options that define the architecture.
+    x, q : nn.Linear
+        Heads for position and quaternion.
+    frozen : bool
+        Whether the trunk is frozen.
     """
 
-    min_side_px: ClassVar[int]  # height and width below which pooling leaves nothing
-    added: ClassVar[tuple[str, ...]]  # modules that no pretraining has seen
-    replaced: ClassVar[tuple[str, ...]]  # beginnings of published names that have no place here
-    estimate_weights: ClassVar[tuple[float, ...]] = (1.0,)  # in the loss, by estimate
-    options: Any  # frozen dataclass: what makes a network of the same kind
+    min_side_px: ClassVar[int]
+    added: ClassVar[tuple[str, ...]]
+    replaced: ClassVar[tuple[str, ...]]
+    estimate_weights: ClassVar[tuple[float, ...]] = (1.0,)
+    options: Any
     x: nn.Linear
     q: nn.Linear
 
@@ -41,48 +58,48 @@ class Regressor(nn.Module, ABC):
 
     @abstractmethod
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
-        """(B, ...) features of images (B, 3, H, W): those of the main estimate first.
+        """Return features (B, ...) of images (B, 3, H, W), those of the main estimate first.
 
-        Those of auxiliary estimates follow while the network is in training mode.
+        Features of auxiliary estimates follow in training mode only.
         """
 
     @abstractmethod
     def describe(self, features: tuple[Tensor, ...]) -> Tensor:
-        """(B, D), what the heads `x` and `q` read, from what `trunk` gives."""
+        """Return the descriptor (B, D) that the heads `x` and `q` take, from the output of `trunk`."""
 
     def auxiliary(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
-        """Further estimates that exist for training."""
+        """Return further estimates, which are used in training only."""
         return ()
 
     def regress(self, features: tuple[Tensor, ...]) -> tuple[Estimate, ...]:
-        """Estimates from what `trunk` gives, the main one first."""
+        """Return the estimates from the output of `trunk`, the main one first."""
         descriptor = self.describe(features)
         return (self.x(descriptor), self.q(descriptor)), *self.auxiliary(features)
 
     def estimates(self, images: Tensor) -> tuple[Estimate, ...]:
-        """All estimates from images (B, 3, H, W), for a loss with `estimate_weights`."""
+        """Return all estimates from images (B, 3, H, W), for a loss weighted by `estimate_weights`."""
         return self.regress(self.trunk(images))
 
     def forward(self, images: Tensor) -> Estimate:
-        """x (B, 3) and q (B, 4) of images (B, 3, H, W)."""
+        """Return x (B, 3) and q (B, 4) of images (B, 3, H, W)."""
         return self.estimates(images)[0]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters as "added" and "pretrained"; an inserted normalisation belongs to its trunk."""
+        """Return the parameters as "added" and "pretrained"; inserted normalisations belong to the trunk."""
         groups: dict[str, list[nn.Parameter]] = {"added": [], "pretrained": []}
         for name, parameter in self.named_parameters():
             groups["added" if self._is_added(name) else "pretrained"].append(parameter)
         return groups
 
     def freeze_trunk(self, frozen: bool = True) -> None:
-        """Train the added layers only, or all. A frozen trunk stays in eval mode and takes no gradient."""
+        """Train the added layers only, or all. A frozen trunk stays in eval mode and gets no gradient."""
         self.frozen = frozen
         for parameter in self.parameter_groups()["pretrained"]:
             parameter.requires_grad_(not frozen)
         self.train(self.training)
 
     def train(self, mode: bool = True) -> Self:
-        """As in torch, but that a frozen trunk normalises with its stored statistics and drops nothing."""
+        """Set the training mode; a frozen trunk keeps using its stored statistics, without dropout."""
         super().train(mode)
         if self.frozen:
             for name, module in self.named_children():
@@ -94,8 +111,8 @@ class Regressor(nn.Module, ABC):
         return name.partition(".")[0] in self.added
 
 
-def he_start(module: nn.Module, slope: float) -> None:
-    """Start convolutions and linear layers so that the size of signals lasts through leaky ReLUs.
+def initialize_he(module: nn.Module, slope: float) -> None:
+    """Initialise convolutions and linear layers so that leaky ReLUs preserve the variance of signals.
 
     He et al. 2015, "Delving deep into rectifiers", equation 15. Biases start at 0.
     """
@@ -106,8 +123,8 @@ def he_start(module: nn.Module, slope: float) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-def heads(width: int) -> tuple[nn.Linear, nn.Linear]:
-    """The layers `x` (3 neurons) and `q` (4 neurons), which start near zero: at the centre of the targets."""
+def make_heads(width: int) -> tuple[nn.Linear, nn.Linear]:
+    """Return the heads `x` (3 neurons) and `q` (4 neurons), initialised near zero: the targets' centre."""
     x, q = nn.Linear(width, 3), nn.Linear(width, 4)
     for layer in (x, q):
         nn.init.normal_(layer.weight, std=0.01)

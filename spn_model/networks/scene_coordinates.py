@@ -1,8 +1,8 @@
-"""Scene coordinates: for each cell of 8 x 8 pixels, the point of the scene that it shows, and how surely.
+"""Scene-coordinate network: for each cell of 8 x 8 pixels the scene point it shows, and its uncertainty.
 
 Shotton et al. 2013, "Scene coordinate regression forests"; Brachmann et al. 2017, "DSAC", as one small
-convolutional network on SqueezeNet 1.1 (Iandola et al. 2016). The pose follows by
-`spn_model.onboard.decoding`.
+convolutional network on SqueezeNet 1.1 (Iandola et al. 2016). `spn_model.onboard.decoding` computes the
+pose.
 """
 
 from __future__ import annotations
@@ -14,20 +14,24 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 STRIDE_PX = 8
-# SqueezeNet 1.1 neither pads its first convolution nor its pooling: the first cell lies this far in.
+# Centre of the first cell: SqueezeNet 1.1 pads neither its first convolution nor its pooling.
 FIRST_CELL_PX = 7.5
-PARTS = 48  # of the scene, among which each cell chooses
-_SHARPNESS = 4.0  # factor of the choice's logits, and
-_REACH = 0.3  # of the coordinates within a part, in spreads: what makes both learn at one rate
-_FAR = 4.0  # spreads from the centre: points beyond are in no part
-_LOG_SCALE = (-6.0, 4.0)  # bounds of the certainty: 0.2 % to 55 times the scene's spread
+PARTS = 48  # parts of the scene, which each cell classifies into
+# Factors that let one learning rate suit both classification and regression:
+_SHARPNESS = 4.0  # of the part logits
+_REACH = 0.3  # of the offsets from a part's centre, in spreads
+_FAR = 4.0  # spreads from the scene's centre; points beyond belong to no part
+_LOG_SCALE = (-6.0, 4.0)  # bounds of the log scale: 0.2 % to 55 times the scene's spread
 
 
 def grid_size(width: int, height: int) -> tuple[int, int]:
-    """Cells (columns, rows) of an image. Raises ValueError where it is smaller than the network takes."""
+    """Return the number of cells (columns, rows) of an image.
+
+    Raises ValueError if the image is smaller than the network needs.
+    """
     smallest = SceneCoordinates.min_side_px
     if min(width, height) < smallest:
-        raise ValueError(f"an image of {width} x {height} is smaller than {smallest} pixels")
+        raise ValueError(f"an image of {width} x {height} is smaller than {smallest} px a side")
 
     def cells(side: int) -> int:
         side = (side - 3) // 2 + 1
@@ -39,7 +43,11 @@ def grid_size(width: int, height: int) -> tuple[int, int]:
 
 
 class TorchvisionFire(nn.Module):
-    """1 x 1 squeeze, then 1 x 1 and 3 x 3 expand side by side; torchvision's names of parameters."""
+    """Fire module: 1 x 1 squeeze, then parallel 1 x 1 and 3 x 3 expand, with torchvision's parameter names.
+
+    It applies one ReLU after the concatenation, as the published network does; the `Fire` of SqueezePoseNet
+    has a normalised activation for each convolution.
+    """
 
     def __init__(self, inputs: int, squeeze: int, expand: int):
         super().__init__()
@@ -48,12 +56,13 @@ class TorchvisionFire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeeze, expand, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return (B, 2 * expand, H, W) from (B, inputs, H, W)."""
         x = functional.relu(self.squeeze(x), inplace=True)
         return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], 1), inplace=True)
 
 
 class Context(nn.Module):
-    """What lies around each cell, at a distance: added to it. 53 thousand parameters."""
+    """Residual block that adds context from a distance to each cell; 53 thousand parameters."""
 
     def __init__(self, channels: int, inner: int, dilation: int):
         super().__init__()
@@ -63,36 +72,51 @@ class Context(nn.Module):
         for layer in (self.reduce, self.around):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-        # It begins as nothing.
+        # The block starts as the identity.
         nn.init.zeros_(self.expand.weight)
         nn.init.zeros_(self.expand.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return feature maps of the input's shape."""
         near = functional.relu(self.reduce(x), inplace=True)
         return x + self.expand(functional.relu(self.around(near), inplace=True))
 
 
 class SceneCoordinates(nn.Module):
-    """Images (B, 3, H, W) -> coordinates (B, 3, h, w) in the scene's frame, log scale (B, 1, h, w).
+    """Network from images (B, 3, H, W) to scene coordinates (B, 3, h, w) and log scales (B, 1, h, w).
 
-    Images are RGB, normalised as ImageNet's; they are first reduced by `shrink`, then given to `cells`, which
-    training does directly. The log scale is that of an isotropic Laplace distribution in the scene's unit:
-    the smaller, the surer. Of a reduced image, cell (0, 0) has its centre at pixel (7.5, 7.5) in COLMAP's
-    convention, its neighbours 8 pixels on; `grid_size` gives h and w.
+    Images are RGB, normalised with ImageNet's mean and standard deviation. `forward` first reduces them by
+    `shrink` and passes them to `cells`, which training calls directly. The log scale is that of an
+    isotropic Laplace distribution in the scene's unit; a smaller one means a more certain cell. In a
+    reduced image, the centre of cell (0, 0) is at pixel (7.5, 7.5) in COLMAP's convention and neighbours
+    are 8 pixels apart; `grid_size` gives h and w.
 
-    The features are SqueezeNet 1.1's as published, without normalisation: the head needs no descriptor of
-    the whole image, and batches of one scene have statistics of their own. Weights at stride 16 see all
-    of an image of 480 x 270: facades repeat, and only what lies around them tells windows apart.
+    Attributes
+    ----------
+    center : Tensor, shape (3,)
+        Centre of the points that the training images see; outputs are centred by it.
+    spread : Tensor, shape ()
+        Spread of these points; outputs are scaled by it.
+    place : Tensor, shape (3, 48)
+        Centres of the scene's parts, centred and scaled likewise.
+    fine_mean, coarse_mean : Tensor, shape (256,) and (512,)
+        Means of the published features on training images, by which the head's inputs are centred.
+    fine_std, coarse_std : Tensor, shape ()
+        Standard deviations of these features, by which the head's inputs are scaled; fixed once measured.
+    covariance_scale : Tensor, shape ()
+        Factor of the covariances of decoded poses, measured on validation images.
 
-    A cell chooses among parts of the scene (`pick`), then tells where it lies against the mean of their
-    middles: a choice tells repeated facades apart sooner than a regression (Li et al. 2020, "Hierarchical
-    scene coordinate classification and regression for visual localization").
+    Notes
+    -----
+    The features are SqueezeNet 1.1's as published, without batch normalisation: the head needs no
+    descriptor of the whole image, and batches of a single scene have statistics of their own. The layers at
+    stride 16 see all of an image of 480 x 270: facades repeat, and only their surroundings distinguish one
+    window from another.
 
-    center (3,), spread () : of the training images' points; outputs are centred and scaled by them.
-    place (3, 48) : middles of the parts, centred and scaled likewise.
-    fine_mean (256,), coarse_mean (512,), fine_std, coarse_std () : of the published features on training
-    images; what the head receives is centred and scaled by them, once for all.
-    covariance_scale () : factor of the covariances of decoded poses, measured on validation images.
+    Each cell classifies itself into a part of the scene (`pick`) and then regresses an offset from the mean
+    of the part centres, weighted by the class probabilities. Classification separates repeated facades
+    sooner than regression (Li et al. 2020, "Hierarchical scene coordinate classification and regression for
+    visual localization").
     """
 
     min_side_px: ClassVar[int] = 63
@@ -154,9 +178,9 @@ class SceneCoordinates(nn.Module):
 
     @torch.no_grad()
     def set_scene(self, xyz: Tensor) -> None:
-        """Centre and spread of the outputs, and parts, from points (N, 3) that the training images see.
+        """Set centre, spread and parts of the scene from points (N, 3) that the training images see.
 
-        By medians: a map has points far outside the scene.
+        Uses medians, because a map has outliers far outside the scene.
         """
         self.center = xyz.median(dim=0).values.to(self.center)
         self.spread = (xyz - xyz.median(dim=0).values).norm(dim=1).median().to(self.spread)
@@ -164,49 +188,51 @@ class SceneCoordinates(nn.Module):
         self.place.copy_(_middles(scaled[scaled.norm(dim=1) < _FAR]).T)
 
     def part_of(self, xyz: Tensor) -> Tensor:
-        """Index of the part (N,) whose middle is the nearest to points (N, 3)."""
+        """Return the index (N,) of the part whose centre is nearest to each point (N, 3)."""
         scaled = (xyz - self.center) / self.spread
         return torch.cdist(scaled, self.place.T).argmin(dim=1)
 
     @torch.no_grad()
     def measure_features(self, images: Tensor) -> None:
-        """Normalise what the head receives, by training images (B, 3, H, W) and the weights as they are.
+        """Set the normalisation of the head's inputs from training images (B, 3, H, W).
 
-        Without it the first steps of the training blow up: a published feature may be 800 large.
+        It depends on the current weights of the features. Without it the first training steps diverge:
+        published features can be as large as 800.
         """
         fine = self.features[:8](self.reduced(images))
         for name, x in (("fine", fine), ("coarse", self.features[8:](fine))):
             mean = x.mean(dim=(0, 2, 3))
-            # One scale for all channels: channels that rarely answer would be blown up by their own.
+            # One scale for all channels: a scale of their own would blow up channels that are rarely active.
             spread = (x - mean[:, None, None]).square().mean().sqrt()
             getattr(self, f"{name}_mean").copy_(mean)
             getattr(self, f"{name}_std").copy_(spread)
 
     @property
     def first_cell_px(self) -> float:
-        """Where the centre of the first cell lies in an image, along both axes."""
+        """Pixel coordinate of the first cell's centre in the full image, along both axes."""
         return FIRST_CELL_PX * self.shrink
 
     @property
     def stride_px(self) -> float:
-        """From one cell to the next, in the image."""
+        """Distance between neighbouring cells in the full image, in pixels."""
         return float(STRIDE_PX * self.shrink)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coordinates (B, 3, h, w) and log scales (B, 1, h, w) of images (B, 3, H, W)."""
         coordinates, log_scale, _ = self.cells(self.reduced(images))
         return coordinates, log_scale
 
     def reduced(self, images: Tensor) -> Tensor:
-        """What `cells` takes: each pixel the mean of shrink x shrink."""
+        """Return the input of `cells`: images averaged over blocks of shrink x shrink pixels."""
         return functional.avg_pool2d(images, self.shrink) if self.shrink > 1 else images
 
     def cells(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `forward`, of images that are reduced already; also logits (B, 48, h, w) of the parts."""
+        """Return coordinates, log scales and part logits (B, 48, h, w) of images already reduced."""
         fine = self.features[:8](images)
         coarse = self._normalised("coarse", self.features[8:](fine))
         coarse = functional.relu(self.coarse(coarse), inplace=True)
         coarse = self.wide(coarse + functional.relu(self.context(coarse)))
-        # Cell n at stride 16 lies on cell 2n + 1 at stride 8, and half-way cells between.
+        # Cell n at stride 16 is centred on cell 2n + 1 at stride 8; the cells between are interpolated.
         coarse = functional.pad(coarse, (1, 1, 1, 1), mode="replicate")
         size = [2 * side - 1 for side in coarse.shape[-2:]]
         up = functional.interpolate(coarse, size=size, mode="bilinear", align_corners=True)
@@ -214,11 +240,11 @@ class SceneCoordinates(nn.Module):
         up = up[..., 1 : 1 + rows, 1 : 1 + columns]
         x = functional.relu(self.fine(self._normalised("fine", fine)) + up, inplace=True)
         x = functional.relu(x + self.merge(x), inplace=True)
-        # bfloat16 would round coordinates to 0.4 %: decimetres.
+        # Compute in float32: bfloat16 rounds coordinates to 0.4 %, which is decimetres.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             out, logits = self.out(x), self.pick(x) * _SHARPNESS
-            # A product of matrices, not a convolution: a quantizer leaves it alone, and what comes before.
+            # A matrix product, not a convolution, so that the quantizer leaves it and its inputs in float.
             chosen = self.place @ logits.softmax(dim=1).flatten(2)
             coordinates = chosen.reshape(out[:, :3].shape) + out[:, :3] * _REACH
             coordinates = coordinates * self.spread + self.center[:, None, None]
@@ -226,7 +252,7 @@ class SceneCoordinates(nn.Module):
         return coordinates, log_scale, logits
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters as "added" and "pretrained", as the regressors have them."""
+        """Return the parameters as "added" and "pretrained", as `Regressor.parameter_groups` does."""
         groups: dict[str, list[nn.Parameter]] = {"added": [], "pretrained": []}
         for name, parameter in self.named_parameters():
             added = name.partition(".")[0] in self.added
@@ -234,7 +260,10 @@ class SceneCoordinates(nn.Module):
         return groups
 
     def freeze_features(self, layers: int) -> None:
-        """Keep the first layers as published: at 5, those at stride 4 and finer, half of a step's time."""
+        """Freeze the first layers at their published weights.
+
+        With 5 layers, those at stride 4 and finer are frozen, which account for half of the time of a step.
+        """
         for k, layer in enumerate(self.features):
             layer.requires_grad_(k >= layers)
 
@@ -244,9 +273,27 @@ class SceneCoordinates(nn.Module):
 
 
 def laplace_loss(coordinates: Tensor, log_scale: Tensor, targets: Tensor, known: Tensor) -> Tensor:
-    """Mean negative log likelihood, without its constant, of targets (B, 3, h, w) where known (B, h, w).
+    """Return the mean negative log-likelihood of target points, without its constant.
 
-    The density falls with exp(-distance / scale) in three dimensions: distance / scale + 3 log scale.
+    Parameters
+    ----------
+    coordinates : Tensor, shape (B, 3, h, w)
+        Estimated scene coordinates.
+    log_scale : Tensor, shape (B, 1, h, w)
+        Log scales of the Laplace distributions.
+    targets : Tensor, shape (B, 3, h, w)
+        True scene coordinates.
+    known : Tensor of bool, shape (B, h, w)
+        Cells that have a target.
+
+    Returns
+    -------
+    Tensor, shape ()
+
+    Notes
+    -----
+    The density is proportional to exp(-distance / scale) in three dimensions, so that the negative
+    log-likelihood is distance / scale + 3 log scale.
     """
     distance = (coordinates - targets).square().sum(1).add(1e-12).sqrt()
     log_scale = log_scale[:, 0]
@@ -254,9 +301,9 @@ def laplace_loss(coordinates: Tensor, log_scale: Tensor, targets: Tensor, known:
 
 
 def _middles(points: Tensor, rounds: int = 15, most: int = 20_000) -> Tensor:
-    """Middles (48, 3) of as many groups of points (N, 3), always the same ones: Lloyd's k-means.
+    """Return k-means centres (48, 3) of points (N, 3), always the same ones: Lloyd's algorithm.
 
-    It begins as k-means++ (Arthur and Vassilvitskii 2007). Without points all middles are 0.
+    The centres are initialised by k-means++ (Arthur and Vassilvitskii 2007). Without points they are all 0.
     """
     generator = torch.Generator(points.device).manual_seed(0)
     if not len(points):

@@ -1,25 +1,26 @@
 """SqueezePoseNet: SqueezeNet (Iandola et al. 2016) adapted to pose regression.
 
 Müller, Urban, Jutzi 2017, "SqueezePoseNet: image based pose regression with small convolutional neural
-networks for real time UAS navigation", section 3: a fully connected layer `fc11` of 500 neurons as a
-descriptor, every ReLU a Leaky ReLU, batch normalisation after each convolution, heads `x` and `q`.
+networks for real time UAS navigation", section 3: a fully connected layer `fc11` of 500 neurons as
+descriptor, Leaky ReLUs instead of all ReLUs, batch normalisation after each convolution, and the heads `x`
+and `q`.
 
-What the paper leaves open, and what we do:
+The paper leaves some choices open; these are made here:
 
-- SqueezeNet 1.0 or 1.1: 1.1. It computes 2.4 times less for the same accuracy on ImageNet, and its weights
-  are shipped. The paper's 4.8 MB are those of 1.0; `version = "1.0"` gives it.
-- Whether conv10 stays: dropped. Its 1000 channels are made for the classes of ImageNet, and its 513,000
-  weights are 42 % of the network; `fc11` takes its number's successor as its name, not its input.
-  `conv10 = true` keeps it, with weights that include it.
-- Where `fc11` attaches: to the global average of the last feature maps, where SqueezeNet averages too. This
-  takes images of any size; a layer on all cells of the map would have 5 million weights and more.
-- What follows `fc11`: a Leaky ReLU. Without one, `fc11` and the heads would be a single linear map.
-- The slope: 0.01, that of the paper's reference for Leaky ReLUs (Maas et al. 2013). SqueezeNet's
-  pre-activations are negative by hundreds, so that a larger slope drowns the pretrained features: on 60
-  frames, pooled features correlate with the original ones by 0.99 at 0.01, and by 0.68 at 0.1.
-- Dropout: 0.5 on the pooled features, SqueezeNet's own, in its own place before the classifier.
-- Batch normalisation of pretrained layers: as the identity (`start_as_identity`).
-- Input size: free. Optimiser and rates are matters of the training recipe.
+- SqueezeNet version: 1.1. It needs 2.4 times less computation for the same accuracy on ImageNet, and its
+  weights are shipped. The paper's 4.8 MB are those of 1.0; use `version = "1.0"` for it.
+- conv10: dropped. Its 1000 channels belong to the classes of ImageNet, and its 513,000 weights are 42 % of
+  the network; `fc11` continues its numbering but does not need its output. `conv10 = true` keeps it, with
+  weights that include it.
+- Input of `fc11`: the global average of the last feature maps, where SqueezeNet averages too. This allows
+  images of any size; a layer on all cells of the map would have at least 5 million weights.
+- After `fc11`: a Leaky ReLU. Without one, `fc11` and the heads would be a single linear map.
+- Slope: 0.01, as in the paper's reference for Leaky ReLUs (Maas et al. 2013). SqueezeNet's pre-activations
+  reach minus several hundred, so that a larger slope drowns the pretrained features: on 60 frames, pooled
+  features correlate with the original ones by 0.99 at 0.01, but by 0.68 at 0.1.
+- Dropout: 0.5 on the pooled features, SqueezeNet's own rate, where SqueezeNet has it before the classifier.
+- Batch normalisation of pretrained layers: initialised as the identity (`initialize_as_identity`).
+- Input size: free. Optimiser and learning rate are set by the training recipe.
 """
 
 from __future__ import annotations
@@ -30,27 +31,27 @@ import torch
 from torch import Tensor, nn
 
 from spn_model.networks.normalization import normalized_leaky_relu
-from spn_model.networks.regressor import Regressor, he_start, heads
+from spn_model.networks.regressor import Regressor, initialize_he, make_heads
 
 
 @dataclass(frozen=True, kw_only=True)
 class SqueezePoseNetOptions:
-    """What the paper leaves open."""
+    """Choices that the paper leaves open."""
 
-    version: str = "1.1"  # of SqueezeNet: 1.0 or 1.1
+    version: str = "1.1"  # SqueezeNet version, 1.0 or 1.1
     conv10: bool = False  # keep the classifier's convolution before the pooling
-    slope: float = 0.01  # of the Leaky ReLUs
-    dropout: float = 0.5  # share of pooled features dropped in training
+    slope: float = 0.01  # slope of the Leaky ReLUs
+    dropout: float = 0.5  # fraction of the pooled features dropped in training
 
     def __post_init__(self) -> None:
         if self.version not in ("1.0", "1.1"):
-            raise ValueError(f"SqueezeNet is of version 1.0 or 1.1, not {self.version!r}")
+            raise ValueError(f"version is {self.version!r}, needs to be 1.0 or 1.1")
         if not (0 <= self.slope < 1 and 0 <= self.dropout < 1):
-            raise ValueError("slope and dropout lie from 0 to below 1")
+            raise ValueError("slope and dropout need to be in [0, 1)")
 
 
 class Fire(nn.Module):
-    """A squeeze to few channels, then 1x1 and 3x3 filters side by side (the paper's figure 2)."""
+    """Fire module: squeeze to few channels, then parallel 1x1 and 3x3 filters (the paper's figure 2)."""
 
     def __init__(self, channels: int, squeeze: int, expand: int, slope: float):
         super().__init__()
@@ -62,7 +63,7 @@ class Fire(nn.Module):
         self.expand3x3_activation = normalized_leaky_relu(expand, slope)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(B, 2 * expand, H, W) from (B, channels, H, W)."""
+        """Return (B, 2 * expand, H, W) from (B, channels, H, W)."""
         squeezed = self.squeeze_activation(self.squeeze(maps))
         narrow = self.expand1x1_activation(self.expand1x1(squeezed))
         wide = self.expand3x3_activation(self.expand3x3(squeezed))
@@ -70,7 +71,7 @@ class Fire(nn.Module):
 
 
 class SqueezePoseNet(Regressor):
-    """SqueezeNet, `fc11`, `x`, `q`: 0.99 million parameters, 4.0 MB, with the default options."""
+    """SqueezeNet with `fc11`, `x` and `q`: 0.99 million parameters, 4.0 MB, with the default options."""
 
     min_side_px = 21
     added = ("dropout", "fc11", "fc11_activation", "x", "q")
@@ -85,34 +86,37 @@ class SqueezePoseNet(Regressor):
         width = 512
         if options.conv10:
             width = 1000
-            # torchvision's names: its dropout is classifier.0.
+            # Keep torchvision's parameter names: classifier.0 is its dropout.
             self.classifier = nn.Sequential(
                 nn.Identity(), nn.Conv2d(512, 1000, 1), normalized_leaky_relu(1000, slope)
             )
         self.dropout = nn.Dropout(options.dropout)
         self.fc11 = nn.Linear(width, 500)
         self.fc11_activation = nn.LeakyReLU(slope)
-        he_start(self, slope)
-        self.x, self.q = heads(500)
+        initialize_he(self, slope)
+        self.x, self.q = make_heads(500)
 
     @property
     def weights_name(self) -> str:
+        """Name of the published SqueezeNet weights that match the version and whether conv10 is kept."""
         if self.options.version == "1.0":
             return "squeezenet1_0"
         return "squeezenet1_1" if self.options.conv10 else "squeezenet1_1-features"
 
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Return the globally averaged feature maps, (B, 512), or (B, 1000) with conv10."""
         maps = self.features(images)  # (B, 512, about H / 16, about W / 16)
         if self.options.conv10:
             maps = self.classifier(maps)  # (B, 1000, ...)
         return (maps.mean((2, 3)),)  # (B, 512 or 1000)
 
     def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        """Return the descriptor of `fc11`, (B, 500)."""
         return self.fc11_activation(self.fc11(self.dropout(features[0])))  # (B, 500)
 
 
 def squeezenet1_1(slope: float) -> nn.Sequential:
-    """The layers conv1 to fire9 of SqueezeNet 1.1; sizes are those for 224 x 224."""
+    """Return the layers conv1 to fire9 of SqueezeNet 1.1; sizes are for a 224 x 224 input."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 3, stride=2),  # conv1 (B, 64, 111, 111)
         normalized_leaky_relu(64, slope),
@@ -131,7 +135,7 @@ def squeezenet1_1(slope: float) -> nn.Sequential:
 
 
 def squeezenet1_0(slope: float) -> nn.Sequential:
-    """The layers conv1 to fire9 of SqueezeNet 1.0; sizes are those for 224 x 224."""
+    """Return the layers conv1 to fire9 of SqueezeNet 1.0; sizes are for a 224 x 224 input."""
     return nn.Sequential(
         nn.Conv2d(3, 96, 7, stride=2),  # conv1 (B, 96, 109, 109)
         normalized_leaky_relu(96, slope),

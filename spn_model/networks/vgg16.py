@@ -1,15 +1,15 @@
 """VGG16 (Simonyan and Zisserman 2014) adapted to pose regression, the paper's large network.
 
-Müller, Urban, Jutzi 2017, section 3: the activations are Leaky ReLUs and two dense layers, `x` and `q`, are
-added. It starts from Places365 weights there; a file with torchvision's names takes them in.
+Müller, Urban, Jutzi 2017, section 3: the activations are Leaky ReLUs, and two dense layers `x` and `q` are
+added. The paper starts from Places365 weights; a file with torchvision's parameter names can be loaded.
 
-What the paper leaves open, and what we do:
+The paper leaves some choices open; these are made here:
 
-- Where the heads attach: to fc7, the last layer of VGG16 before its classes.
-- Whether batch normalisation is inserted as in SqueezePoseNet: no, the paper names dense layers and
-  activations only.
-- Input size: free, by torchvision's pooling of the last feature maps into 7 x 7 cells.
-- Slope 0.01 (Maas et al. 2013); dropout 0.5 after fc6 and fc7, VGG16's own.
+- Input of the heads: fc7, VGG16's last layer before its classifier.
+- No batch normalisation is inserted, unlike in SqueezePoseNet: the paper names dense layers and activations
+  only.
+- Input size: free, by torchvision's pooling of the last feature maps to 7 x 7 cells.
+- Slope 0.01 (Maas et al. 2013); dropout 0.5 after fc6 and fc7, as in VGG16.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from spn_model.networks.regressor import Regressor, he_start, heads
+from spn_model.networks.regressor import Regressor, initialize_he, make_heads
 
 
 @dataclass(frozen=True, kw_only=True)
 class VGG16Options:
-    """What the paper leaves open."""
+    """Choices that the paper leaves open."""
 
-    slope: float = 0.01  # of the Leaky ReLUs
-    dropout: float = 0.5  # share of fc6 and of fc7 dropped in training
+    slope: float = 0.01  # slope of the Leaky ReLUs
+    dropout: float = 0.5  # fraction of fc6 and of fc7 dropped in training
 
     def __post_init__(self) -> None:
         if not (0 <= self.slope < 1 and 0 <= self.dropout < 1):
-            raise ValueError("slope and dropout lie from 0 to below 1")
+            raise ValueError("slope and dropout need to be in [0, 1)")
 
 
 class VGG16(Regressor):
-    """VGG16 to fc7, `x`, `q`: 134 million parameters, 537 MB."""
+    """VGG16 up to fc7 with the heads `x` and `q`: 134 million parameters, 537 MB."""
 
     min_side_px = 32
     added = ("dropout", "x", "q")
@@ -55,19 +55,21 @@ class VGG16(Regressor):
             nn.LeakyReLU(slope, inplace=True),
         )
         self.dropout = nn.Dropout(options.dropout)
-        he_start(self, slope)
-        self.x, self.q = heads(4096)
+        initialize_he(self, slope)
+        self.x, self.q = make_heads(4096)
 
     def trunk(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Return the output of fc7, (B, 4096)."""
         maps = self.avgpool(self.features(images))  # (B, 512, 7, 7)
         return (self.classifier(maps.flatten(1)),)  # (B, 4096)
 
     def describe(self, features: tuple[Tensor, ...]) -> Tensor:
+        """Return the features (B, 4096) after dropout."""
         return self.dropout(features[0])  # (B, 4096)
 
 
 def vgg16(slope: float) -> nn.Sequential:
-    """Configuration D of VGG's table 1 to its last pooling; sizes are those for 224 x 224."""
+    """Return configuration D of VGG's table 1 up to its last pooling; sizes are for a 224 x 224 input."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 3, padding=1),  # (B, 64, 224, 224)
         nn.LeakyReLU(slope, inplace=True),

@@ -75,7 +75,7 @@ CATALOGUE = (
 )
 
 
-def of_name(name: str) -> Weights:
+def by_name(name: str) -> Weights:
     """Raises InputError for a name that isn't in the catalogue."""
     for weights in CATALOGUE:
         if weights.name == name:

@@ -43,7 +43,7 @@ def torch_seed_of_step(seed: int, stage: int, step: int, rank: int = 0) -> int:
     return int(np.random.SeedSequence([seed, stage, step, 2, rank]).generate_state(1)[0])
 
 
-class Ahead:
+class BatchPrefetcher:
     """Batches by their numbers; while one is used the next are made, in threads.
 
     Threads, since OpenCV, NumPy and torch let others run while they compute, and images need not be sent.
@@ -73,15 +73,15 @@ class Ahead:
 
 
 @contextmanager
-def batches_ahead(
+def prefetch_batches(
     make: Callable[[int], Batch], first: int, workers: int, depth: int = 0
-) -> Iterator[Ahead]:
+) -> Iterator[BatchPrefetcher]:
     """`make` is called with number `first` and those after it, by threads that end with the block.
 
     depth : that are ready or under way, at most; at least two for each worker.
     """
     pool = ThreadPoolExecutor(workers, "batches", initializer=torch.set_num_threads, initargs=(1,))
     try:
-        yield Ahead(make, first, pool, max(depth, 2 * workers))
+        yield BatchPrefetcher(make, first, pool, max(depth, 2 * workers))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

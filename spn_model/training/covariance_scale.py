@@ -7,13 +7,13 @@ from scipy.special import chdtri
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, rotation_vectors
-from spn_model.evaluation.calibration import DOF, squared_distances
+from spn_model.evaluation.calibration import DOF, nees
 from spn_model.models.pose_model import PoseEstimates
 
 LEAST_FRAMES = 10
 
 
-def measured_scale(estimates: PoseEstimates, truth: Poses) -> float:
+def fit_covariance_scale(estimates: PoseEstimates, truth: Poses) -> float:
     """Factor by which the covariances of these estimates have to grow, from the true poses (N).
 
     The median of the errors' squared Mahalanobis distances becomes that of chi-squared with 6 degrees of
@@ -27,9 +27,7 @@ def measured_scale(estimates: PoseEstimates, truth: Poses) -> float:
     errors[known, :3] = truth.centers[known] - estimates.poses.centers[known]
     turns = truth.rotations[known] @ estimates.poses.rotations[known].swapaxes(1, 2)
     errors[known, 3:] = rotation_vectors(turns)
-    squared = squared_distances(
-        errors, np.where(known[:, None, None], estimates.covariance, np.nan)
-    )
+    squared = nees(errors, np.where(known[:, None, None], estimates.covariance, np.nan))
     squared = squared[np.isfinite(squared)]
     if len(squared) < LEAST_FRAMES:
         raise GeometryError(

@@ -21,7 +21,7 @@ class Gradients:
     ):
         self._model, self._parameters, self._pool = model, parameters, pool
 
-    def of(self, parts: Sequence[Batch]) -> tuple[Tensor, dict[str, Tensor]]:
+    def compute(self, parts: Sequence[Batch]) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss of a step's parts, and its figures, detached; parameters have the mean's gradient.
 
         The sum is taken in the order of the parts: it does not depend on which is ready first.
@@ -46,7 +46,7 @@ class Gradients:
 
 
 @contextmanager
-def gradients(
+def gradient_workers(
     model: PoseModel, parameters: Sequence[nn.Parameter], parts: int, machine: Machine
 ) -> Iterator[Gradients]:
     """Threads for the parts of each step, which end with the block.

@@ -81,7 +81,7 @@ def choose(
 
 
 @contextmanager
-def prepared(machine: Machine) -> Iterator[None]:
+def limited_threads(machine: Machine) -> Iterator[None]:
     """Libraries compute with the machine's threads inside, and as before after it."""
     before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(machine.threads)
@@ -104,11 +104,11 @@ class Ranks:
     local_rank: int = 0
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process writes and speaks."""
         return self.rank == 0
 
-    def start_alike(self, tensors: Sequence[Tensor]) -> None:
+    def broadcast_from_first(self, tensors: Sequence[Tensor]) -> None:
         """Give all processes the first one's values."""
         if self.world > 1:
             for tensor in tensors:
@@ -124,7 +124,7 @@ class Ranks:
         if self.world == 1:
             return seconds, stop
         parts = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
-        told = [seconds if self.leads else 0.0, float(stop)]
+        told = [seconds if self.is_main else 0.0, float(stop)]
         more = torch.tensor(told, device=parts[0].device)
         flat = torch.cat([*(part.float().reshape(-1) for part in parts), more])
         distributed.all_reduce(flat)
@@ -142,7 +142,7 @@ class Ranks:
 
 
 @contextmanager
-def joined(device: str) -> Iterator[Ranks]:
+def process_group(device: str) -> Iterator[Ranks]:
     """The processes that `torchrun` started, if it did; they part at the end."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Ranks()

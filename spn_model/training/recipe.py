@@ -51,7 +51,7 @@ class Stage:
     options: Mapping[str, Any] = field(default_factory=dict)  # of the kind of network
 
     @property
-    def images_about(self) -> int:
+    def expected_images(self) -> int:
         """Training images that it draws: its budget, or what two cores compute in its minutes."""
         by_minutes = round(self.minutes * 60 * _IMAGES_PER_S)
         return min((n for n in (self.images, by_minutes) if n), default=0)
@@ -61,7 +61,7 @@ class Stage:
         by_images = drawn / self.images if self.images else 0.0
         return max(by_images, seconds / 60 / self.minutes if self.minutes else 0.0)
 
-    def rate_at(self, step: int, progress: float) -> float:
+    def learning_rate_at(self, step: int, progress: float) -> float:
         """The rate of learning of a step (from 0), after `progress` of the budget."""
         rate = self.rate * min(1.0, (step + 1) / max(self.warmup_steps, 1))
         if self.schedule == "cosine":
@@ -91,7 +91,7 @@ class Recipe:
         return {**asdict(self), "stages": [asdict(stage) for stage in self.stages]}
 
     @property
-    def shares(self) -> list[float]:
+    def budget_shares(self) -> list[float]:
         """Of the stages in the whole budget."""
         by = [float(stage.images) for stage in self.stages]
         if not all(by):
@@ -110,7 +110,7 @@ class Recipe:
                     images=0 if images is None else max(stage.batch, round(images * share)),
                     minutes=0.0 if minutes is None else minutes * share,
                 )
-                for stage, share in zip(self.stages, self.shares, strict=True)
+                for stage, share in zip(self.stages, self.budget_shares, strict=True)
             ),
         )
 

@@ -25,17 +25,17 @@ from spn_model.examples.training_set import TrainingSet
 from spn_model.models.pose_model import Batch, PoseModel
 from spn_model.models.registry import make
 from spn_model.training.batches import (
-    batches_ahead,
     generator_of_step,
+    prefetch_batches,
     rows_of_step,
     torch_seed_of_step,
 )
-from spn_model.training.gradients import gradients
-from spn_model.training.machine import Machine, Ranks, choose, joined, prepared
+from spn_model.training.gradients import gradient_workers
+from spn_model.training.machine import Machine, Ranks, choose, limited_threads, process_group
 from spn_model.training.muon import Muon
 from spn_model.training.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
-from spn_model.training.training_loss import Diverged, Losses
-from spn_model.training.training_record import Clock, Files, Record, Watch, judged_frames
+from spn_model.training.training_loss import Diverged, LossMonitor
+from spn_model.training.training_record import Clock, Files, Record, Watch, select_validation_frames
 from spn_model.training.training_state import Position, read_state
 
 _LOG_EVERY_S = 10.0
@@ -84,12 +84,12 @@ def train(
     Starts anew, or goes on from files.state. Raises InputError and FormatError for a recipe, weights or data
     that nothing can be trained with or on, StageError where the loss diverges or the disk is full.
     """
-    with joined(options.device) as ranks, ExitStack() as stack:
+    with process_group(options.device) as ranks, ExitStack() as stack:
         machine = choose(
             *(options.device, options.threads, options.precision, ranks.local_rank),
             makes_batches=True,
         )
-        stack.enter_context(prepared(machine))
+        stack.enter_context(limited_threads(machine))
         state = read_state(files.state)
         position = Position() if state is None else state.position
         model = make(recipe.kind, recipe.options, seed=options.seed)
@@ -105,8 +105,8 @@ def train(
             model.load_pretrained(model.weights_name if published else recipe.weights)
         area = stack.enter_context(Dataset(data.area))
         record = None
-        if ranks.leads:
-            judged = judged_frames(
+        if ranks.is_main:
+            judged = select_validation_frames(
                 area, _training_group(area), options.validation_frames, options.sample
             )
             facts = {"recipe": recipe.plain(), "seed": options.seed, **machine.plain()}
@@ -127,16 +127,16 @@ def train(
             if record is not None:
                 on_area = [s for s in recipe.stages[: index + 1] if data.of(s) == data.area]
                 learnt = {g.name: None for s in on_area for g in _groups_of(area, s.frames)}
-                record.trains_on(list(learnt), images)
+                record.set_training_frames(list(learnt), images)
             model.network.to(machine.device)
             model.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-            model.begin_stage(stage.options, images, stage.images_about)
-            ranks.start_alike(list(model.network.state_dict().values()))
+            model.begin_stage(stage.options, images, stage.expected_images)
+            ranks.broadcast_from_first(list(model.network.state_dict().values()))
             optimizer = optimizer_of(recipe, stage, model)
             if state is not None:
                 state.restore_optimizer(optimizer)
                 state = None
-            validations = max(1, round(options.validations * recipe.shares[index]))
+            validations = max(1, round(options.validations * recipe.budget_shares[index]))
             run_stage(
                 *(stage, index, images, model, optimizer, position),
                 *(machine, ranks, record, watch, options.seed, validations),
@@ -167,7 +167,7 @@ def run_stage(
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     step_images = stage.batch * ranks.world
-    losses = Losses(1 if machine.device.type == "cpu" else _STEPS_UNSEEN)
+    losses = LossMonitor(1 if machine.device.type == "cpu" else _STEPS_UNSEEN)
     before_s = at.train_s - at.stage_s
     clock = Clock(at.stage_s)
     progress = stage.progress(at.step * step_images, at.stage_s)
@@ -175,26 +175,26 @@ def run_stage(
     def part_of(number: int) -> Batch:
         # A budget in minutes is as far as it was when the batch was begun.
         spent = progress if stage.minutes else 0.0
-        return _pinned(made_part(model, images, stage, index, number, seed, ranks, spent), machine)
+        return _pinned(make_part(model, images, stage, index, number, seed, ranks, spent), machine)
 
     logged = saved = time.perf_counter()
     shown, save_s = at.shown, 0.0
     with (
-        batches_ahead(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
-        gradients(model, parameters, stage.parts, machine) as gradient,
+        prefetch_batches(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
+        gradient_workers(model, parameters, stage.parts, machine) as gradient,
     ):
         waited_s = at.wait_s
         model.network.train()
         while progress < 1:
-            rate = stage.rate_at(at.step, progress)
+            rate = stage.learning_rate_at(at.step, progress)
             for group in optimizer.param_groups:
                 group["lr"] = rate * group["rate"]
             parts = [_on_device(ahead.next(), machine) for _ in range(stage.parts)]
             torch.manual_seed(torch_seed_of_step(seed, index, at.step, ranks.rank))
-            loss, figures = gradient.of(parts)
+            loss, figures = gradient.compute(parts)
             seconds, stop = ranks.average(parameters, clock.seconds, watch.wants_stop())
             norm = nn.utils.clip_grad_norm_(parameters, stage.clip or math.inf)
-            with _telling_what_is_kept(at):
+            with _divergence_as_stage_error(at):
                 losses.add(loss, norm, figures)
             optimizer.step()
             at.step, at.steps = at.step + 1, at.steps + 1
@@ -210,7 +210,7 @@ def run_stage(
                 continue
             at.wait_s = waited_s + ahead.waited_s
             at.validated = min(int(progress * validations + 1e-9), validations)
-            with clock.paused(), _telling_what_is_kept(at):
+            with clock.paused(), _divergence_as_stage_error(at):
                 means = losses.means()
                 if record is not None:
                     means["images_per_s"] = (at.shown - shown) / max(now - logged, 1e-9)
@@ -228,7 +228,7 @@ def run_stage(
             saved = logged if is_saved else saved
 
 
-def made_part(
+def make_part(
     model: PoseModel,
     images: TrainingSet,
     stage: Stage,
@@ -252,7 +252,7 @@ def made_part(
 
 
 @contextmanager
-def _telling_what_is_kept(at: Position) -> Iterator[None]:
+def _divergence_as_stage_error(at: Position) -> Iterator[None]:
     """Raises StageError where the loss diverges."""
     try:
         yield

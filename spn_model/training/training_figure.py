@@ -24,7 +24,7 @@ _MAX_BYTES = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Curve:
     """Values of one kind over a training: minutes (N,), values (N,), NaN where not known."""
 
     minutes: np.ndarray
@@ -38,8 +38,8 @@ class TrainingLog:
     minutes, images : at the end.
     """
 
-    loss: Course
-    errors: dict[str, tuple[Course, Course]]
+    loss: Curve
+    errors: dict[str, tuple[Curve, Curve]]
     stages: tuple[tuple[str, float], ...]
     minutes: float
     images: int
@@ -71,11 +71,11 @@ def read_log(path: Path) -> TrainingLog:
         before = max(before, minutes)
     tables = {name: np.array(found).reshape(-1, 3) for name, found in rows.items()}
     return TrainingLog(
-        Course(tables["steps"][:, 0], tables["steps"][:, 1]),
+        Curve(tables["steps"][:, 0], tables["steps"][:, 1]),
         {
             name: (
-                Course(tables[name][:, 0], tables[name][:, 1]),
-                Course(tables[name][:, 0], tables[name][:, 2]),
+                Curve(tables[name][:, 0], tables[name][:, 1]),
+                Curve(tables[name][:, 0], tables[name][:, 2]),
             )
             for name in _EVENTS
         },
@@ -90,7 +90,7 @@ def training_figure(log: TrainingLog, *, unit: str = "m") -> str:
     heading = f"training: {log.minutes:.1f} minutes, {log.images:,} images"
     parts = [svg.text(20, 22, heading, bold=True)]
     far = max(log.minutes, 1e-3)
-    panels: list[tuple[str, list[tuple[Course, str]]]] = [
+    panels: list[tuple[str, list[tuple[Curve, str]]]] = [
         ("loss", [(log.loss, COLOURS[0])]),
         *(
             (label, [(log.errors[event][k], colour) for event, (_, colour) in _EVENTS.items()])
@@ -114,7 +114,7 @@ def training_figure(log: TrainingLog, *, unit: str = "m") -> str:
     return svg.document(1000, 384, heading, parts)
 
 
-def _line(panel: Panel, course: Course, colour: str) -> str:
+def _line(panel: Panel, course: Curve, colour: str) -> str:
     """Through known values, the most of them evenly chosen."""
     known = np.flatnonzero(np.isfinite(course.values))
     if len(known) == 0:
@@ -124,14 +124,14 @@ def _line(panel: Panel, course: Course, colour: str) -> str:
     return svg.line(points, colour, width=1.5) if len(points) > 1 else ""
 
 
-def _marks(panel: Panel, course: Course, colour: str, wanted: bool) -> str:
+def _marks(panel: Panel, course: Curve, colour: str, wanted: bool) -> str:
     known = np.isfinite(course.values) & (course.values <= panel.y_range[1])
     if not wanted or not known.any():
         return ""
     return svg.dots(panel.on_page(course.minutes[known], course.values[known]), colour)
 
 
-def _limits(courses: Sequence[Course], *, from_zero: bool) -> tuple[float, float]:
+def _limits(courses: Sequence[Curve], *, from_zero: bool) -> tuple[float, float]:
     """That show all but single bursts."""
     values = np.concatenate([course.values[np.isfinite(course.values)] for course in courses])
     if len(values) == 0:

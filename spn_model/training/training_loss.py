@@ -16,7 +16,7 @@ class Diverged(ArithmeticError):
     """Raised when a loss leads nowhere."""
 
 
-class Losses:
+class LossMonitor:
     """Of one stage. Losses of several steps are looked at together where looking waits for the device."""
 
     def __init__(self, every: int):

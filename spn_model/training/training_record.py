@@ -15,12 +15,12 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
-from spn_model.evaluation.validation import Errors, PosedImages, judge, spread_rows
+from spn_model.evaluation.validation import PosedImages, ValidationErrors, spread_rows, validate
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import checkpoint
 from spn_model.models.pose_model import PoseModel
 from spn_model.onboard.view import View
-from spn_model.training.covariance_scale import LEAST_FRAMES, measured_scale
+from spn_model.training.covariance_scale import LEAST_FRAMES, fit_covariance_scale
 from spn_model.training.training_state import Log, Position, save_state
 
 # A later network is kept where its score is at most this times the best one: rates fall towards the end, and
@@ -64,18 +64,18 @@ class ValidationFrames:
     rows: np.ndarray
     group: str = ""
 
-    def errors(self, model: PoseModel, *, scales: bool) -> Errors:
+    def errors(self, model: PoseModel, *, scales: bool) -> ValidationErrors:
         """Of the member's estimates; scales : they also tell how large its covariances have to be."""
-        errors, found = judge(model, self.frames, self.rows)
+        errors, found = validate(model, self.frames, self.rows)
         if scales:
             # Too few frames with a pose: covariances stay as they are.
             with suppress(GeometryError):
-                factor = measured_scale(found, self.frames.poses[self.rows])
+                factor = fit_covariance_scale(found, self.frames.poses[self.rows])
                 model.set_covariance_scale(min(max(factor, 1e-6), 1e6))
         return errors
 
 
-def judged_frames(
+def select_validation_frames(
     dataset: Dataset, training: DatasetGroup, frames: int, sample: int
 ) -> list[ValidationFrames]:
     """Validation frames, where there are any, and a sample of those that are trained on."""
@@ -135,7 +135,7 @@ class Record:
             {**{k: figures[k] for k in own}, "rate": rate, "figures": others},
         )
 
-    def trains_on(self, groups: Sequence[str], images: TrainingSet) -> None:
+    def set_training_frames(self, groups: Sequence[str], images: TrainingSet) -> None:
         """Before a stage: names of the groups that it or an earlier one learns: they judge no longer.
 
         images : that it trains on. What it renders of them judges too.
@@ -152,7 +152,7 @@ class Record:
     def _with_views(self) -> list[ValidationFrames]:
         """What judges, with the stage's views, which are rendered when first asked for."""
         if self._images is not None:
-            views = self.model.unseen_views(self._images, _VIEWS)
+            views = self.model.held_out_views(self._images, _VIEWS)
             if views is not None:
                 rows = np.arange(len(views.poses))
                 self.judged = [ValidationFrames("views", views, rows), *self.judged]
@@ -178,7 +178,7 @@ class Record:
                 return
             at.best = score if at.best is None else min(at.best, score)
         at.kept = {"stage": stage, "steps": at.steps, "drawn": at.drawn, **at.latest}
-        checkpoint.save(self.files.checkpoint, self.model, self.view, self.told())
+        checkpoint.save(self.files.checkpoint, self.model, self.view, self.summary())
 
     def save(self, optimizer: torch.optim.Optimizer | None) -> None:
         """The state to go on from."""
@@ -186,11 +186,11 @@ class Record:
 
     def finish(self) -> dict[str, Any]:
         """The network as it is at the end; facts of the training."""
-        told = self.told()
+        told = self.summary()
         checkpoint.save(self.files.last, self.model, self.view, told)
         return told
 
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Facts of the training so far."""
         at = self.position
         return {

@@ -21,7 +21,7 @@ from spn_data.geometry.pose import Poses, canonical_quats
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import registry
 from spn_model.models.checkpoint import load
-from spn_model.models.pose_model import ANY_NUMBER, Batch, PoseEstimates, PoseModel
+from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.training.train import TrainOptions
 from spn_model.training.training_record import Files
 
@@ -144,7 +144,7 @@ class TinyModel(PoseModel):
         self.network.scale.copy_(centers.std(dim=0).max())
 
     def begin_stage(
-        self, stage: Mapping[str, Any], data: TrainingSet, images: int = ANY_NUMBER
+        self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
         unknown = [name for name in stage if name not in ("frozen", "brightness", "sick_at")]
         if unknown:

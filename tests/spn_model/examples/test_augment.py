@@ -7,7 +7,12 @@ import pytest
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-from spn_model.examples.augment import LookOptions, WarpOptions, change_look, random_warp
+from spn_model.examples.augment import (
+    PhotometricOptions,
+    WarpOptions,
+    augment_photometrically,
+    random_warp,
+)
 
 SIZE = (480, 271)  # an odd height: halving it is not exactly by two
 MATRIX = np.array([[328.0, 0, 233.0], [0, 331.0, 141.0], [0, 0, 1.0]])
@@ -110,8 +115,10 @@ def test_turns_and_zooms_fill_their_ranges():
 def test_a_look_without_changes_is_the_image():
     """All strengths at zero give the same bytes, in a new array."""
     image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    still = LookOptions(exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=0)
-    changed = change_look(image, np.random.default_rng(1), still)
+    still = PhotometricOptions(
+        exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=0
+    )
+    changed = augment_photometrically(image, np.random.default_rng(1), still)
     assert changed is not image
     assert np.array_equal(changed, image)
 
@@ -121,7 +128,8 @@ def test_looks_are_those_of_their_seed():
     image = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
     before = image.copy()
     first, again, other = (
-        change_look(image, np.random.default_rng(seed), LookOptions()) for seed in (5, 5, 6)
+        augment_photometrically(image, np.random.default_rng(seed), PhotometricOptions())
+        for seed in (5, 5, 6)
     )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -130,19 +138,19 @@ def test_looks_are_those_of_their_seed():
 
 def test_blur_moves_nothing():
     """Motion blur spreads a spot and leaves its middle within 0.02 px."""
-    only = LookOptions(exposure=0, tint=0, gamma=0, blur_share=1, noise=0, occlusion_share=0)
+    only = PhotometricOptions(exposure=0, tint=0, gamma=0, blur_share=1, noise=0, occlusion_share=0)
     image = spot(121, 91, np.array([60.3, 45.8]), sigma=3.0)
     for seed in range(8):
-        changed = change_look(image, np.random.default_rng(seed), only)
+        changed = augment_photometrically(image, np.random.default_rng(seed), only)
         assert changed.max() < image.max()
         assert middle(changed) == pytest.approx(middle(image), abs=0.02)
 
 
 def test_an_occlusion_is_one_box_of_one_colour():
     """Inside a rectangle all pixels are alike, outside all are as before."""
-    only = LookOptions(exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=1)
+    only = PhotometricOptions(exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=1)
     image = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
-    changed = change_look(image, np.random.default_rng(3), only)
+    changed = augment_photometrically(image, np.random.default_rng(3), only)
     y, x = np.nonzero((changed != image).any(axis=2))
     box = changed[y.min() : y.max() + 1, x.min() : x.max() + 1].reshape(-1, 3)
     assert 20 < len(box) <= 0.3 * 90 * 0.3 * 120

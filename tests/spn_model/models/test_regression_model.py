@@ -18,9 +18,9 @@ from spn_model.evaluation.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.registry import make
 from spn_model.models.regression import RegressionModel
-from spn_model.models.regression_examples import example
+from spn_model.models.regression_examples import augmented_example
 from spn_model.networks.normalization import InsertedBatchNorm
-from spn_model.networks.pose_loss import beta_weighted, residuals
+from spn_model.networks.pose_loss import beta_weighted_loss, pose_residuals
 from tests.worlds.box_world import CAMERA, seen_by, write_box
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -285,7 +285,9 @@ def test_stored_features_are_those_of_their_images(data, network):
     rows = np.array([4, 0, 11])
     batch = model.batch(data, rows, np.random.default_rng(0), 0.0)
     varied = [
-        example(data, int(row), NARROW, model._stage, np.random.default_rng((int(row), 0)))
+        augmented_example(
+            data, int(row), NARROW, model._stage, np.random.default_rng((int(row), 0))
+        )
         for row in rows
     ]
     model.network.train()
@@ -337,7 +339,7 @@ def test_stating_uncertainty_changes_no_pose(data):
     found = {n: p.grad.clone() for n, p in network.regressor.named_parameters()}
     network.zero_grad()
     x, q = network.outputs(network.regressor.trunk(model.normalised(batch["images"]))).estimates[0]
-    beta_weighted(x, q, batch["x"], batch["q"], 500.0).mean().backward()
+    beta_weighted_loss(x, q, batch["x"], batch["q"], 500.0).mean().backward()
     for name, parameter in network.regressor.named_parameters():
         assert torch.allclose(found[name], parameter.grad, rtol=1e-4, atol=1e-5), name
 
@@ -351,7 +353,7 @@ def test_stated_covariances_become_those_of_the_errors(data):
                 parameter.requires_grad_(False)
     train(model, data, 150, 2e-2)
     found = model.estimate(all_images(data), data.intrinsics)
-    errors = residuals(
+    errors = pose_residuals(
         *(
             torch.from_numpy(a)
             for poses in (found.poses, data.poses)
@@ -433,7 +435,7 @@ def test_wrong_stages_are_refused(data, stage, said):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"network": "alexnet"}, "there is no network 'alexnet'"),
+        ({"network": "alexnet"}, "unknown network 'alexnet'"),
         ({"width": 12}, "width is 12"),
         ({"height": 100}, "'height' is not known"),
         ({"network_options": {"slope": 2.0}}, "slope"),

@@ -20,7 +20,7 @@ from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.models.scene_examples import SceneStageOptions
 from spn_model.networks.scene_coordinates import FIRST_CELL_PX, STRIDE_PX
 from spn_model.onboard.decoding import decode
-from spn_model.training.covariance_scale import measured_scale
+from spn_model.training.covariance_scale import fit_covariance_scale
 from spn_model.training.precision import bfloat16_is_fast
 from tests.worlds.box_world import CAMERA, seen_by, write_box
 
@@ -311,10 +311,10 @@ def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
     covariance = root @ root.swapaxes(1, 2)
     found = estimates(true, errors, covariance)
     found.poses.centers[9:20] = np.nan
-    assert measured_scale(found, true) == pytest.approx(4, rel=0.2)
+    assert fit_covariance_scale(found, true) == pytest.approx(4, rel=0.2)
     few = PoseEstimates(found.poses[:19], covariance[:19], found.reasons[:19])
     with pytest.raises(GeometryError, match="9 images"):
-        measured_scale(few, true[:19])
+        fit_covariance_scale(few, true[:19])
 
 
 def test_the_scale_of_covariances_is_part_of_the_state(data):

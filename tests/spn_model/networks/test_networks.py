@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from spn_data.errors import InputError
 from spn_model.networks.imagenet import MEAN, STD
-from spn_model.networks.normalization import InsertedBatchNorm, start_as_identity
+from spn_model.networks.normalization import InsertedBatchNorm, initialize_as_identity
 from spn_model.networks.posenet import PoseNet
 from spn_model.networks.registry import REGRESSORS, build, options_of
 from spn_model.networks.squeezeposenet import SqueezePoseNetOptions
@@ -173,7 +173,7 @@ def test_with_slope_zero_the_trunk_computes_what_squeezenet_does():
     network = pretrained_squeezeposenet(slope=0.0).eval()
     images = photos(2, 135, 240)
     weights = {name: t.float() for name, t in read_tensors(find(network.weights_name)).items()}
-    start_as_identity(network, [images])
+    initialize_as_identity(network, [images])
     expected = reference_squeezenet1_1(weights, images)
     assert float(expected.std()) > 0.1
     torch.testing.assert_close(network.features(images), expected, rtol=1e-3, atol=2e-3)
@@ -192,7 +192,7 @@ def test_inserted_normalisation_starts_as_the_identity():
             parent, _, slot = name.rpartition(".")
             setattr(without.get_submodule(parent), slot, nn.Identity())
     images, others = photos(6), photos(8)[6:]
-    start_as_identity(network, [images])
+    initialize_as_identity(network, [images])
     for seen in (images, others):
         expected = without.trunk(seen)[0]
         assert float(expected.abs().max()) > 0.5
@@ -206,7 +206,7 @@ def test_normalisation_is_measured_not_left_at_its_defaults():
     """Weight is sqrt(var + eps) and bias the mean of the layer's real input, over all batches."""
     network = pretrained_squeezeposenet().eval()
     images = photos(6)
-    start_as_identity(network, [images[:1], images[1:3], images[3:]])
+    initialize_as_identity(network, [images[:1], images[1:3], images[3:]])
     first = network.features[0](images).double()
     layer = network.features[1][0]
     mean, variance = first.mean((0, 2, 3)), first.var((0, 2, 3), unbiased=False)
@@ -220,12 +220,12 @@ def test_normalisation_is_measured_not_left_at_its_defaults():
 def test_what_a_normalisation_was_before_does_not_matter():
     """Measured a second time, on other images, it is what it would have been at once."""
     network, fresh = pretrained_squeezeposenet(), pretrained_squeezeposenet()
-    start_as_identity(network, [photos(2) * 3 + 1])
+    initialize_as_identity(network, [photos(2) * 3 + 1])
     for layer in network.modules():
         if isinstance(layer, InsertedBatchNorm):
             layer.weight.mul_(2)
     for measured in (network, fresh):
-        start_as_identity(measured, [photos(4)])
+        initialize_as_identity(measured, [photos(4)])
     for name, tensor in fresh.state_dict().items():
         torch.testing.assert_close(network.state_dict()[name], tensor)
 
@@ -235,7 +235,7 @@ def test_a_channel_that_never_varied_still_lets_other_values_through():
     """ReLU features are often dead on some images: a variance of 0 must not become a weight of 0."""
     network = nn.Sequential(InsertedBatchNorm(2)).eval()
     still = torch.stack([torch.full((4, 4), 3.0), torch.zeros(4, 4)])[None]
-    start_as_identity(network, [still])
+    initialize_as_identity(network, [still])
     other = torch.randn(5, 2, 4, 4, generator=torch.manual_seed(3))
     torch.testing.assert_close(network(other), other, rtol=1e-4, atol=1e-4)
 
@@ -245,7 +245,7 @@ def test_training_mode_starts_where_eval_mode_is():
     """On the batch that was measured, statistics of the batch are the stored ones."""
     network = pretrained_squeezeposenet(dropout=0.0).eval()
     images = photos(6)
-    start_as_identity(network, [images])
+    initialize_as_identity(network, [images])
     evaluated = network.trunk(images)[0]
     trained = network.train().trunk(images)[0]
     torch.testing.assert_close(trained, evaluated, rtol=1e-3, atol=1e-3)
@@ -254,10 +254,10 @@ def test_training_mode_starts_where_eval_mode_is():
 def test_the_identity_start_keeps_mode_and_other_normalisations(posenet):
     """GoogLeNet's own normalisation is pretrained: it stays; a network in training stays in training."""
     before = {name: tensor.clone() for name, tensor in posenet.state_dict().items()}
-    start_as_identity(posenet, [photos(2)])
+    initialize_as_identity(posenet, [photos(2)])
     assert all(torch.equal(before[name], tensor) for name, tensor in posenet.state_dict().items())
     network = build("squeezeposenet").train()
-    start_as_identity(network, [photos(2)])
+    initialize_as_identity(network, [photos(2)])
     assert network.training
     assert network.features.training
 
@@ -268,7 +268,7 @@ def test_the_identity_start_needs_images(images):
     network = build("squeezeposenet")
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     with pytest.raises(ValueError, match=r"no images|not finite"):
-        start_as_identity(network, images)
+        initialize_as_identity(network, images)
     assert all(torch.equal(before[name], tensor) for name, tensor in network.state_dict().items())
 
 
@@ -450,18 +450,26 @@ def test_whole_numbers_do_for_real_ones():
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("resnet", {}, "there is no network 'resnet'; there are squeezeposenet, vgg16, posenet"),
-        ("vgg16", {"conv10": True}, "network vgg16 has no option 'conv10'; it has slope, dropout"),
+        ("resnet", {}, "unknown network 'resnet'; choose one of squeezeposenet, vgg16, posenet"),
+        (
+            "vgg16",
+            {"conv10": True},
+            "network vgg16 has no option 'conv10'; its options are slope, dropout",
+        ),
         (
             "squeezeposenet",
             {"conv10": 1},
-            "conv10 of network squeezeposenet is 1, not of type bool",
+            "conv10 of network squeezeposenet is 1, needs to be of type bool",
         ),
         ("squeezeposenet", {"slope": True}, "slope of network squeezeposenet is True"),
-        ("squeezeposenet", {"version": "1.2"}, "SqueezeNet is of version 1.0 or 1.1, not '1.2'"),
-        ("squeezeposenet", {"dropout": 1.0}, "slope and dropout lie from 0 to below 1"),
-        ("squeezeposenet", {"slope": math.nan}, "slope and dropout lie from 0 to below 1"),
-        ("posenet", {"auxiliary_dropout": -0.1}, "rates of dropout lie from 0 to below 1"),
+        ("squeezeposenet", {"version": "1.2"}, "version is '1.2', needs to be 1.0 or 1.1"),
+        ("squeezeposenet", {"dropout": 1.0}, "slope and dropout need to be in [0, 1)"),
+        ("squeezeposenet", {"slope": math.nan}, "slope and dropout need to be in [0, 1)"),
+        (
+            "posenet",
+            {"auxiliary_dropout": -0.1},
+            "dropout and auxiliary_dropout need to be in [0, 1)",
+        ),
     ],
 )
 def test_what_cannot_be_built_is_told(name, options, message):

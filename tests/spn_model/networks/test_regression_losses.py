@@ -10,10 +10,10 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats, rotations_from_vectors
 from spn_model.networks.pose_loss import (
     LearnedWeighting,
-    beta_weighted,
-    laplace,
-    reprojection,
-    residuals,
+    beta_weighted_loss,
+    laplace_nll,
+    pose_residuals,
+    reprojection_loss,
 )
 from spn_model.networks.pose_targets import PoseTargets
 
@@ -101,7 +101,7 @@ def test_quaternions_are_read_out_whatever_their_length_and_sign():
 def test_the_papers_loss_is_as_by_hand(sign):
     """|x - x*| = 5 m, and |q - q*| = 1 as q = (2, 0, 0, 0) is not normalised: 5 + 500."""
     x, q, true_x, true_q = tensors([[4, 6, 1]], [[2, 0, 0, 0]], [[1, 2, 1]], [[sign, 0, 0, 0]])
-    assert beta_weighted(x, q, true_x, true_q, 500.0).tolist() == pytest.approx([505.0])
+    assert beta_weighted_loss(x, q, true_x, true_q, 500.0).tolist() == pytest.approx([505.0])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -139,7 +139,7 @@ def test_reprojection_is_as_the_camera_projects():
         expected.append(np.abs(after - before).sum(axis=1)[seen[k]].mean())
     values = tensors(moved.centers, -2 * moved.quats_wxyz, truth.centers, truth.quats_wxyz, points)
     matrices = tensors(np.tile(lens.matrix, (4, 1, 1)))
-    found = reprojection(*values, torch.from_numpy(seen), *matrices)
+    found = reprojection_loss(*values, torch.from_numpy(seen), *matrices)
     assert found.tolist() == pytest.approx(expected)
 
 
@@ -151,7 +151,7 @@ def test_reprojection_stays_finite():
     points[:2, 0] = torch.tensor([1.0, 0, 10])
     seen = torch.tensor([[True, False], [True, False], [False, False]])
     matrices = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]).expand(3, 3, 3)
-    found = reprojection(x, q, torch.zeros(3, 3), q.detach(), points, seen, matrices)
+    found = reprojection_loss(x, q, torch.zeros(3, 3), q.detach(), points, seen, matrices)
     # The first camera has passed the point: it counts at a tenth of its depth, 1 m, 100 px from the middle.
     assert found.tolist() == pytest.approx([90.0, 0.0, 0.0])
     found.sum().backward()
@@ -172,7 +172,7 @@ def test_residuals_have_the_conventions_of_estimates():
         estimated.centers + away, rotations_from_vectors(vectors) @ estimated.rotations
     )
     factor = rng.choice([-2.0, 0.5], (30, 1))
-    found = residuals(
+    found = pose_residuals(
         *tensors(estimated.centers, factor * estimated.quats_wxyz, truth.centers, truth.quats_wxyz)
     )
     assert found[:, :3].numpy() == pytest.approx(away)
@@ -185,7 +185,7 @@ def test_the_likelihood_is_best_at_the_standard_deviation_of_errors():
         np.random.default_rng(2).laplace(scale=0.3 / 2**0.5, size=(40_000, 6))
     )
     likelihood = [
-        float(laplace(errors, torch.full((1, 6), float(np.log(0.3 * by)))).mean())
+        float(laplace_nll(errors, torch.full((1, 6), float(np.log(0.3 * by)))).mean())
         for by in (0.96, 1.0, 1.04)
     ]
     assert likelihood[1] < min(likelihood[0], likelihood[2])

@@ -12,6 +12,7 @@ from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
 from spn_model.examples.augment import WarpOptions, random_warp
+from spn_model.examples.novel_views import NovelViewOptions, nearby_pose, warp_to_pose
 from spn_model.examples.point_targets import (
     Surface,
     SurfaceOptions,
@@ -19,7 +20,6 @@ from spn_model.examples.point_targets import (
     cell_targets,
     surface,
 )
-from spn_model.examples.virtual_views import NovelViewOptions, random_place, view_from
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -274,7 +274,7 @@ def test_without_points_nothing_is_known(count):
     seen = surface(few, pose, LENS.matrix, SIZE, SurfaceOptions())
     assert np.isnan(seen.xyz(np.array([[100.0, 100.0]]))).all()
     with pytest.raises(ValueError, match="nothing is known"):
-        random_place(np.random.default_rng(0), seen, NovelViewOptions())
+        nearby_pose(np.random.default_rng(0), seen, NovelViewOptions())
 
 
 def test_targets_of_a_virtual_camera_are_what_its_pixels_show():
@@ -310,7 +310,7 @@ def test_a_virtual_view_is_what_a_camera_there_would_see():
     there = Poses.from_rotations(
         [[6.0, -4.5, 12.0]], rotations_from_angles(np.array([[26.0, -58.0, 2.0]]))
     )
-    image, moved = view_from(checkered(pose), seen, there, (255, 0, 255))
+    image, moved = warp_to_pose(checkered(pose), seen, there, (255, 0, 255))
     drawn = ~(image == [255, 0, 255]).all(axis=2)
     assert drawn.mean() > 0.2
     error = np.abs(image[..., 0].astype(float) - checkered(there)[..., 0])[drawn]
@@ -330,7 +330,7 @@ def test_a_near_wall_hides_what_is_behind():
     image = np.where(np.arange(480)[None, :, None] < 240, [[[200, 0, 0]]], [[[0, 0, 200]]])
     image = np.broadcast_to(image, (270, 480, 3)).astype(np.uint8)
     left = Poses.from_rotations([[-1.0, 0, 0]], np.eye(3)[None])
-    drawn, moved = view_from(image, seen, left, (0, 0, 0))
+    drawn, moved = warp_to_pose(image, seen, left, (0, 0, 0))
     edge = int(240 + LENS.focal_px[0] * 1.0 / 4.0)
     assert drawn[135, edge - 12].tolist() == [200, 0, 0]
     assert drawn[135, edge + 12].tolist() == [0, 0, 200]
@@ -344,7 +344,7 @@ def test_virtual_cameras_rise_and_keep_their_view():
     rng = np.random.default_rng(0)
     aim = np.array([[240.0, 135.0]])
     for _ in range(20):
-        place = random_place(rng, seen, NovelViewOptions(rise_m=6.0, side_m=2.0))
+        place = nearby_pose(rng, seen, NovelViewOptions(rise_m=6.0, side_m=2.0))
         move = (place.centers - pose.centers)[0]
         assert 0 <= move[2] <= 6
         assert np.abs(move[:2]).max() <= 2

@@ -28,16 +28,16 @@ from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.pretrained.weights import (
     CATALOGUE,
     SHIPPED,
+    by_name,
     cache_folder,
     fetch,
     find,
-    of_name,
     state,
 )
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).resolve().parents[3]
-FEATURES = of_name("squeezenet1_1-features")
+FEATURES = by_name("squeezenet1_1-features")
 
 
 @pytest.fixture(autouse=True)
@@ -172,7 +172,7 @@ def test_published_files_carry_their_hash_in_their_name():
 )
 def test_every_network_names_weights_of_the_catalogue(name, options):
     """What a network starts from by default can be listed and fetched."""
-    of_name(build(name, options).weights_name)
+    by_name(build(name, options).weights_name)
 
 
 def test_fetched_files_are_kept_in_the_users_cache(tmp_path, monkeypatch):
@@ -407,7 +407,7 @@ def test_a_published_name_on_other_content_is_refused(tmp_path, cache):
     cache.mkdir(parents=True)
     for folder in (tmp_path, cache):
         (folder / "googlenet-1378be20.pth").write_bytes(b"half a download")
-    assert state(of_name("googlenet")) == "damaged"
+    assert state(by_name("googlenet")) == "damaged"
     for wanted in ("googlenet", tmp_path / "googlenet-1378be20.pth"):
         with pytest.raises(InputError, match="does not begin with 1378be20"):
             find(wanted)
@@ -473,7 +473,7 @@ def served(server: Server, content: bytes, size_bytes: int | None = None):
     file = f"small-{digest}.pth"
     size = len(content) if size_bytes is None else size_bytes
     return replace(
-        of_name("googlenet"), file=file, sha256=digest, size_bytes=size, url=server.url(file)
+        by_name("googlenet"), file=file, sha256=digest, size_bytes=size, url=server.url(file)
     )
 
 
@@ -536,7 +536,7 @@ def test_without_a_network_the_line_says_what_to_do(cache):
     """Where to put the file that was fetched elsewhere."""
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
-    weights = replace(of_name("googlenet"), url=f"http://127.0.0.1:{port}/small.pth")
+    weights = replace(by_name("googlenet"), url=f"http://127.0.0.1:{port}/small.pth")
     with pytest.raises(InputError, match="cannot be fetched") as error:
         fetch(weights, quiet)
     wanted = f"fetch it elsewhere and put it at {cache / weights.file}, or give its path"
@@ -570,7 +570,7 @@ def test_the_list_shows_what_is_here_and_what_is_not(cache):
     assert str(cache) in shown.output
     assert "damaged" not in shown.output
     cache.mkdir(parents=True)
-    of_name("vgg16").path.write_bytes(b"")
+    by_name("vgg16").path.write_bytes(b"")
     assert "a damaged file is not used" in invoke().output
 
 

@@ -12,7 +12,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.scene_coordinates import SceneCoordinatesModel
-from spn_model.training.gradients import gradients
+from spn_model.training.gradients import gradient_workers
 from spn_model.training.machine import choose
 from spn_model.training.recipe import Recipe, Stage
 from spn_model.training.train import Data, TrainingStopped, train
@@ -47,8 +47,8 @@ def model_and_parts(tmp_path_factory: pytest.TempPathFactory):
 def gradient(model, parts, threads: int) -> tuple[float, list[torch.Tensor]]:
     parameters = [p for group in model.parameter_groups() for p in group["params"]]
     machine = choose("cpu", threads, "float32", makes_batches=True)
-    with gradients(model, parameters, len(parts), machine) as computing:
-        loss, _ = computing.of(parts)
+    with gradient_workers(model, parameters, len(parts), machine) as computing:
+        loss, _ = computing.compute(parts)
     return float(loss), [p.grad for p in parameters]
 
 

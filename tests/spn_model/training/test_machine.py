@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from spn_data.errors import InputError
-from spn_model.training.machine import choose, cores, prepared
+from spn_model.training.machine import choose, cores, limited_threads
 
 
 @pytest.mark.parametrize("device", ["tpu", "cuda:x", "mps", "meta", ""])
@@ -47,7 +47,7 @@ def test_libraries_are_left_as_they_were():
     before = torch.get_num_threads()
 
     def fail() -> None:
-        with prepared(choose("cpu", 3, "float32")):
+        with limited_threads(choose("cpu", 3, "float32")):
             assert torch.get_num_threads() == 3
             raise KeyError
 

@@ -56,7 +56,7 @@ def test_a_recipe_is_read_whole(tmp_path):
         images=900,
         schedule="constant",
     )
-    assert recipe.shares == [0.25, 0.75]
+    assert recipe.budget_shares == [0.25, 0.75]
 
 
 @pytest.mark.parametrize(
@@ -148,12 +148,14 @@ def test_progress_is_of_whichever_budget_is_spent_first():
 def test_the_rate_rises_and_falls():
     """Over the warm-up it rises by equal steps; a cosine is at half when half is done, and ends at 0."""
     stage = Stage(name="a", images=10_000, rate=0.4, warmup_steps=4)
-    assert [stage.rate_at(k, 0) for k in range(5)] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
-    assert stage.rate_at(100, 0.5) == pytest.approx(0.2)
-    assert stage.rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
-    assert replace(stage, schedule="constant").rate_at(100, 0.9) == 0.4
+    assert [stage.learning_rate_at(k, 0) for k in range(5)] == pytest.approx(
+        [0.1, 0.2, 0.3, 0.4, 0.4]
+    )
+    assert stage.learning_rate_at(100, 0.5) == pytest.approx(0.2)
+    assert stage.learning_rate_at(100, 1.0) == pytest.approx(0, abs=1e-12)
+    assert replace(stage, schedule="constant").learning_rate_at(100, 0.9) == 0.4
     straight = replace(stage, schedule="linear")
-    assert [straight.rate_at(100, at) for at in (0, 0.25, 1.0, 1.1)] == pytest.approx(
+    assert [straight.learning_rate_at(100, at) for at in (0, 0.25, 1.0, 1.1)] == pytest.approx(
         [0.4, 0.3, 0, 0]
     )
 
@@ -164,4 +166,4 @@ def test_the_rate_rises_and_falls():
 )
 def test_a_stage_knows_about_how_many_images_it_draws(images, minutes, drawn):
     """Its budget, or 200 a second; the smaller of two."""
-    assert Stage(name="all", images=images, minutes=float(minutes)).images_about == drawn
+    assert Stage(name="all", images=images, minutes=float(minutes)).expected_images == drawn

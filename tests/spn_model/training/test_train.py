@@ -21,18 +21,18 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.pose import Poses
-from spn_model.evaluation.validation import judge, spread_rows
+from spn_model.evaluation.validation import spread_rows, validate
 from spn_model.examples.dataset_view import view_of
+from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.unseen_views import UnseenViews
 from spn_model.models.checkpoint import load
 from spn_model.models.pose_model import PoseEstimates
 from spn_model.training.batches import generator_of_step, rows_of_step, torch_seed_of_step
-from spn_model.training.covariance_scale import measured_scale
+from spn_model.training.covariance_scale import fit_covariance_scale
 from spn_model.training.recipe import Recipe, Stage
 from spn_model.training.train import Data, TrainingStopped, train
-from spn_model.training.training_loss import Diverged, Losses
-from spn_model.training.training_record import Record, judged_frames
+from spn_model.training.training_loss import Diverged, LossMonitor
+from spn_model.training.training_record import Record, select_validation_frames
 from spn_model.training.training_state import COLUMNS, Log, Position, read_state
 from tests.worlds.training_world import (
     INFO,
@@ -80,7 +80,7 @@ def test_a_training_learns_where_the_camera_is(field, tmp_path):
     assert found.facts["kept"] == facts["kept"]
     with Dataset(field) as dataset:
         group = dataset.groups["validation"]
-        errors, _ = judge(found.model, group, np.arange(len(group)))
+        errors, _ = validate(found.model, group, np.arange(len(group)))
     assert errors.median_m == pytest.approx(facts["kept"]["validation"]["median_m"], rel=1e-5)
 
 
@@ -261,7 +261,7 @@ def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
     with Dataset(field) as dataset:
         training = dataset.groups["train"]
         model.fit(TrainingSet(training))
-        judged = judged_frames(dataset, training, 64, 4)
+        judged = select_validation_frames(dataset, training, 64, 4)
         record = Record(
             *(files(tmp_path), Follower(), model, view_of(dataset), judged, Position(), {})
         )
@@ -285,14 +285,16 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
     """Where a stage renders views, they fit these, not the validation frames; each stage has its own."""
     stages = []
 
-    def views(self: TinyModel, data: TrainingSet, count: int) -> UnseenViews:
+    def views(self: TinyModel, data: TrainingSet, count: int) -> HeldOutViews:
         stages.append(len(data))
         shown = 12
         poses = data.poses[:shown]
         moved = Poses(poses.centers + 30.0, poses.quats_wxyz)
-        return UnseenViews(moved, data.intrinsics[:shown], [data.image(k) for k in range(shown)], 1)
+        return HeldOutViews(
+            moved, data.intrinsics[:shown], [data.image(k) for k in range(shown)], 1
+        )
 
-    monkeypatch.setattr(TinyModel, "unseen_views", views)
+    monkeypatch.setattr(TinyModel, "held_out_views", views)
     field = write_field(tmp_path / "dataset.h5", validation=12)
     facts = train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
     judged = [row["stage"] for row in log(tmp_path) if row["event"] == "views"]
@@ -302,10 +304,14 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
     last = load(tmp_path / "last.safetensors").model
     with Dataset(field) as dataset:
         shown = views(last, TrainingSet(dataset.groups["train"]), 64)
-        assert measured_scale(judge(last, shown, np.arange(12))[1], shown.poses) == pytest.approx(1)
+        assert fit_covariance_scale(
+            validate(last, shown, np.arange(12))[1], shown.poses
+        ) == pytest.approx(1)
         rows = np.arange(12)
         validation = dataset.groups["validation"]
-        of_validation = measured_scale(judge(last, validation, rows)[1], validation.poses[rows])
+        of_validation = fit_covariance_scale(
+            validate(last, validation, rows)[1], validation.poses[rows]
+        )
     assert not 0.5 < of_validation < 2
 
 
@@ -323,7 +329,7 @@ def test_frames_of_places_that_no_training_image_shows_do_not_judge(tmp_path):
                 ids = seen.point_ids + (1000 if k < strange else 0)
                 writer.append("validation", replace(seen, point_ids=ids))
         with Dataset(path) as dataset:
-            judged = judged_frames(dataset, dataset.groups["train"], 64, 4)
+            judged = select_validation_frames(dataset, dataset.groups["train"], 64, 4)
         assert [one.event for one in judged] == ["validation", "training"]
         assert len(judged[0].rows) == expected
         if expected == 12:
@@ -347,7 +353,7 @@ def test_a_training_that_turns_to_nan_stops(field, tmp_path, at):
 def test_a_loss_far_above_its_beginning_is_seen():
     """One that jumps about its level is not; one that grows a hundredfold is, within 100 steps."""
     rng = np.random.default_rng(0)
-    sound, sick = Losses(1), Losses(1)
+    sound, sick = LossMonitor(1), LossMonitor(1)
     for k in range(400):
         value = torch.tensor(3 * np.exp(-k / 100) - 4 + rng.normal())
         sound.add(value, torch.tensor(1.0), {})

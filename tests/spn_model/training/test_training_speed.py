@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from spn_model.training.machine import choose, prepared
+from spn_model.training.machine import choose, limited_threads
 from tests.worlds.training_world import write_field
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
@@ -37,7 +37,7 @@ def test_every_loop_takes_the_same_steps(benchmark, tmp_path, monkeypatch):
 
     monkeypatch.setattr("tests.worlds.training_world.TinyModel.loss", watched)
     machine = choose("cpu", 1, "float32", makes_batches=True)
-    with prepared(machine):
+    with limited_threads(machine):
         found = benchmark.measure(tmp_path, str(recipe), machine, 4, 1)
     assert found["images_per_round"] == 20
     assert set(found["loops"]) == {"loop", "bare", "in turns"}

@@ -11,7 +11,7 @@ from spn_data.geometry.pose import Poses
 
 
 @dataclass(frozen=True, eq=False)
-class UnseenViews:
+class HeldOutViews:
     """Frames to judge a network by, beside those of a data set.
 
     intrinsics (N, 3, 3) : of `image`'s; small : images (h, w, 3) uint8 RGB, which are `enlarged` times

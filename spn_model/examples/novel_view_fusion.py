@@ -12,8 +12,8 @@ from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.pose import Poses
 from spn_model.examples.ground import Ground
 from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
+from spn_model.examples.source_images import Occluders, SourceImages, projected
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.view_sources import Occluders, ViewSources, projected
 
 _SOURCES = 16  # images that a view is made of, at most
 _MARGIN_PX = 40.0  # around a view: map points there hold surfaces that reach into it
@@ -31,7 +31,7 @@ _MOST_REDUCED = 3  # halvings of a source's image, where it is finer than the vi
 
 def fused_view(
     data: TrainingSet,
-    sources: ViewSources,
+    sources: SourceImages,
     surface_of: Callable[[int], Surface],
     pose: Poses,
     matrix: np.ndarray,
@@ -80,7 +80,7 @@ def fused_view(
 
 def _painted(
     data: TrainingSet,
-    sources: ViewSources,
+    sources: SourceImages,
     surface_of: Callable[[int], Surface],
     chosen: list[int],
     pose: Poses,
@@ -160,7 +160,7 @@ def _agreed(values: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _points(
-    data: TrainingSet, sources: ViewSources, chosen: list[int], pose: Poses, matrix: np.ndarray
+    data: TrainingSet, sources: SourceImages, chosen: list[int], pose: Poses, matrix: np.ndarray
 ) -> FramePoints:
     """Map points of the chosen sources that a camera would see, in and around its image."""
     points = [data.points(int(sources.rows[k])) for k in chosen]
@@ -185,9 +185,9 @@ def _ground_depth(
     columns, rows = (side // shrink for side in size)
     pixels = cell_centers(columns, rows, 0.5, 1.0)
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(small).T
-    depth = ground.met_by(pose.centers[0], rays @ pose.rotations[0])
-    above = ~ground.has(points.xyz)
-    before = Occluders.of(
+    depth = ground.intersect(pose.centers[0], rays @ pose.rotations[0])
+    above = ~ground.is_at_or_below(points.xyz)
+    before = Occluders.from_points(
         points.pixels[above],
         (points.xyz[above] - pose.centers[0]) @ pose.rotations[0][2],
         size,

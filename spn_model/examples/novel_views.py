@@ -30,7 +30,7 @@ class NovelViewOptions:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, of length 1
 
 
-def random_place(generator: np.random.Generator, seen: Surface, options: NovelViewOptions) -> Poses:
+def nearby_pose(generator: np.random.Generator, seen: Surface, options: NovelViewOptions) -> Poses:
     """(1,) pose of a camera that rose and moved, and turned the shortest way to keep its view in sight.
 
     Raises ValueError where nothing of the surface is known.
@@ -54,7 +54,7 @@ def random_place(generator: np.random.Generator, seen: Surface, options: NovelVi
     return Poses.from_rotations((center + move)[None], (rotation @ turn.T)[None])
 
 
-def high_place(
+def overhead_pose(
     generator: np.random.Generator,
     centers: np.ndarray,
     scene: np.ndarray,
@@ -90,7 +90,7 @@ def high_place(
     return Poses.from_rotations(center[None], rotation[None])
 
 
-def view_from(
+def warp_to_pose(
     image: np.ndarray, seen: Surface, pose: Poses, fill: tuple[int, int, int]
 ) -> tuple[np.ndarray, Surface]:
     """The image (H, W, 3) and the surface as a camera of the same K at another pose (1,) would see them.

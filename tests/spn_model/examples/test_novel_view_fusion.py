@@ -9,14 +9,14 @@ import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.geometry.pose import Poses, rotations_from_angles
-from spn_model.examples.fused_views import fused_view
-from spn_model.examples.ground import level_ground
+from spn_model.examples.ground import fit_level_ground
+from spn_model.examples.novel_view_fusion import fused_view
+from spn_model.examples.novel_views import NovelViewOptions, overhead_pose
 from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
+from spn_model.examples.source_images import Occluders, SourceImages
 from spn_model.examples.training_set import TrainingSet
-from spn_model.examples.view_sources import Occluders, ViewSources
-from spn_model.examples.virtual_views import NovelViewOptions, high_place
-from spn_model.models.pose_model import ANY_NUMBER
-from spn_model.models.scene_examples import Examples, SceneStageOptions
+from spn_model.models.pose_model import UNKNOWN_COUNT
+from spn_model.models.scene_examples import SceneExamples, SceneStageOptions
 from tests.worlds.box_world import CAMERA, SIZE_M, seen_by, write_box
 
 CENTER, SPREAD = SIZE_M / 2, 8.0
@@ -32,8 +32,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> TrainingSet:
 
 
 @pytest.fixture(scope="module")
-def sources(data: TrainingSet) -> ViewSources:
-    return ViewSources(data, CENTER, SPREAD, 4 * SPREAD)
+def sources(data: TrainingSet) -> SourceImages:
+    return SourceImages(data, CENTER, SPREAD, 4 * SPREAD)
 
 
 def above(pitch_deg: float = -60.0) -> Poses:
@@ -109,7 +109,7 @@ def test_without_up_there_is_no_ground(data):
 def _without_up(data: TrainingSet) -> tuple[np.ndarray, Surface]:
     data.up_is_known = False
     try:
-        sources = ViewSources(data, CENTER, SPREAD, 4 * SPREAD)
+        sources = SourceImages(data, CENTER, SPREAD, 4 * SPREAD)
         assert sources.ground is None
         return view(data, sources, above(), surface_of=unknown_surfaces(data))
     finally:
@@ -163,7 +163,7 @@ def test_the_best_source_of_its_own_place_is_the_image_itself(data, sources):
 
 def test_a_map_point_hides_what_lies_around_and_behind_it():
     """Nothing before it, beside it, or about as far as it is."""
-    one = Occluders.of(np.array([[100.0, 50.0]]), np.array([5.0]), (320, 180), 6)
+    one = Occluders.from_points(np.array([[100.0, 50.0]]), np.array([5.0]), (320, 180), 6)
     at = np.array([[100.0, 50.0], [106, 50], [100, 50], [100, 50], [120, 50]])
     depth = np.array([9.0, 9, 5.2, 3, 9])
     assert one.hide(at, depth).tolist() == [True, True, False, False, False]
@@ -180,14 +180,14 @@ def facades_and_ground(rng: np.random.Generator, ground: int) -> np.ndarray:
 
 def test_ground_is_found_among_many_more_points_of_facades():
     """Its height to 2 cm; near its points in plan, and nowhere else."""
-    found = level_ground(facades_and_ground(np.random.default_rng(0), 600), 18.0)
+    found = fit_level_ground(facades_and_ground(np.random.default_rng(0), 600), 18.0)
     assert found.height == pytest.approx(-1.1, abs=0.02)
-    assert found.has(np.array([[0, 0, -1.0], [0, 0, 0.0]])).tolist() == [True, False]
+    assert found.is_at_or_below(np.array([[0, 0, -1.0], [0, 0, 0.0]])).tolist() == [True, False]
     rays = np.array([[0, 0, -1.0], [0.5, 0, -1.0], [1.85, 0, -1.0], [0, 0, 1.0], [1.0, 0, 0]])
-    length = found.met_by(np.array([0.0, 0.0, 8.9]), rays)
+    length = found.intersect(np.array([0.0, 0.0, 8.9]), rays)
     assert length[:2] == pytest.approx(10, abs=0.02)
     assert np.isnan(length[2:]).all()
-    assert np.isnan(found.met_by(np.array([0.0, 0.0, -3.0]), rays)).all()
+    assert np.isnan(found.intersect(np.array([0.0, 0.0, -3.0]), rays)).all()
     assert np.abs(found.samples()[:, :2]).max() < 17
 
 
@@ -195,12 +195,12 @@ def test_a_scene_without_level_ground_has_none():
     """Neither facades alone nor a slope, nor a scene of impossible size, are level ground."""
     rng = np.random.default_rng(0)
     walls = facades_and_ground(rng, 0)
-    assert level_ground(walls, 18.0) is None
+    assert fit_level_ground(walls, 18.0) is None
     slope = rng.uniform(-20, 20, (5000, 3))
     slope[:, 2] = 0.3 * slope[:, 0]
-    assert level_ground(slope, 18.0) is None
+    assert fit_level_ground(slope, 18.0) is None
     endless = facades_and_ground(rng, 600) * [1000, 1, 1]
-    assert level_ground(endless, 18.0) is None
+    assert fit_level_ground(endless, 18.0) is None
 
 
 def test_high_places_look_down_at_the_scene(data, sources):
@@ -208,7 +208,7 @@ def test_high_places_look_down_at_the_scene(data, sources):
     centers, scene = data.poses.centers, sources.samples
     options = NovelViewOptions(side_m=1.5, height_m=6.0)
     rng = np.random.default_rng(0)
-    places = [high_place(rng, centers, scene, options) for _ in range(150)]
+    places = [overhead_pose(rng, centers, scene, options) for _ in range(150)]
     at = np.concatenate([place.centers for place in places])
     rotations = np.concatenate([place.rotations for place in places])
     assert at[:, 2].min() >= np.median(centers[:, 2])
@@ -225,13 +225,13 @@ def test_high_places_look_down_at_the_scene(data, sources):
 def test_a_camera_may_look_straight_down():
     """The azimuth is then drawn, and no number is unknown."""
     below = np.array([[3.0, 4.0, 0.0]])
-    place = high_place(
+    place = overhead_pose(
         np.random.default_rng(1), np.array([[3.0, 4.0, 5.0]]), below, NovelViewOptions(side_m=0.0)
     )
     assert place.rotations[0, 2] == pytest.approx([0, 0, -1])
     assert np.linalg.det(place.rotations[0]) == pytest.approx(1)
     with pytest.raises(ValueError, match="nothing of the scene lies below"):
-        high_place(np.random.default_rng(1), below, below + 50, NovelViewOptions(height_m=1.0))
+        overhead_pose(np.random.default_rng(1), below, below + 50, NovelViewOptions(height_m=1.0))
 
 
 def test_a_stage_begins_with_few_views(data):
@@ -239,7 +239,7 @@ def test_a_stage_begins_with_few_views(data):
     options = SceneStageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
     numbers: dict[float, set[int]] = {}
     for progress in (0.0, 0.5, 0.9):
-        examples = Examples(data, options, CENTER, SPREAD, 2, ANY_NUMBER)
+        examples = SceneExamples(data, options, CENTER, SPREAD, 2, UNKNOWN_COUNT)
         drawn: list[int] = []
         examples._view = lambda n, to=drawn, of=examples: (
             to.append(n) or (data.image(0), of._surface(0))
@@ -256,7 +256,9 @@ def test_a_stage_begins_with_few_views(data):
 def test_views_are_kept_within_their_memory(data, monkeypatch):
     """Fewer are made where they would take more, of images spread over all of them."""
     monkeypatch.setattr("spn_model.models.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
-    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
+    examples = SceneExamples(
+        data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, UNKNOWN_COUNT
+    )
     assert examples._view_count == 10
     views = [examples._view(n) for n in range(10)]
     assert sum(i.nbytes + s.inverse_depth.nbytes for i, s in views) <= 7 * 160 * 90 * 10
@@ -265,20 +267,22 @@ def test_views_are_kept_within_their_memory(data, monkeypatch):
 def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     """After some attempts; its targets are the image's own."""
     monkeypatch.setattr("spn_model.models.scene_examples._LEAST_SHOWN", 1.1)
-    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, ANY_NUMBER)
+    examples = SceneExamples(
+        data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, UNKNOWN_COUNT
+    )
     assert examples._view(0) is None
     image, seen = examples._training_image(0)
     assert np.array_equal(image, data.image(0))
     assert seen is examples._surface(0)
-    assert examples.unseen_views(3) is None
+    assert examples.held_out_views(3) is None
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
     """Each is what a camera at its pose sees; none is among those that batches are drawn from."""
     options = SceneStageOptions(views_share=1.0, views=8)
-    examples = Examples(data, options, CENTER, SPREAD, shrink, ANY_NUMBER)
-    views = examples.unseen_views(5)
+    examples = SceneExamples(data, options, CENTER, SPREAD, shrink, UNKNOWN_COUNT)
+    views = examples.held_out_views(5)
     assert len(views.poses) == len(views.small) == 5
     drawn = Poses.concatenate(examples._view(n)[1].pose for n in range(8)).centers
     apart = np.linalg.norm(views.poses.centers[:, None] - drawn, axis=2)
@@ -294,7 +298,8 @@ def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink)
         wrong, _ = seen_by(views.poses[k - 1 :][:1])
         assert np.median(np.abs(image.astype(float) - wrong).mean(axis=2)) > 2 * np.median(off)
     assert (
-        Examples(data, SceneStageOptions(), CENTER, SPREAD, 2, ANY_NUMBER).unseen_views(5) is None
+        SceneExamples(data, SceneStageOptions(), CENTER, SPREAD, 2, UNKNOWN_COUNT).held_out_views(5)
+        is None
     )
 
 
@@ -304,15 +309,15 @@ def test_shares_of_high_views_are_as_told(data):
 
     def heights(**options: float) -> np.ndarray:
         stage = SceneStageOptions(views_share=1.0, views_rise=0.0, views_side=0.0, **options)
-        examples = Examples(data, stage, CENTER, SPREAD, 2, ANY_NUMBER)
+        examples = SceneExamples(data, stage, CENTER, SPREAD, 2, UNKNOWN_COUNT)
         return np.array([examples._view(n)[1].pose.centers[0, 2] for n in range(6)])
 
     assert (heights(views_high=1.0, views_height=3.0) > highest).any()
     assert (heights(views_high=0.0) <= highest + 1e-6).all()
 
 
-@pytest.mark.parametrize(("images", "views"), [(100, 32), (6000, 50), (ANY_NUMBER, 1000)])
+@pytest.mark.parametrize(("images", "views"), [(100, 32), (6000, 50), (UNKNOWN_COUNT, 1000)])
 def test_a_short_stage_makes_few_views(data, images, views):
     """One for 120 images that it draws: a view takes the time of ten of them."""
-    examples = Examples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
+    examples = SceneExamples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
     assert examples._view_count == views

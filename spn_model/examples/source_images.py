@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.pose import Poses
-from spn_model.examples.ground import Ground, level_ground
+from spn_model.examples.ground import Ground, fit_level_ground
 from spn_model.examples.training_set import TrainingSet
 
 _MOST_IMAGES = 600  # that views are made of; neighbouring frames of a video show the same
@@ -32,7 +32,7 @@ class Occluders:
     cell_px: int
 
     @classmethod
-    def of(
+    def from_points(
         cls, pixels: np.ndarray, depth: np.ndarray, size: tuple[int, int], cell_px: int
     ) -> Occluders:
         """From points at pixels (N, 2) of an image of a size, at depths (N,); each counts for 3 x 3 cells."""
@@ -64,7 +64,7 @@ def projected(
     return index, np.column_stack([x[index], y[index]]), depth[index]
 
 
-class ViewSources:
+class SourceImages:
     """Training images as sources of views.
 
     rows (S,) : which images; ground : None where there is none, or up is not known; occluders : of each
@@ -81,7 +81,7 @@ class ViewSources:
         owner, xyz = owner[near], xyz[near]
         self.ground: Ground | None = None
         if data.up_is_known and len(xyz):
-            self.ground = level_ground(xyz, spread)
+            self.ground = fit_level_ground(xyz, spread)
         self.centers = data.poses.centers[self.rows]
         self._axes = data.poses.rotations[self.rows, 2]
         self._apart = _APART * spread
@@ -106,12 +106,12 @@ class ViewSources:
         hiding = np.unique(np.round(xyz / step).astype(np.int64), axis=0) * step
         # The ground hides nothing, and at a flat angle its nearer parts lie close below the farther ones.
         if self.ground is not None:
-            hiding = hiding[~self.ground.has(hiding)]
+            hiding = hiding[~self.ground.is_at_or_below(hiding)]
         made = []
         for row in self.rows:
             pose = data.poses[row : row + 1]
             _, pixels, depth = projected(hiding, pose, data.intrinsics[row], data.size)
-            made.append(Occluders.of(pixels, depth, data.size, _OCCLUDER_PX))
+            made.append(Occluders.from_points(pixels, depth, data.size, _OCCLUDER_PX))
         return made
 
     def _see_ground(self, data: TrainingSet, ground: Ground) -> np.ndarray:
