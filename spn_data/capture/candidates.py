@@ -17,7 +17,7 @@ from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, safe_name
 from spn_data.errors import InputError
 from spn_data.storage.files import atomic_writer
-from spn_data.telemetry.exif import telemetry_of_photos
+from spn_data.telemetry.exif import telemetry_from_photos
 from spn_data.telemetry.track import Telemetry
 
 _CACHE_VERSION = 1  # increase whenever the measurements change
@@ -186,7 +186,7 @@ def _video_images(
 def _analyse_photos(source: Source, progress: Callable[[int], None] | None) -> Candidates:
     headers = read_headers(source.parts)
     known = [i for i, photo in enumerate(headers.metadata) if photo is not None]
-    telemetry = telemetry_of_photos(
+    telemetry = telemetry_from_photos(
         [photo for photo in headers.metadata if photo is not None], source=source.sequence
     )
     # Unreadable photos take the time of the photo before.

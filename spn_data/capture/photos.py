@@ -192,8 +192,10 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
 def _check_size(width: int, height: int, path: Path) -> None:
     """Refuse a photo whose header claims an absurd size."""
     if width * height > MAX_PHOTO_PIXELS:
-        limit = f"{MAX_PHOTO_PIXELS / 1e6:.0f} megapixels"
-        raise InputError(f"{width}x{height} pixels exceed the limit of {limit}", path=path)
+        raise InputError(
+            f"{width}x{height} pixels exceed the limit of {MAX_PHOTO_PIXELS / 1e6:.0f} megapixels",
+            path=path,
+        )
 
 
 def _upright(image: Image.Image) -> Image.Image:

@@ -10,8 +10,8 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
-from spn_data.matching.guided import match_along_lines
-from spn_data.matching.putative import DescriptorComparison, MatchOptions
+from spn_data.matching.guided import match_guided
+from spn_data.matching.putative import MatchOptions, PutativeMatcher
 
 _ITERATIONS = 1000  # of its estimation, at most
 
@@ -94,11 +94,11 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
     The strongest features tell first, for a sixteenth of the cost, then twice as many, and so on: most pairs
     end here. Of those that surely overlap the other features are compared along epipolar lines alone.
     """
-    comparison = DescriptorComparison(a.descriptors, b.descriptors)
+    matcher = PutativeMatcher(a.descriptors, b.descriptors)
     fundamental, n = None, options.strongest
     while n < min(len(a), len(b)):
-        comparison.extend(n)
-        first = comparison.matches(options)
+        matcher.extend(n)
+        first = matcher.matches(options)
         n *= 2
         if len(first) < options.telling_matches:
             continue
@@ -109,11 +109,11 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
             fundamental = found
             break
     if fundamental is None:
-        comparison.extend(max(len(a), len(b)))
-        matches = comparison.matches(options)
+        matcher.extend(max(len(a), len(b)))
+        matches = matcher.matches(options)
     else:
         points = a.keypoints[:, :2], b.keypoints[:, :2]
-        matches = match_along_lines(
+        matches = match_guided(
             *(points[0], a.descriptors, points[1], b.descriptors, fundamental, options)
         )
     _, fits = _epipolar_geometry(a, b, matches, options)

@@ -1,4 +1,4 @@
-"""Local features of one image: SIFT keypoints and RootSIFT descriptors, a pure function of pixels."""
+"""Local features of one image: SIFT keypoints and RootSIFT descriptors, a pure function of the pixels."""
 
 from __future__ import annotations
 
@@ -12,21 +12,37 @@ from spn_data.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureOptions:
-    """How features are found."""
+    """Options of feature detection.
 
-    max_features: int = 4096  # strongest kept per image
-    max_image_size_px: int = 1600  # the longer side is reduced to this before detection
-    contrast_threshold: float = 0.02  # OpenCV's; finds what COLMAP's peak threshold 0.0067 does
-    edge_threshold: float = 10.0  # ratio of principal curvatures above which a point is an edge
+    Attributes
+    ----------
+    max_features : int
+        Number of strongest features kept per image.
+    max_image_size_px : int
+        The longer image side is reduced to this before detection.
+    contrast_threshold : float
+        OpenCV's; it detects what COLMAP's peak threshold of 0.0067 does.
+    edge_threshold : float
+        Ratio of principal curvatures above which a point is rejected as an edge.
+    """
+
+    max_features: int = 4096
+    max_image_size_px: int = 1600
+    contrast_threshold: float = 0.02
+    edge_threshold: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
     """Features of one image, strongest first.
 
-    keypoints : (N, 4) float32: x, y in full-size pixels (COLMAP's: centre of the upper-left pixel at
-        0.5, 0.5), scale in pixels, orientation in radians.
-    descriptors : (N, 128) uint8 RootSIFT, of length 512.
+    Attributes
+    ----------
+    keypoints : ndarray of float32, shape (N, 4)
+        x, y in full-size pixels (COLMAP's convention: the centre of the upper-left pixel is 0.5, 0.5), scale
+        in pixels, orientation in radians.
+    descriptors : ndarray of uint8, shape (N, 128)
+        RootSIFT of length 512.
     """
 
     keypoints: np.ndarray
@@ -39,21 +55,62 @@ class Features:
 def extract_from_bytes(
     name: str, image: bytes, mask: bytes | None, options: FeatureOptions
 ) -> tuple[str, Features]:
-    """Features of an encoded image. Pure: the same bytes give the same features anywhere."""
+    """Extract the features of an encoded image.
+
+    A pure function: the same bytes give the same features on any machine.
+
+    Parameters
+    ----------
+    name : str
+        Name of the image, returned unchanged.
+    image : bytes
+        The encoded image.
+    mask : bytes or None
+        An encoded mask of the image, white at pixels on which features may be detected.
+    options : FeatureOptions
+        Options of feature detection.
+
+    Returns
+    -------
+    name : str
+        As given.
+    features : Features
+        Features of the image.
+
+    Raises
+    ------
+    InputError
+        If the image or its mask cannot be decoded.
+    """
     gray = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
     if gray is None:
-        raise InputError("is no image that can be decoded", path=name)
-    use = None
+        raise InputError("cannot be decoded as an image", path=name)
+    usable = None
     if mask is not None:
         decoded = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
         if decoded is None:
-            raise InputError("its mask is no image that can be decoded", path=name)
-        use = decoded > 127
-    return name, extract(gray, use, options)
+            raise InputError("its mask cannot be decoded as an image", path=name)
+        usable = decoded > 127
+    return name, extract(gray, usable, options)
 
 
 def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) -> Features:
-    """Features of a grey image (H, W) uint8, only where mask (H, W) bool is true."""
+    """Extract the features of a grey image.
+
+    Parameters
+    ----------
+    gray : ndarray of uint8, shape (H, W)
+        The image.
+    mask : ndarray of bool, shape (H, W), or None
+        Pixels on which features may be detected.
+    options : FeatureOptions
+        Options of feature detection.
+
+    Returns
+    -------
+    Features
+        At most `options.max_features`.
+    """
     height, width = gray.shape
     scale = min(1.0, options.max_image_size_px / max(height, width))
     if scale < 1:
@@ -69,7 +126,7 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
         nfeatures=options.max_features,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,
-        # Without it the doubled first octave is shifted by a quarter of a pixel.
+        # Without this, the doubled first octave is shifted by a quarter of a pixel.
         enable_precise_upscale=True,
     )
     points, raw = sift.detectAndCompute(gray, mask_image)
@@ -87,6 +144,6 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
 
 
 def root_sift(descriptors: np.ndarray) -> np.ndarray:
-    """RootSIFT (N, 128) uint8 of length 512 (Arandjelovic & Zisserman 2012), as COLMAP stores it."""
+    """Convert SIFT to RootSIFT (N, 128) uint8 of length 512 as in COLMAP (Arandjelovic & Zisserman 2012)."""
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
     return np.clip(np.rint(512.0 * rooted), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Which pairs of frames to match: neighbours in time, in space, and in appearance."""
+"""Selection of image pairs to match: neighbours in time, in space and in appearance."""
 
 from __future__ import annotations
 
@@ -14,23 +14,41 @@ from spn_data.matching.putative import unit_descriptors
 
 @dataclass(frozen=True, kw_only=True)
 class PairOptions:
-    """How pairs are chosen."""
+    """Options of the pair selection.
 
-    overlap: int = 2  # following frames of the same sequence
-    far_steps: int = 3  # further ones at 2, 4, ... times the overlap
-    spatial_neighbors: int = 5  # nearest frames by GNSS that lie not just before or behind
-    spatial_max_m: float = 60.0  # beyond which no frame is a neighbour
-    appearance_neighbors: int = 4  # most similar frames that time does not pair already
-    words: int = 64  # of the vocabulary that appearance is described with
+    Attributes
+    ----------
+    overlap : int
+        Number of following frames of the same sequence to pair with.
+    far_steps : int
+        Number of further frames, at 2, 4, ... times `overlap`.
+    spatial_neighbors : int
+        Number of nearest frames by GNSS position, apart from those directly before or after.
+    spatial_max_m : float
+        Distance beyond which no frame is a spatial neighbour.
+    appearance_neighbors : int
+        Number of most similar frames that are not already paired in time.
+    words : int
+        Size of the visual vocabulary.
+    seed : int
+        Random seed.
+    """
+
+    overlap: int = 2
+    far_steps: int = 3
+    spatial_neighbors: int = 5
+    spatial_max_m: float = 60.0
+    appearance_neighbors: int = 4
+    words: int = 64
     seed: int = 0
 
     @property
     def farthest_step(self) -> int:
-        """Between frames of a sequence that time pairs."""
+        """Largest step between frames of a sequence that are paired in time."""
         return int(self.overlap * 2**self.far_steps)
 
     def wider(self) -> PairOptions:
-        """Three times as many neighbours of each kind."""
+        """Return options with three times as many neighbours of each kind."""
         return replace(
             self,
             overlap=self.overlap * 3 + self.far_steps * 2,
@@ -45,10 +63,23 @@ def choose_pairs(
     appearance: np.ndarray | None,
     options: PairOptions,
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j) of frame indices, i < j, sorted.
+    """Choose the image pairs to match.
 
-    sequences : (N,) names; frames of one sequence stand in the order of time. positions_m : (N, 3) ENU,
-    NaN where unknown. appearance : (N, D) unit vectors (`describe_appearance`), or None.
+    Parameters
+    ----------
+    sequences : ndarray of str, shape (N,)
+        Sequence of each frame; frames of one sequence are in order of time.
+    positions_m : ndarray, shape (N, 3)
+        ENU positions in metres; NaN if unknown.
+    appearance : ndarray, shape (N, D), or None
+        Unit vectors from `vlad_descriptor`.
+    options : PairOptions
+        Options of the pair selection.
+
+    Returns
+    -------
+    list of (int, int)
+        Sorted pairs (i, j) of frame indices, i < j.
     """
     return sorted(
         sequence_pairs(sequences, options)
@@ -58,7 +89,20 @@ def choose_pairs(
 
 
 def sequence_pairs(sequences: np.ndarray, options: PairOptions) -> set[tuple[int, int]]:
-    """Frames of a sequence with the next `overlap` ones, and some further ones."""
+    """Pair frames of a sequence with the next `overlap` ones and with some further ones.
+
+    Parameters
+    ----------
+    sequences : ndarray of str, shape (N,)
+        Sequence of each frame; frames of one sequence are in order of time.
+    options : PairOptions
+        Supplies `overlap` and `far_steps`.
+
+    Returns
+    -------
+    set of (int, int)
+        Pairs (i, j) of frame indices, i < j.
+    """
     steps = [
         *range(1, options.overlap + 1),
         *(options.overlap * 2**k for k in range(1, options.far_steps + 1)),
@@ -74,25 +118,26 @@ def sequence_pairs(sequences: np.ndarray, options: PairOptions) -> set[tuple[int
 def spatial_pairs(
     sequences: np.ndarray, positions_m: np.ndarray, options: PairOptions
 ) -> set[tuple[int, int]]:
-    """Nearest frames by position, over all sequences; within one, of those on another part of the path.
+    """Pair frames with their nearest neighbours by position.
 
-    On another part is what lies nearer than half the way that was flown in between: a neighbouring line, a
-    place seen again. What lies straight on is paired by time.
+    Neighbours may be in any sequence. In the same one they must be on another part of the path, that is,
+    nearer than half the distance flown in between: an adjacent flight line or a revisited place. Frames
+    straight ahead are paired in time.
     """
     known = np.flatnonzero(np.isfinite(positions_m).all(axis=1))
     if len(known) < 2 or options.spatial_neighbors == 0:
         return set()
-    places, of_place = positions_m[known], sequences[known]
+    positions, sequence = positions_m[known], sequences[known]
     k = min(options.spatial_neighbors + 2 * options.farthest_step + 1, len(known))
-    distance_m, neighbor = cKDTree(places).query(places, k=k)
-    step_m = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1)
+    distance_m, neighbor = cKDTree(positions).query(positions, k=k)
+    step_m = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
     flown_m = np.cumsum(step_m)
     pairs = set()
     for i in range(len(known)):
         others, away_m = neighbor[i], distance_m[i]
         straight_on = away_m > 0.5 * np.abs(flown_m[others] - flown_m[i])
         wanted = (others != i) & (away_m <= options.spatial_max_m)
-        wanted &= (of_place[others] != of_place[i]) | ~straight_on
+        wanted &= (sequence[others] != sequence[i]) | ~straight_on
         for j in others[wanted][: options.spatial_neighbors].tolist():
             pairs.add(_ordered(int(known[i]), int(known[j])))
     return pairs
@@ -101,7 +146,7 @@ def spatial_pairs(
 def appearance_pairs(
     sequences: np.ndarray, appearance: np.ndarray, options: PairOptions
 ) -> set[tuple[int, int]]:
-    """Most similar frames, leaving out those that are close in time anyway (loop closures)."""
+    """Pair the most similar frames, except those close in time (loop closures)."""
     n = len(appearance)
     similarity = appearance @ appearance.T
     order = np.arange(n)
@@ -122,8 +167,21 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
     return (i, j) if i < j else (j, i)
 
 
-def appearance_vocabulary(descriptors: list[np.ndarray], options: PairOptions) -> np.ndarray:
-    """Words (W, 128): k-means over a sample of the descriptors of the frames themselves."""
+def visual_vocabulary(descriptors: list[np.ndarray], options: PairOptions) -> np.ndarray:
+    """Train a visual vocabulary by k-means on a sample of the descriptors.
+
+    Parameters
+    ----------
+    descriptors : list of ndarray of uint8, shape (N_i, 128)
+        RootSIFT descriptors of each frame.
+    options : PairOptions
+        Supplies `words` and `seed`.
+
+    Returns
+    -------
+    ndarray of float32, shape (W, 128)
+        Visual words; fewer than `words` if there are fewer descriptors.
+    """
     rng = np.random.default_rng(options.seed)
     filled = [d for d in descriptors if len(d)]
     per_image = max(1, 50_000 // max(1, len(filled)))
@@ -134,17 +192,31 @@ def appearance_vocabulary(descriptors: list[np.ndarray], options: PairOptions) -
     if words == 0:
         return np.zeros((0, 128), np.float32)
     with warnings.catch_warnings():
-        # A word that no descriptor is nearest to only leaves its part of the description empty.
+        # A word without descriptors only leaves its part of the VLAD vector empty.
         warnings.filterwarnings("ignore", "One of the clusters is empty")
         centers, _ = kmeans2(unit_descriptors(sample), words, iter=12, minit="points", rng=rng)
     return np.asarray(centers, np.float32)
 
 
-def describe_appearance(descriptors: np.ndarray, vocabulary: np.ndarray) -> np.ndarray:
-    """One unit vector (W * 128,) for an image: VLAD with intra-normalisation.
+def vlad_descriptor(descriptors: np.ndarray, vocabulary: np.ndarray) -> np.ndarray:
+    """Describe the appearance of an image by VLAD with intra-normalisation.
 
+    Parameters
+    ----------
+    descriptors : ndarray of uint8, shape (N, 128)
+        RootSIFT descriptors of the image.
+    vocabulary : ndarray, shape (W, 128)
+        From `visual_vocabulary`.
+
+    Returns
+    -------
+    ndarray of float32, shape (W * 128,)
+        Unit vector; zero for an image without features.
+
+    References
+    ----------
     Jegou et al. 2010, "Aggregating local descriptors into a compact image representation";
-    Arandjelovic & Zisserman 2013, "All about VLAD". An image without features is the zero vector.
+    Arandjelovic & Zisserman 2013, "All about VLAD".
     """
     vlad = np.zeros_like(vocabulary, dtype=np.float32)
     if len(descriptors) and len(vocabulary):

@@ -9,41 +9,92 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
-    """How descriptors are matched and pairs verified."""
+    """Options of descriptor matching and geometric verification.
 
-    max_ratio: float = 0.8  # nearest to second-nearest distance (Lowe 2004)
-    max_distance: float = 0.7  # of unit descriptors
-    max_error_px: float = 4.0  # epipolar error of an inlier
-    min_inliers: int = 15  # of a verified pair
-    strongest: int = 1024  # features of each image that tell whether two of them overlap
-    telling_matches: int = 30  # of these, from which on they do
-    least_share: float = 0.36  # of these that fit one epipolar geometry, below which they do not
-    guided_share: float = 0.6  # from which on the others are sought along epipolar lines
-    guided_px: float = 6.0  # to either side of a line
-    guided_step: int = 8  # every such feature elsewhere is compared as well
-    guided_ratio: float = 0.7  # in place of max_ratio there: fewer others give as few wrong ones
+    Attributes
+    ----------
+    max_ratio : float
+        Ratio test: nearest over second-nearest descriptor distance (Lowe 2004).
+    max_distance : float
+        Largest distance of unit descriptors.
+    max_error_px : float
+        Epipolar error of an inlier.
+    min_inliers : int
+        Inliers of a verified pair.
+    strongest : int
+        Number of strongest features per image that decide whether two images overlap.
+    telling_matches : int
+        Number of putative matches of these that is needed to decide.
+    least_share : float
+        Inlier ratio of these matches below which the images are taken not to overlap.
+    guided_share : float
+        Inlier ratio of these matches from which guided matching is used for all features.
+    guided_px : float
+        Half width of the band around an epipolar line in guided matching.
+    guided_step : int
+        Every such feature outside the band takes part in the ratio test of guided matching.
+    guided_ratio : float
+        Replaces `max_ratio` in guided matching; stricter, because there are few competitors near a line.
+    seed : int
+        Random seed.
+    """
+
+    max_ratio: float = 0.8
+    max_distance: float = 0.7
+    max_error_px: float = 4.0
+    min_inliers: int = 15
+    strongest: int = 1024
+    telling_matches: int = 30
+    least_share: float = 0.36
+    guided_share: float = 0.6
+    guided_px: float = 6.0
+    guided_step: int = 8
+    guided_ratio: float = 0.7
     seed: int = 0
 
 
-_ROWS = 64  # rows of the similarity matrix at a time: they stay in the processor's cache
+_ROWS = 64  # rows of the similarity matrix per block, so that a block fits into the CPU cache
 
 
 def match_descriptors(
     descriptors_a: np.ndarray, descriptors_b: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
-    """Matches (M, 2) uint32 of row indices into two (N, 128) uint8 RootSIFT arrays."""
-    comparison = DescriptorComparison(descriptors_a, descriptors_b)
-    comparison.extend(max(len(descriptors_a), len(descriptors_b)))
-    return comparison.matches(options)
+    """Match two sets of descriptors.
+
+    Parameters
+    ----------
+    descriptors_a, descriptors_b : ndarray of uint8, shape (N, 128) and (K, 128)
+        RootSIFT descriptors.
+    options : MatchOptions
+        Supplies `max_ratio` and `max_distance`.
+
+    Returns
+    -------
+    ndarray of uint32, shape (M, 2)
+        Row indices of putative matches.
+    """
+    matcher = PutativeMatcher(descriptors_a, descriptors_b)
+    matcher.extend(max(len(descriptors_a), len(descriptors_b)))
+    return matcher.matches(options)
 
 
-class DescriptorComparison:
-    """All with all of the first n descriptors of two images, where n can grow: nothing is compared twice."""
+class PutativeMatcher:
+    """Incremental exhaustive matcher of two images.
+
+    It compares the first n descriptors of one image with the first n of the other; n can grow, and nothing is
+    compared twice.
+    """
 
     def __init__(self, descriptors_a: np.ndarray, descriptors_b: np.ndarray) -> None:
-        """(N, 128) and (K, 128) uint8 RootSIFT."""
+        """Create a matcher that has compared nothing yet.
+
+        Parameters
+        ----------
+        descriptors_a, descriptors_b : ndarray of uint8, shape (N, 128) and (K, 128)
+            RootSIFT descriptors.
+        """
         self._descriptors = descriptors_a, descriptors_b
-        # Of unit length, as far as they are compared; rows of one and columns of the other.
+        # Unit descriptors of those compared so far: rows of a, columns of b.
         self._a = np.empty(descriptors_a.shape, np.float32)
         self._b = np.empty(descriptors_b.T.shape, np.float32)
         self._compared = 0, 0
@@ -54,7 +105,7 @@ class DescriptorComparison:
         self._best_of_b = np.full(len(descriptors_b), -1.0, np.float32)
 
     def extend(self, n: int) -> None:
-        """Compare the first n of each, or all where there are fewer."""
+        """Compare the first n descriptors of each image, or all if there are fewer."""
         a, b = self._descriptors
         rows, columns = self._compared
         self._compared = min(n, len(a)), min(n, len(b))
@@ -82,7 +133,7 @@ class DescriptorComparison:
             self._first[block][nearer] = first[nearer]
 
     def matches(self, options: MatchOptions) -> np.ndarray:
-        """(M, 2) uint32 row indices of those compared so far: mutual nearest that pass the ratio test."""
+        """Return putative matches (M, 2) uint32, row indices of the descriptors compared so far."""
         rows, columns = self._compared
         if rows == 0 or columns < 2:
             return np.zeros((0, 2), np.uint32)
@@ -98,10 +149,10 @@ def mutual_matches(
     best_of_b: np.ndarray,
     options: MatchOptions,
 ) -> np.ndarray:
-    """Matches (M, 2) uint32 of features in a whose nearest in b has them as its nearest too.
+    """Return mutual nearest neighbours (M, 2) uint32 that pass the ratio test.
 
-    nearest : (N,) rows of b; first, second : (N,) similarities of the nearest and of the next, whose ratio
-    of distances is tested; best_of_b : (K,) highest similarity of each row of b.
+    nearest : (N,) rows of b; first, second : (N,) similarities of the nearest and second-nearest neighbour;
+    best_of_b : (K,) highest similarity of each row of b.
     """
     distance_sq, second_sq = 2 - 2 * first, 2 - 2 * second
     good = (
@@ -110,11 +161,11 @@ def mutual_matches(
         & (distance_sq < options.max_distance**2)
     )
     matches = np.stack([np.flatnonzero(good), nearest[good]], axis=1).astype(np.uint32)
-    # Two equal descriptors in a can both be the best of one in b: only one of them may keep it.
+    # Two equal descriptors in a can both be the best match of one in b; keep the first.
     return matches[np.sort(np.unique(matches[:, 1], return_index=True)[1])]
 
 
 def unit_descriptors(descriptors: np.ndarray) -> np.ndarray:
-    """(N, 128) float32 of length one."""
+    """Normalise descriptors to unit length, (N, 128) float32."""
     floats = descriptors.astype(np.float32)
     return floats / np.maximum(np.linalg.norm(floats, axis=1, keepdims=True), 1e-12)

@@ -13,7 +13,7 @@ from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import FeatureOptions, Features, extract_from_bytes
-from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_data.matching.putative import MatchOptions
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
@@ -74,10 +74,10 @@ def appearance_of(database: MapDatabase, frames: FramesToMap, options: PairOptio
     # All descriptors at once would be half a megabyte a frame.
     telling = frames.names[:: math.ceil(len(frames.names) / _FRAMES_OF_VOCABULARY)]
     described = [database.read_features(name).descriptors for name in telling]
-    vocabulary = appearance_vocabulary(described, options)
+    vocabulary = visual_vocabulary(described, options)
     return np.stack(
         [
-            describe_appearance(database.read_features(name).descriptors, vocabulary)
+            vlad_descriptor(database.read_features(name).descriptors, vocabulary)
             for name in frames.names
         ]
     )

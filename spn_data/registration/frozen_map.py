@@ -14,7 +14,7 @@ from spn_data.colmap.map_features import MapFeatures
 from spn_data.colmap.model import MapObservations, Scene, read_map_with_features
 from spn_data.errors import FormatError
 from spn_data.labels.map_points import MapPoints
-from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +40,8 @@ class FrozenMap:
         )
         self._features = features
         described = [features.descriptors(name) for name in self.scene.names]
-        self.vocabulary = appearance_vocabulary(described, PairOptions())
-        self._appearance = np.stack([describe_appearance(d, self.vocabulary) for d in described])
+        self.vocabulary = visual_vocabulary(described, PairOptions())
+        self._appearance = np.stack([vlad_descriptor(d, self.vocabulary) for d in described])
 
     @classmethod
     @contextmanager
@@ -51,7 +51,7 @@ class FrozenMap:
 
     def similar(self, descriptors: np.ndarray, count: int) -> list[str]:
         """Names of the map frames that look most like an image with these descriptors, best first."""
-        likeness = self._appearance @ describe_appearance(descriptors, self.vocabulary)
+        likeness = self._appearance @ vlad_descriptor(descriptors, self.vocabulary)
         order = np.argsort(-likeness, kind="stable")[:count]
         return [self.scene.names[k] for k in order]
 

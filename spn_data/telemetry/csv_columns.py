@@ -1,4 +1,4 @@
-"""The names and units that the columns of flight logs have, and what they mean."""
+"""Names and units of flight-log columns, and their meaning."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-# What a column means: its names, in lower case with "_" for blanks and dots, without units.
-# Where a log has columns of several names for one meaning, the first in the list counts.
+# Meaning of a column -> its names without units, in lower case with "_" for blanks and dots.
+# If a log has several of these columns, the first name in the list counts.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "time": ("time", "t", "elapsed_time", "fly_time", "flytime"),
     "utc": ("datetime", "utc", "timestamp", "utc_time", "date_time", "updatetime"),
@@ -50,25 +50,25 @@ _BRACKETS = re.compile(r"(.*?)\s*[(\[]\s*([^()\[\]]*?)\s*[)\]]\s*")
 
 @dataclass(frozen=True)
 class CsvColumn:
-    """One column that is understood."""
+    """One recognised column of a CSV log."""
 
     index: int
-    header: str  # as the file has it
-    scale: float  # from its unit to ours; NaN where the unit is not known
-    unit: str  # as the file has it; "" where it states none
+    header: str  # as in the file
+    scale: float  # from its unit to ours; NaN if the unit is unknown
+    unit: str  # as in the file; "" if none is stated
 
 
-def columns_of(header: Sequence[str]) -> dict[str, CsvColumn]:
-    """What is known of a header row, by meaning; of equal names the first column counts."""
+def parse_header(header: Sequence[str]) -> dict[str, CsvColumn]:
+    """Return the recognised columns of a header row by meaning; the first of several equal names counts."""
     parsed: dict[str, tuple[int, str]] = {}
     for index, cell in enumerate(header):
         name, unit = _name_and_unit(cell)
         parsed.setdefault(name, (index, unit))
-    found: dict[str, CsvColumn] = {}
+    columns: dict[str, CsvColumn] = {}
     for meaning, names in COLUMNS.items():
         units = _UNITS.get(meaning, {})
         for name in names:
-            # The unit stands in brackets, or after the name: "rel_alt_m".
+            # The unit is in brackets or is a suffix of the name: "rel_alt_m".
             candidates = [(name, "")] + [(f"{name}_{unit}", unit) for unit in units]
             match = next((c for c in candidates if c[0] in parsed), None)
             if match is None:
@@ -76,13 +76,13 @@ def columns_of(header: Sequence[str]) -> dict[str, CsvColumn]:
             index, unit = parsed[match[0]]
             unit = unit or match[1]
             scale = 1.0 if not unit or not units else units.get(unit, math.nan)
-            found[meaning] = CsvColumn(index, header[index], scale, unit)
+            columns[meaning] = CsvColumn(index, header[index], scale, unit)
             break
-    return found
+    return columns
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """("height_above_takeoff", "feet") of "height_above_takeoff(feet)" or "OSD.height [ft]"."""
+    """Split "height_above_takeoff(feet)" or "OSD.height [ft]" into a normalised name and a unit."""
     match = _BRACKETS.fullmatch(cell)
     name, unit = (match[1], match[2]) if match else (cell, "")
     name = re.sub(r"[\s.\-]+", "_", name.strip().lower())

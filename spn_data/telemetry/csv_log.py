@@ -1,4 +1,4 @@
-"""Logs of named columns: our own CSV, Airdata's exports, DJI flight records, RTK loggers."""
+"""Flight logs with named columns: our own CSV, Airdata exports, DJI flight records, RTK loggers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import sigma_from_dop
-from spn_data.telemetry.csv_columns import COLUMNS, CsvColumn, columns_of
-from spn_data.telemetry.textfile import MAX_RECORDS, csv_rows, read_text
-from spn_data.telemetry.track import Telemetry, increasing
+from spn_data.telemetry.csv_columns import COLUMNS, CsvColumn, parse_header
+from spn_data.telemetry.textfile import MAX_RECORDS, csv_rows, finite_number, read_text
+from spn_data.telemetry.track import Telemetry, time_order
 
-MAX_DAMAGED_FRACTION = 0.05  # of the rows, above which the log as a whole is not believed
+MAX_DAMAGED_FRACTION = 0.05  # of the rows; a log with more damage is refused as a whole
 NAN = float("nan")
 _UNKNOWN = {"", "nan", "n/a", "na", "null", "none", "-"}
 _REFERENCES = {
@@ -26,19 +26,19 @@ _REFERENCES = {
     "takeoff": HeightReference.TAKEOFF,
     "unknown": HeightReference.UNKNOWN,
 }
-# Seconds since 1970 beyond this are a date after 1973, and never a time of flight.
+# Larger values are seconds since 1970 (a date after 1973), never a flight time.
 _ABSOLUTE_S = 1e8
 
 
 def read_csv_log(path: Path | str) -> Telemetry:
-    """Telemetry of a log with a header row. Raises InputError naming file and line.
+    """Read a log with a header row; raise InputError naming file and line.
 
-    Needs a latitude, a longitude and a time; `docs/telemetry.md` lists names and units of columns.
-    Up to 5 % damaged rows are left out and counted in the notes.
+    It needs a latitude, a longitude and a time; `docs/telemetry.md` lists column names and units. Up to 5 %
+    damaged rows are left out and counted in the notes.
     """
     rows = csv_rows(read_text(path), path, "telemetry")
     header_line, header = next(rows, (1, []))
-    columns = _understood(header, header_line, path)
+    columns = _parse_columns(header, header_line, path)
     records: list[dict[str, float]] = []
     damaged: list[tuple[int, str]] = []
     zoneless = False
@@ -47,7 +47,7 @@ def read_csv_log(path: Path | str) -> Telemetry:
         if len(records) == MAX_RECORDS:
             raise InputError(f"has more than {MAX_RECORDS:,} rows", path=path, line=line)
         try:
-            record, without_zone = _record(row, columns, len(header))
+            record, without_zone = _parse_row(row, columns, len(header))
         except ValueError as error:
             damaged.append((line, str(error)))
             continue
@@ -57,7 +57,7 @@ def read_csv_log(path: Path | str) -> Telemetry:
             references.add(row[columns["alt_reference"].index].lower())
     total = len(records) + len(damaged)
     if total == 0:
-        raise InputError("a header and no rows", path=path, line=header_line)
+        raise InputError("has a header but no rows", path=path, line=header_line)
     if len(damaged) > MAX_DAMAGED_FRACTION * total:
         line, why = damaged[0]
         raise InputError(f"{why}; {len(damaged)} of {total} rows are damaged", path=path, line=line)
@@ -75,18 +75,18 @@ def read_csv_log(path: Path | str) -> Telemetry:
     if clock == "utc":
         time_s = time_s - time_s.min()
         notes.append(
-            "its times are dates, counted from the first: the offset to the video must be given, "
+            "its times are dates, counted from the first: the time offset to the video must be given, "
             "taken from the video's creation time, or estimated"
         )
     elif "utc" in columns and columns["time"].unit.startswith("milli"):
         notes.append(
-            "its times count from the start of the flight, not of the video (Airdata): the offset "
-            "must be given, or is estimated"
+            "its times count from the start of the flight, not of the video (Airdata): the time offset "
+            "must be given or estimated"
         )
     rel_alt_m, abs_alt_m, reference = _heights(table, references, path, header_line)
     lat_lon = np.stack([table["latitude"], table["longitude"]], axis=1)
-    lat_lon[(lat_lon == 0).all(axis=1)] = np.nan  # how drones say that there is no fix
-    index, order_notes = increasing(time_s)
+    lat_lon[(lat_lon == 0).all(axis=1)] = np.nan  # drones write 0, 0 if there is no fix
+    index, order_notes = time_order(time_s)
     notes += order_notes + _video_notes(time_s[index], table["is_video"][index] == 1)
     return Telemetry.from_columns(
         time_s,
@@ -105,7 +105,7 @@ def read_csv_log(path: Path | str) -> Telemetry:
 
 
 class _Table:
-    """Columns (N,) of the rows, NaN where a row, or the whole log, does not say."""
+    """Columns (N,) of the rows; NaN if a row, or the whole log, does not state a value."""
 
     def __init__(self, records: list[dict[str, float]]):
         self._records = records
@@ -114,12 +114,13 @@ class _Table:
         return np.array([record.get(name, NAN) for record in self._records])
 
     def known(self, name: str) -> int:
+        """Count the rows that state a value."""
         return int(np.isfinite(self[name]).sum())
 
 
-def _understood(header: list[str], line: int, path: Path | str) -> dict[str, CsvColumn]:
-    """The columns by meaning. Raises InputError where one that is needed is missing."""
-    columns = columns_of(header)
+def _parse_columns(header: list[str], line: int, path: Path | str) -> dict[str, CsvColumn]:
+    """Return the columns by meaning; raise InputError if a required one is missing or a unit is unknown."""
+    columns = parse_header(header)
     missing = [name for name in ("latitude", "longitude") if name not in columns]
     if "time" not in columns and "utc" not in columns:
         missing.insert(0, "time")
@@ -135,22 +136,22 @@ def _understood(header: list[str], line: int, path: Path | str) -> dict[str, Csv
     for column in columns.values():
         if math.isnan(column.scale):
             raise InputError(
-                f"the unit {column.unit!r} of column {column.header!r} is not known",
+                f"unknown unit {column.unit!r} in column {column.header!r}",
                 path=path,
                 line=line,
             )
     return columns
 
 
-def _record(
+def _parse_row(
     row: list[str], columns: dict[str, CsvColumn], width: int
 ) -> tuple[dict[str, float], bool]:
-    """The numbers of a row in our units, and whether its date is of an unknown zone.
+    """Return the numbers of a row in our units, and whether its date has no time zone.
 
     Raises ValueError saying what is damaged.
     """
     if len(row) < width:
-        raise ValueError(f"{len(row)} cells, the header has {width}")
+        raise ValueError(f"{len(row)} cells, but the header has {width}")
     record: dict[str, float] = {}
     zoneless = False
     for name, column in columns.items():
@@ -158,25 +159,25 @@ def _record(
         if name == "alt_reference" or cell.lower() in _UNKNOWN:
             continue
         if name in ("time", "utc"):
-            seconds, is_date, without_zone = _moment(cell, column)
+            seconds, is_date, without_zone = _parse_time(cell, column)
             if name == "utc" and not is_date and not column.unit:
                 raise ValueError(
-                    f"{column.header} is {cell[:40]}, no date: a column of seconds is named time_s"
+                    f"{column.header} is {cell[:40]}, not a date; name a column of seconds time_s"
                 )
             record.setdefault("utc" if is_date else "time", seconds)
             zoneless |= without_zone
         else:
-            record[name] = _number(cell, column) * column.scale
+            record[name] = finite_number(cell, column.header) * column.scale
     if not {"time", "utc"} & record.keys():
-        raise ValueError("it has no time")
+        raise ValueError("the row has no time")
     lat, lon = record.get("latitude", NAN), record.get("longitude", NAN)
     if abs(lat) > 90 or abs(lon) > 180:
-        raise ValueError(f"{lat}, {lon} is no position on Earth")
+        raise ValueError(f"{lat}, {lon} is not a position on Earth")
     return record, zoneless
 
 
-def _moment(cell: str, column: CsvColumn) -> tuple[float, bool, bool]:
-    """(seconds, whether they count from 1970, whether that is in a zone that is not known)."""
+def _parse_time(cell: str, column: CsvColumn) -> tuple[float, bool, bool]:
+    """Return (seconds, whether they count from 1970, whether their time zone is unknown)."""
     try:
         seconds = float(cell)
     except ValueError:
@@ -184,7 +185,7 @@ def _moment(cell: str, column: CsvColumn) -> tuple[float, bool, bool]:
             date = datetime.fromisoformat(cell.replace("/", "-"))
         except ValueError:
             raise ValueError(
-                f"{column.header} is {cell[:40]!r}, no number and no date like 2024-05-01 12:00:00"
+                f"{column.header} is {cell[:40]!r}, neither a number nor a date like 2024-05-01 12:00:00"
             ) from None
         zoneless = date.tzinfo is None
         date = date.replace(tzinfo=UTC) if zoneless else date
@@ -198,20 +199,10 @@ def _moment(cell: str, column: CsvColumn) -> tuple[float, bool, bool]:
     return seconds, seconds > _ABSOLUTE_S, column.unit == "local" and seconds > _ABSOLUTE_S
 
 
-def _number(cell: str, column: CsvColumn) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.inf
-    if not math.isfinite(value):
-        raise ValueError(f"{column.header} is {cell[:40]!r}, not a number")
-    return value
-
-
 def _heights(
     table: _Table, references: set[str], path: Path | str, line: int
 ) -> tuple[np.ndarray, np.ndarray, HeightReference]:
-    """(rel_alt_m, abs_alt_m, reference): the column whose name says most of its reference counts."""
+    """Return (rel_alt_m, abs_alt_m, reference) from the column with the most explicit reference."""
     rel_alt_m = table["rel_alt"]
     for name, reference in (
         ("alt_ellipsoid", HeightReference.ELLIPSOID),
@@ -221,8 +212,8 @@ def _heights(
             return rel_alt_m, table[name], reference
     if len(references) > 1 or not references <= _REFERENCES.keys():
         raise InputError(
-            f"the height references are {', '.join(sorted(references))[:100]}; expected one of "
-            f"{', '.join(_REFERENCES)} in all rows",
+            f"the height references are {', '.join(sorted(references))[:100]}; all rows must have the same "
+            f"one of {', '.join(_REFERENCES)}",
             path=path,
             line=line,
         )
@@ -234,7 +225,7 @@ def _heights(
 
 
 def _sigma(table: _Table) -> np.ndarray:
-    """(N, 3) from columns of standard deviations, else of accuracies, else of dilutions."""
+    """Return (N, 3) from standard deviations if there are any, else from accuracies, else from dilutions."""
     horizontal = table["sigma_h"]
     sigma = np.stack(
         [
@@ -247,11 +238,11 @@ def _sigma(table: _Table) -> np.ndarray:
     dilutions = zip(table["hdop"], table["vdop"], table["pdop"], strict=True)
     by_dilution = np.array([sigma_from_dop(hdop=h, vdop=v, pdop=p) for h, v, p in dilutions])
     sigma = np.where(np.isfinite(sigma).any(axis=1, keepdims=True), sigma, by_dilution)
-    return np.where(sigma > 0, sigma, np.nan)  # loggers write 0 where they do not know
+    return np.where(sigma > 0, sigma, np.nan)  # loggers write 0 if unknown
 
 
 def _video_notes(time_s: np.ndarray, is_video: np.ndarray) -> list[str]:
-    """When the drone recorded, where the log says so: the offsets that a user may give."""
+    """Report when the drone recorded, if the log says so: these are candidate time offsets."""
     starts = time_s[is_video & ~np.concatenate([[False], is_video[:-1]])]
     if len(starts) == 0:
         return []

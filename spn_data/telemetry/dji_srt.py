@@ -1,7 +1,6 @@
-"""Subtitle files (.SRT) in which drones write position, height and gimbal angles.
+"""Subtitle files (.SRT) in which drones record position, height and gimbal angles.
 
-Dialects are told apart by what the records say, not by the drone's model; `docs/telemetry.md`
-lists them.
+The dialect is detected from the records, not from the drone's model; `docs/telemetry.md` lists them.
 """
 
 from __future__ import annotations
@@ -21,33 +20,33 @@ from spn_data.telemetry.track import Telemetry, coordinate_step_m
 _TIMES = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})[,.](\d{1,6})\s*-->")
 _INDEX = re.compile(r"\s*\d{1,9}\s*")
 
-Skipped = list[tuple[int, str]]  # (line, why) of records that are left out
+Skipped = list[tuple[int, str]]  # (line, reason) of records left out
 
 
 def read_dji_srt(path: Path | str) -> Telemetry:
-    """Telemetry of a subtitle file. Raises InputError, naming file and line, where it has none."""
+    """Read telemetry from a subtitle file; raise InputError naming file and line if it has none."""
     return parse_dji_srt(read_text(path), source=str(path))
 
 
 def parse_dji_srt(text: str, *, source: str) -> Telemetry:
-    """Telemetry of the text of a subtitle file; `source` names it in messages.
+    """Parse the text of a subtitle file; `source` names it in messages.
 
-    time_s is the start of each record in the video; utc_s the drone's clock, which is local time.
-    Damaged records are left out and counted in the notes. Raises InputError where none is usable.
+    time_s is the start of each record in the video; utc_s is the drone's clock, which is local time. Damaged
+    records are left out and counted in the notes. Raises InputError if no record is usable.
     """
     if not text.strip():
-        raise InputError("the file is empty: no telemetry in it", path=source)
-    return telemetry_of_blocks(_blocks(text), source=source)
+        raise InputError("the file is empty: it contains no telemetry", path=source)
+    return telemetry_from_records(_records(text), source=source)
 
 
-def telemetry_of_blocks(
-    blocks: Iterable[tuple[int, float, str]], *, source: str, has_lines: bool = True
+def telemetry_from_records(
+    texts: Iterable[tuple[int, float, str]], *, source: str, has_lines: bool = True
 ) -> Telemetry:
-    """As `parse_dji_srt`, from (line, time_s, text) of each record; its count without `has_lines`."""
+    """Parse records given as (line, time_s, text), or as (number, time_s, text) without `has_lines`."""
     place = "line" if has_lines else "record"
     records: list[SrtRecord] = []
     skipped: Skipped = []
-    for line, time_s, body in blocks:
+    for line, time_s, body in texts:
         if len(records) == MAX_RECORDS:
             raise InputError(f"has more than {MAX_RECORDS:,} records", path=source)
         try:
@@ -60,9 +59,9 @@ def telemetry_of_blocks(
         else:
             records.append(record)
     if not records:
-        why = f"the first of its {len(skipped)}: {skipped[0][1]}" if skipped else "it has none"
+        why = f"the first of {len(skipped)}: {skipped[0][1]}" if skipped else "there are none"
         raise InputError(
-            f"no subtitle record holds drone telemetry ({why}); give the .SRT that the drone wrote",
+            f"no subtitle record contains drone telemetry ({why}); use the .SRT written by the drone",
             path=source,
             line=skipped[0][0] if skipped and has_lines else None,
         )
@@ -74,10 +73,10 @@ def telemetry_of_blocks(
     abs_alt = np.array([r.abs_alt_m for r in records])
     notes += time_notes + position_notes + _rate_notes(time, lat_lon, utc)
     if any(r.bare_altitude for r in records):
-        notes.append("[altitude] does not say above what: an absolute height of unknown reference")
+        notes.append("[altitude] is an absolute height of unknown reference")
     if np.any(abs_alt < -50):
         notes.append(
-            f"the absolute height falls to {np.nanmin(abs_alt):.1f} m, below almost all land: "
+            f"the absolute height goes down to {np.nanmin(abs_alt):.1f} m, below almost all land: "
             "its zero is not sea level"
         )
     if skipped:
@@ -98,11 +97,11 @@ def telemetry_of_blocks(
     )
 
 
-def _blocks(text: str) -> Iterator[tuple[int, float, str]]:
-    """(first line, time_s or NaN, text) of each record.
+def _records(text: str) -> Iterator[tuple[int, float, str]]:
+    """Yield (first line, time_s or NaN, text) of each record.
 
-    A record begins with its times, or with a line that holds only its number; blank lines mean
-    nothing, for some drones write them inside records.
+    A record starts with its times, or with a line that contains only its number. Blank lines do not separate
+    records, because some drones write them inside a record.
     """
     start, time_s = 1, NAN
     body: list[str] = []
@@ -123,7 +122,7 @@ def _blocks(text: str) -> Iterator[tuple[int, float, str]]:
 
 
 def _with_times(records: list[SrtRecord], source: str) -> tuple[list[SrtRecord], list[str]]:
-    """The records with times from date stamps or durations where there are no subtitle times."""
+    """Take times from date stamps or durations if the records have no subtitle times."""
     if not all(np.isnan(r.time_s) for r in records):
         return records, []
     since_first = np.array([r.utc_s - records[0].utc_s for r in records])
@@ -139,7 +138,7 @@ def _with_times(records: list[SrtRecord], source: str) -> tuple[list[SrtRecord],
             path=source,
             line=records[0].line,
         )
-    note = f"the records have no subtitle times: taken from their {by}, the first as 0 s"
+    note = f"the records have no subtitle times; times are taken from their {by}, starting at 0 s"
     timed = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
     return timed, [note]
 
@@ -147,8 +146,8 @@ def _with_times(records: list[SrtRecord], source: str) -> tuple[list[SrtRecord],
 def _in_order(
     records: list[SrtRecord], skipped: Skipped, place: str
 ) -> tuple[list[SrtRecord], list[str]]:
-    """The records whose times increase, up to where the times start over; adds to `skipped`."""
-    skipped += [(r.line, "it has no subtitle times") for r in records if np.isnan(r.time_s)]
+    """Keep the records whose times increase, up to the point where they start over; extend `skipped`."""
+    skipped += [(r.line, "no subtitle times") for r in records if np.isnan(r.time_s)]
     records = [r for r in records if not np.isnan(r.time_s)]
     keep, restart = _increasing([r.time_s for r in records])
     notes = []
@@ -160,17 +159,17 @@ def _in_order(
         records = records[:restart]
     for record, good in zip(records, keep, strict=True):
         if not good:
-            skipped.append((record.line, "its time does not follow the one before"))
+            skipped.append((record.line, "its time is not after that of the record before"))
     return [r for r, good in zip(records, keep, strict=True) if good], notes
 
 
 def _increasing(times: Sequence[float]) -> tuple[list[bool], int | None]:
-    """Which times to keep so that they increase, and from where they start over (None: nowhere)."""
+    """Return which times to keep so that they increase, and the index at which they start over, or None."""
     keep: list[bool] = []
     last = -np.inf
     for i, time_s in enumerate(times):
         following = times[i + 1 : i + 3]
-        # One time that leaps ahead of its followers is wrong, not they.
+        # A single time that leaps ahead of those after it is wrong, not the others.
         leap = len(following) == 2 and last < following[0] < min(time_s, following[1])
         if time_s <= last - 1.0 and len(following) == 2 and time_s < following[0] < following[1]:
             return keep, i
@@ -180,9 +179,9 @@ def _increasing(times: Sequence[float]) -> tuple[list[bool], int | None]:
 
 
 def _positions(records: list[SrtRecord], place: str) -> tuple[np.ndarray, list[str]]:
-    """(N, 2) latitude, longitude, NaN without a fix, and how an order was decided."""
+    """Return (N, 2) latitude and longitude, NaN without a fix, and notes on how their order was decided."""
     pairs = [p for r in records for p in (r.pair, r.home_pair) if p is not None]
-    # A latitude is at most 90 degrees: one larger value tells the order of the whole file.
+    # Latitudes are at most 90 degrees, so one larger value decides the order for the whole file.
     votes = sum(abs(a) > 90 for a, _ in pairs) - sum(abs(b) > 90 for _, b in pairs)
     height_third = any(r.height_third for r in records)
     lon_first = votes > 0 if votes else not height_third
@@ -191,8 +190,8 @@ def _positions(records: list[SrtRecord], place: str) -> tuple[np.ndarray, list[s
         order = "longitude, latitude" if lon_first else "latitude, longitude"
         third = "satellites" if lon_first else "a height"
         notes.append(
-            f"GPS(a, b, c) is read as {order}, as drones write it whose third value is {third}: "
-            "the numbers fit both orders"
+            f"GPS(a, b, c) could be in either order; it is read as {order}, the order of drones whose "
+            f"third value is {third}"
         )
     lat_lon = np.full((len(records), 2), np.nan)
     impossible: list[str] = []
@@ -202,15 +201,15 @@ def _positions(records: list[SrtRecord], place: str) -> tuple[np.ndarray, list[s
             lat, lon = record.pair[::-1] if lon_first else record.pair
         if abs(lat) > 90 or abs(lon) > 180:
             impossible.append(f"{lat}, {lon} at {place} {record.line}")
-        elif lat != 0 or lon != 0:  # 0, 0 is how DJI says that there is no fix
+        elif lat != 0 or lon != 0:  # DJI writes 0, 0 if there is no fix
             lat_lon[i] = (lat, lon) if np.isfinite(lat + lon) else NAN
     if impossible:
-        notes.append(f"positions not on Earth: {len(impossible)}, the first {impossible[0]}")
+        notes.append(f"positions not on Earth: {len(impossible)}, the first is {impossible[0]}")
     return lat_lon, notes
 
 
 def _rate_notes(time_s: np.ndarray, lat_lon: np.ndarray, utc_s: np.ndarray) -> list[str]:
-    """What to know of fixes (N, 2) and clocks (N,) before relying on them."""
+    """Report on resolution and rate of the fixes (N, 2) and on jumps of the clock (N,)."""
     notes = []
     fixed = np.isfinite(lat_lon).all(axis=1)
     if not fixed.any():
@@ -221,11 +220,11 @@ def _rate_notes(time_s: np.ndarray, lat_lon: np.ndarray, utc_s: np.ndarray) -> l
         span_s = time_s[fixed][-1] - time_s[fixed][0]
         changes = np.count_nonzero(np.any(np.diff(lat_lon[fixed], axis=0) != 0, axis=1))
         rate_hz = (fixed.sum() - 1) / span_s
-        # Frame-rate records repeat the last fix of a slower receiver: they are not independent.
+        # Records at frame rate repeat the last fix of a slower receiver: they are not independent.
         if rate_hz > 2 and changes / span_s < 0.6 * rate_hz:
             notes.append(
-                f"the position changes {changes / span_s:.2g} times a second "
-                f"in {rate_hz:.3g} records a second"
+                f"the position changes {changes / span_s:.2g} times per second, "
+                f"but there are {rate_hz:.3g} records per second"
             )
     jumps_s = np.diff(utc_s) - np.diff(time_s)
     jumped = np.flatnonzero(np.abs(jumps_s) > 3)

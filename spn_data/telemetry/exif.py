@@ -1,4 +1,4 @@
-"""What a photo's EXIF and XMP say: when, where, which way, through which lens. Never its pixels."""
+"""EXIF and XMP metadata of photos: time, position, orientation and lens. Pixels are never decoded."""
 
 from __future__ import annotations
 
@@ -28,49 +28,93 @@ _FOCAL_MM, _FOCAL_35MM, _LENS_MODEL = 37386, 41989, 42036
 _GPS_LAT, _GPS_LON, _GPS_ALT_REF, _GPS_ALT = 2, 4, 5, 6
 _GPS_MEASURE_MODE, _GPS_DOP, _GPS_H_ERROR = 10, 11, 31
 
-# The prefix is the file's own choice; the address is what identifies the vocabulary.
+# Files choose their own prefixes; the URI identifies the namespace.
 _DJI = "{http://www.dji.com/drone-dji/1.0/}"
 _PIX4D = "{http://pix4d.com/camera/1.0}"
 
 
 @dataclass(frozen=True)
 class PhotoMetadata:
-    """What a photo says of itself; NaN, "" or None where it says nothing.
+    """Metadata of one photo; NaN, "" or None if not stated.
 
-    local_s, utc_s : when it was taken, seconds since 1970, on the camera's clock of unknown zone
-        and in UTC (only where the photo tells the zone).
-    altitude_m, altitude_reference : EXIF altitude, else XMP's AbsoluteAltitude.
-    sigma_m : east, north, up. gimbal_deg : heading, pitch, roll.
+    Attributes
+    ----------
+    path : Path
+        The photo.
+    width, height : int
+        Size as stored, before `orientation` is applied.
+    orientation : int
+        EXIF: 1 as stored, 3 turned by 180 degrees, 6 and 8 by 90.
+    make, model, lens : str
+        Camera and lens.
+    focal_mm, focal_35mm : float
+        Focal length and its 35 mm equivalent.
+    calibrated_focal_px : float
+        XMP focal length of the full-size photo.
+    local_s, utc_s : float
+        Time of exposure in seconds since 1970, on the camera's clock of unknown time zone, and in UTC
+        (only if the photo states the zone).
+    lat_deg, lon_deg : float
+        WGS84 position.
+    altitude_m : float
+        EXIF altitude, or XMP's AbsoluteAltitude.
+    altitude_reference : HeightReference
+        What `altitude_m` is measured from.
+    altitude_type : str
+        XMP, such as "RtkAlt" or "GpsFusionAlt".
+    relative_altitude_m : float
+        Height above take-off.
+    gimbal_deg : tuple of float
+        Heading, pitch, roll.
+    rtk_flag : int or None
+        DJI: 50 fixed, 32 to 49 float, 16 single, 0 none.
+    sigma_m : tuple of float
+        Standard deviations east, north, up.
+    notes : tuple of str
+        What is damaged in the metadata.
     """
 
     path: Path
-    width: int  # as stored, before `orientation` is applied
+    width: int
     height: int
-    orientation: int = 1  # EXIF: 1 as stored, 3 turned by 180 degrees, 6 and 8 by 90
+    orientation: int = 1
     make: str = ""
     model: str = ""
     lens: str = ""
     focal_mm: float = NAN
     focal_35mm: float = NAN
-    calibrated_focal_px: float = NAN  # XMP, of the full-size photo
+    calibrated_focal_px: float = NAN
     local_s: float = NAN
     utc_s: float = NAN
     lat_deg: float = NAN
     lon_deg: float = NAN
     altitude_m: float = NAN
     altitude_reference: HeightReference = HeightReference.UNKNOWN
-    altitude_type: str = ""  # XMP, such as "RtkAlt" or "GpsFusionAlt"
+    altitude_type: str = ""
     relative_altitude_m: float = NAN
     gimbal_deg: tuple[float, float, float] = (NAN, NAN, NAN)
-    rtk_flag: int | None = None  # DJI: 50 fixed, 32 to 49 float, 16 single, 0 none
+    rtk_flag: int | None = None
     sigma_m: Sigma = NAN_SIGMA
-    notes: tuple[str, ...] = ()  # what is damaged in the metadata
+    notes: tuple[str, ...] = ()
 
 
 def read_photo(path: Path | str) -> PhotoMetadata:
-    """Metadata of a JPEG, PNG or TIFF. Raises InputError where it is no such photo.
+    """Read the metadata of a JPEG, PNG or TIFF.
 
-    Damaged metadata in a readable photo does not stop it: it is left out and said in `notes`.
+    Parameters
+    ----------
+    path : Path or str
+        The photo.
+
+    Returns
+    -------
+    PhotoMetadata
+        Its metadata. Damaged entries in a readable photo are left out and reported in `notes`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as such a photo.
     """
     path = Path(path)
     notes: list[str] = []
@@ -79,14 +123,14 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         try:
             if path.stat().st_size > MAX_PHOTO_BYTES:
                 raise InputError(
-                    f"is larger than the {MAX_PHOTO_BYTES / 1e9:.0f} GB that a photo may have",
+                    f"is larger than {MAX_PHOTO_BYTES / 1e9:.0f} GB, the limit for a photo",
                     path=path,
                 )
             with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
                 width, height = image.size
                 main, exif, gps = exif_tags(image, notes)
                 if image.format == "TIFF" and number(main.get(_ORIENTATION)) in (5, 6, 7, 8):
-                    width, height = height, width  # Pillow tells the size of a TIFF once turned
+                    width, height = height, width  # Pillow reports the upright size of a TIFF
                 xmp = xmp_properties(image, notes)
         except (
             OSError,
@@ -95,7 +139,10 @@ def read_photo(path: Path | str) -> PhotoMetadata:
             struct.error,
             Image.DecompressionBombError,
         ) as error:
-            reason = getattr(error, "strerror", None) or "it is no JPEG, PNG or TIFF, or is damaged"
+            reason = (
+                getattr(error, "strerror", None)
+                or "it is not a JPEG, PNG or TIFF, or it is damaged"
+            )
             raise InputError(f"cannot be read as a photo: {reason}", path=path) from error
     damage = [
         str(warning.message).splitlines()[0][:200]
@@ -136,13 +183,30 @@ def read_photo(path: Path | str) -> PhotoMetadata:
     )
 
 
-def telemetry_of_photos(
+def telemetry_from_photos(
     photos: Sequence[PhotoMetadata], names: Sequence[str] | None = None, *, source: str = ""
 ) -> Telemetry:
-    """One record a photo, in the order given; `names` (by default the files') serve the notes.
+    """Build telemetry with one record per photo.
 
-    time_s is seconds after the first photo, in UTC or on the camera's clock; where a photo has no
-    time, or the times decrease, it is the photo's place in the order, and a note says so.
+    Parameters
+    ----------
+    photos : sequence of PhotoMetadata
+        In the order of the sequence.
+    names : sequence of str, optional
+        Names for the notes, by default those of the files.
+    source : str
+        Name of the source.
+
+    Returns
+    -------
+    Telemetry
+        time_s is in seconds after the first photo, in UTC or on the camera's clock. If a photo has no time,
+        or the times decrease, photos are counted as one per second, and a note says so.
+
+    Raises
+    ------
+    ValueError
+        If the number of names differs from that of the photos.
     """
     names = [photo.path.name for photo in photos] if names is None else names
     if len(names) != len(photos):
@@ -151,7 +215,7 @@ def telemetry_of_photos(
     notes = []
     if damaged:
         notes.append(
-            f"photos with damaged metadata: {len(damaged)}, the first {': '.join(damaged[0])}"
+            f"photos with damaged metadata: {len(damaged)}, the first is {': '.join(damaged[0])}"
         )
     utc_s = np.array([photo.utc_s for photo in photos])
     is_local = not np.isfinite(utc_s).all()
@@ -161,20 +225,23 @@ def telemetry_of_photos(
     if not np.isfinite(time_s).all():
         missing = [name for name, t in zip(names, utc_s, strict=True) if math.isnan(t)]
         notes.append(
-            f"{len(missing)} photos have no time, the first {missing[0]}: counted as one a second"
+            f"{len(missing)} photos have no time, the first is {missing[0]}; "
+            "photos are counted as one per second"
         )
         time_s = np.arange(len(photos), dtype=np.float64)
     elif np.any(np.diff(time_s) < 0):
         later = names[int(np.flatnonzero(np.diff(time_s) < 0)[0]) + 1]
-        notes.append(f"{later} was taken before the photo ahead of it: counted as one a second")
+        notes.append(
+            f"{later} is older than the photo before it; photos are counted as one per second"
+        )
         time_s = np.arange(len(photos), dtype=np.float64)
     altitude = np.array([photo.altitude_m for photo in photos])
     references = {p.altitude_reference for p in photos if not math.isnan(p.altitude_m)}
     reference = references.pop() if len(references) == 1 else HeightReference.UNKNOWN
     if np.any(altitude < 0):
         notes.append(
-            f"the EXIF altitude falls to {np.nanmin(altitude):.1f} m, below sea level: "
-            "trust it for differences at most"
+            f"the EXIF altitude goes down to {np.nanmin(altitude):.1f} m, below sea level: "
+            "trust only its differences, if at all"
         )
     kinds = sorted({p.altitude_type for p in photos if p.altitude_type})
     if kinds and reference is HeightReference.UNKNOWN:
@@ -200,7 +267,7 @@ def telemetry_of_photos(
 def _times(
     main: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str]
 ) -> tuple[float, float]:
-    """(local_s, utc_s), seconds since 1970."""
+    """Return (local_s, utc_s), seconds since 1970."""
     taken = text(exif.get(_DATE_TIME_ORIGINAL)) or text(main.get(_DATE_TIME))
     local_s = _seconds(taken, "%Y:%m:%d %H:%M:%S")
     fraction = text(exif.get(_SUB_SEC_ORIGINAL))
@@ -226,30 +293,29 @@ def _times(
 def _seconds(stamp: str, layout: str) -> float:
     try:
         return datetime.strptime(stamp, layout).replace(tzinfo=UTC).timestamp()
-    except ValueError:  # "0000:00:00 00:00:00" is how a camera says that its clock was never set
+    except ValueError:  # a camera whose clock was never set writes "0000:00:00 00:00:00"
         return NAN
 
 
 def _position(
     gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
 ) -> tuple[float, float]:
-    """(latitude, longitude): EXIF's, which post-processing rewrites, else XMP's; or NaN."""
+    """Return (latitude, longitude) from EXIF, which post-processing rewrites, or from XMP; NaN if unknown."""
     lat, lon = _degrees(gps, _GPS_LAT, "S"), _degrees(gps, _GPS_LON, "W")
     if math.isnan(lat + lon):
         lat = number(xmp.get(_DJI + "GpsLatitude"))
         lon = number(xmp.get(_DJI + "GpsLongitude", xmp.get(_DJI + "GpsLongtitude")))
-    if math.isnan(lat + lon) or (
-        lat == 0 and lon == 0
-    ):  # 0, 0 is how DJI says that there is no fix
+    # DJI writes 0, 0 if there is no fix.
+    if math.isnan(lat + lon) or (lat == 0 and lon == 0):
         return NAN, NAN
     if abs(lat) > 90 or abs(lon) > 180:
-        notes.append(f"{lat}, {lon} is no position on Earth")
+        notes.append(f"{lat}, {lon} is not a position on Earth")
         return NAN, NAN
     return lat, lon
 
 
 def _degrees(gps: Mapping[int, Any], tag: int, negative: str) -> float:
-    """Signed degrees of (degrees, minutes, seconds) and the letter in the tag before it."""
+    """Return signed degrees from (degrees, minutes, seconds) and the letter in the tag before it."""
     parts = gps.get(tag)
     letter = text(gps.get(tag - 1)).upper()
     if not isinstance(parts, tuple) or len(parts) != 3 or letter not in ("N", "S", "E", "W"):
@@ -262,10 +328,10 @@ def _degrees(gps: Mapping[int, Any], tag: int, negative: str) -> float:
 
 
 def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float, HeightReference]:
-    """The altitude with its sign, and what it is above.
+    """Return the signed altitude and its reference.
 
-    EXIF 2 calls references 0 and 1 sea level, EXIF 3 the ellipsoid, and drones write either of
-    these or a pressure height under them: unknown. 2 and 3 came with EXIF 3 and say sea level.
+    EXIF 2 calls references 0 and 1 sea level, EXIF 3 the ellipsoid, and drones write either of these or a
+    pressure height: unknown. References 2 and 3 were added in EXIF 3 and mean sea level.
     """
     altitude = number(gps.get(_GPS_ALT))
     if math.isnan(altitude):
@@ -277,7 +343,7 @@ def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float, He
 
 
 def _sigma(gps: Mapping[int, Any], xmp: Mapping[str, str], rtk_flag: float) -> Sigma:
-    """Sigma east, north, up in metres, from the most direct statement that there is."""
+    """Return standard deviations east, north, up in metres from the most direct statement available."""
     rtk = tuple(positive(xmp.get(_DJI + f"RtkStd{axis}")) for axis in ("Lon", "Lat", "Hgt"))
     if not any(math.isnan(value) for value in rtk) and rtk_flag != 0:
         return rtk[0], rtk[1], rtk[2]
@@ -288,7 +354,7 @@ def _sigma(gps: Mapping[int, Any], xmp: Mapping[str, str], rtk_flag: float) -> S
     if not math.isnan(horizontal):
         return horizontal, horizontal, NAN
     dop = positive(gps.get(_GPS_DOP))
-    # EXIF: dilution in three dimensions, or in two where only these were measured.
+    # EXIF: dilution in three dimensions, or in two if only those were measured.
     return (
         sigma_from_dop(hdop=dop)
         if text(gps.get(_GPS_MEASURE_MODE)) == "2"

@@ -1,4 +1,4 @@
-"""EXIF tags and XMP properties of an open photo, and what their values may look like."""
+"""EXIF tags and XMP properties of an open photo, and conversion of their values."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 def exif_tags(
     image: Image.Image, notes: list[str]
 ) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
-    """The main, the EXIF and the GPS tags; empty where they are damaged beyond reading."""
+    """Return the main, EXIF and GPS tags; empty if they are damaged beyond reading."""
     try:
         main = image.getexif()
-        # Pillow decodes a tag when it is asked for: here, where damage is caught.
+        # Pillow decodes tags lazily: do it here, where damage is caught.
         return dict(main), dict(main.get_ifd(_EXIF_IFD)), dict(main.get_ifd(_GPS_IFD))
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error) as error:
         notes.append(f"damaged EXIF left out ({error})")
@@ -30,7 +30,7 @@ def exif_tags(
 
 
 def xmp_properties(image: Image.Image, notes: list[str]) -> dict[str, str]:
-    """XMP properties by "{namespace}name", elements and attributes; the first of a name counts."""
+    """Return XMP elements and attributes by "{namespace}name"; the first of a name counts."""
     data = image.info.get("xmp")
     if isinstance(data, str):
         data = data.encode()
@@ -53,7 +53,7 @@ def xmp_properties(image: Image.Image, notes: list[str]) -> dict[str, str]:
 
 
 def number(value: Any) -> float:
-    """A finite number, or NaN for anything else."""
+    """Return a finite number, or NaN for anything else."""
     try:
         result = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -62,13 +62,13 @@ def number(value: Any) -> float:
 
 
 def positive(value: Any) -> float:
-    """As `number`, and NaN for the zero that cameras write for "unknown"."""
+    """Return a positive number, or NaN for anything else, such as the 0 that cameras write for unknown."""
     result = number(value)
     return result if result > 0 else NAN
 
 
 def text(value: Any) -> str:
-    """Text without the zero bytes and blanks that cameras pad it with."""
+    """Return text without the NUL bytes and blanks that cameras pad it with."""
     if isinstance(value, bytes):
         value = value.decode("ascii", errors="replace")
     return value.split("\0")[0].strip()[:200] if isinstance(value, str) else ""

@@ -1,4 +1,4 @@
-"""Telemetry of a file of any kind that is supported, told by its name and content."""
+"""Telemetry from any supported file, detected by name and content."""
 
 from __future__ import annotations
 
@@ -16,9 +16,22 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".m4v", ".ts", ".avi")
 
 
 def read_telemetry(path: Path | str) -> Telemetry:
-    """Telemetry of a DJI .srt, a .gpx, a .csv (.tsv, .txt) or a video's own subtitle track.
+    """Read telemetry from a DJI .srt, a .gpx, a .csv (.tsv, .txt) or the subtitle track of a video.
 
-    Raises InputError where the file is of no such kind, or holds no telemetry.
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+
+    Returns
+    -------
+    Telemetry
+        Its records.
+
+    Raises
+    ------
+    InputError
+        If the file is of another kind or contains no telemetry.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -29,15 +42,15 @@ def read_telemetry(path: Path | str) -> Telemetry:
         return telemetry
     if suffix not in TELEMETRY_SUFFIXES:
         raise InputError(
-            f"{suffix or 'a file without a suffix'} is no telemetry format; supported are "
+            f"{suffix or 'a file without a suffix'} is not a telemetry format; supported are "
             "DJI subtitles (.srt), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
             f"videos with a subtitle track ({', '.join(VIDEO_SUFFIXES)})",
             path=path,
         )
     if suffix == ".gpx":
         return read_gpx(path)
-    # Subtitles and GPX are often saved as .txt, and logs from the web under a wrong name.
-    start = _start(path)
+    # Subtitles and GPX are often saved as .txt, and logs from the web with a wrong suffix.
+    start = _head(path)
     if start.startswith("<") and "<gpx" in start:
         return read_gpx(path)
     if suffix == ".srt" or "-->" in start:
@@ -45,8 +58,8 @@ def read_telemetry(path: Path | str) -> Telemetry:
     return read_csv_log(path)
 
 
-def _start(path: Path) -> str:
-    """The first 2,000 characters, for telling formats apart only."""
+def _head(path: Path) -> str:
+    """Read the first 2,000 characters, only to tell formats apart."""
     try:
         with path.open("rb") as file:
             return file.read(2000).decode("utf-8-sig", errors="replace").lstrip()

@@ -1,4 +1,4 @@
-"""One record of a drone's subtitles: which numbers in its text mean what."""
+"""Parsing of one subtitle record of a drone."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _FIELD = re.compile(
     r"|difftime)\s*[:(]\s*([^\s\],;()<>]*)",
     re.IGNORECASE,
 )
-# Focal length in a unit of the model's own, and digital zoom: only their changes mean something.
+# Focal length in a model-specific unit, and digital zoom: only their changes are meaningful.
 _ZOOM = re.compile(r"(?<![\w.])(focal_len|dzoom_ratio|dzoom)\s*[:(]\s*([\d.]+)", re.IGNORECASE)
 _HEIGHT = re.compile(r"(?<![\w.])H\s?[ =:]\s?([-+]?[\d.]+)\s?m(?![\w/])")
 _POSITION = re.compile(r"(?<![\w.])(GPS|RTK|HOME)\s*\(([^()]{0,120})\)", re.IGNORECASE)
 _GIMBAL = re.compile(r"(?<![\w.])G\.PRY\s*\(([^()]{0,120})\)", re.IGNORECASE)
-# U+FFFD: a degree sign that was not written as UTF-8.
+# U+FFFD is a degree sign that was not written as UTF-8.
 _NUMBER = re.compile("([-+]?(?:\\d+\\.?\\d*|\\.\\d+))\\s*(?:ms|m|M|°|\ufffd+|deg)?")
 _UNKNOWN = {"", "n/a", "na", "nan", "null", "none", "-", "--"}
 _LETTER = re.compile(r"([NSEW])\s*:\s*(.*)", re.IGNORECASE)
@@ -31,33 +31,31 @@ _LETTER = re.compile(r"([NSEW])\s*:\s*(.*)", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class SrtRecord:
-    """What one record says; NaN or None for what it does not."""
+    """Values of one record; NaN or None if not stated."""
 
-    line: int  # of its times, or else its first, in the file
+    line: int  # of its times in the file, or its first line
     time_s: float  # start in the video
     utc_s: float  # the drone's clock, as if it were UTC
     diff_s: float  # since the record before
-    lat_lon_deg: tuple[float, float] | None  # where keys or letters name the two
-    pair: (
-        tuple[float, float] | None
-    )  # in GPS(a, b, c), where only the file as a whole tells the order
-    home_pair: tuple[float, float] | None  # in HOME(a, b): the same order
-    height_third: bool  # GPS(a, b, 0.0M): c is a height and no count of satellites
+    lat_lon_deg: tuple[float, float] | None  # if keys or letters name them
+    pair: tuple[float, float] | None  # of GPS(a, b, c); only the whole file decides the order
+    home_pair: tuple[float, float] | None  # of HOME(a, b), in the same order
+    height_third: bool  # GPS(a, b, 0.0M): c is a height, not a number of satellites
     rel_alt_m: float
     abs_alt_m: float
-    bare_altitude: bool  # abs_alt_m comes from [altitude: x], which does not say above what
+    bare_altitude: bool  # abs_alt_m is from [altitude: x], which has no stated reference
     gimbal_deg: tuple[float, float, float]  # heading, pitch, roll
-    zoom: float  # focal length times digital zoom, in a unit of the model's own
+    zoom: float  # focal length times digital zoom, in a model-specific unit
 
 
 def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
-    """The record, or None where it holds no telemetry. Raises ValueError saying what is damaged."""
+    """Parse a record; None if it has no telemetry. Raises ValueError saying what is damaged."""
     text = _TAG.sub(" ", body)
     values: dict[str, float] = {}
     for key, token in _FIELD.findall(text):
         values.setdefault(key.lower().replace("longt", "long"), _number(token, key))
     diff_ms = values.pop("difftime", NAN)
-    # For each name the first arguments count, as for the keys.
+    # The first occurrence of each name counts, as for the keys.
     calls = {name.upper(): arguments for name, arguments in reversed(_POSITION.findall(text))}
     fix = calls.get("RTK", calls.get("GPS"))
     height = _HEIGHT.search(text)
@@ -70,7 +68,7 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
         lat_lon = (values.get("latitude", NAN), values.get("longitude", NAN))
     elif fix is not None:
         lat_lon, pair = _coordinates("GPS", fix)
-        # Satellites are whole numbers; a third value with a unit or decimals is a height.
+        # Satellite counts are integers; a third value with a unit or decimals is a height.
         height_third = bool(re.search(r",[^,]*,[^,]*(?:\.\d|[mM]\s*$)", fix))
     home_pair = _coordinates("HOME", calls["HOME"])[1] if "HOME" in calls else None
     rel_alt = values.get("rel_alt", values.get("barometer", NAN))
@@ -102,10 +100,10 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
 def _coordinates(
     name: str, arguments: str
 ) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-    """(latitude, longitude) where letters tell them, or else the two numbers as they stand."""
+    """Return (latitude, longitude) if letters name them, otherwise the two numbers in file order."""
     tokens = [token.strip() for token in arguments.split(",")]
     if len(tokens) < 2:
-        raise ValueError(f"{name}({arguments}) is no position")
+        raise ValueError(f"{name}({arguments}) is not a position")
     letters = [_LETTER.fullmatch(token) for token in tokens[:2]]
     if letters[0] and letters[1]:  # "E: 120.0, N: 20.0"
         values = {m[1].upper(): _number(m[2], name) for m in letters if m}
@@ -114,12 +112,12 @@ def _coordinates(
         return (latitude, longitude), None
     pair = (_number(tokens[0], name), _number(tokens[1], name))
     if abs(pair[0]) > 180 or abs(pair[1]) > 180:
-        raise ValueError(f"{name}({arguments}) is no position on Earth")
+        raise ValueError(f"{name}({arguments}) is not a position on Earth")
     return None, pair
 
 
 def _number(token: str, name: str) -> float:
-    """A number with an optional unit; NaN where the token says that it is unknown."""
+    """Parse a number with an optional unit; NaN if the token says that it is unknown."""
     token = token.strip()
     if token.lower() in _UNKNOWN:
         return NAN
@@ -130,7 +128,7 @@ def _number(token: str, name: str) -> float:
 
 
 def _stamp(text: str) -> float:
-    """Seconds since 1970 of the first date stamp, taken as if it were UTC; NaN without one."""
+    """Parse the first date stamp as seconds since 1970, as if it were UTC; NaN if there is none."""
     match = _STAMP.search(text)
     if match is None:
         return NAN
@@ -138,6 +136,6 @@ def _stamp(text: str) -> float:
     fraction = (match[7] or "0") + (match[8] or "")
     try:
         whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
-    except ValueError:  # a clock that was never set, such as 2000-00-00
+    except ValueError:  # the clock was never set, as in 2000-00-00
         return NAN
     return whole + int(fraction) / 10 ** len(fraction)

@@ -1,4 +1,4 @@
-"""Telemetry that a drone wrote as a subtitle track inside the video."""
+"""Telemetry that a drone recorded as a subtitle track inside the video."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import av
 
 from spn_data.errors import InputError
-from spn_data.telemetry.dji_srt import telemetry_of_blocks
+from spn_data.telemetry.dji_srt import telemetry_from_records
 from spn_data.telemetry.textfile import MAX_TEXT_BYTES
 from spn_data.telemetry.track import Telemetry
 
@@ -16,10 +16,22 @@ _TEXT_CODECS = ("mov_text", "srt", "subrip", "text", "ass", "ssa")
 
 
 def read_subtitles(path: Path | str) -> Telemetry | None:
-    """Telemetry of the first subtitle track that holds some; None where the video has no such track.
+    """Read the telemetry of the first subtitle track that contains any.
 
-    time_s is 0 at the first frame. Raises InputError where there are text subtitles, but of other
-    content, and where the file is no video.
+    Parameters
+    ----------
+    path : Path or str
+        The video file.
+
+    Returns
+    -------
+    Telemetry or None
+        time_s is 0 at the first frame. None if the video has no text subtitle track.
+
+    Raises
+    ------
+    InputError
+        If the subtitles contain no telemetry, or the file is not a video.
     """
     try:
         with av.open(str(path)) as container:
@@ -38,7 +50,7 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
     failure: InputError | None = None
     for records in tracks:
         try:
-            return telemetry_of_blocks(records, source=str(path), has_lines=False)
+            return telemetry_from_records(records, source=str(path), has_lines=False)
         except InputError as error:
             failure = failure or error
     if failure is not None:
@@ -49,13 +61,13 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
 def _tracks(
     container: Any, streams: list[Any], start_s: float, path: Path | str
 ) -> list[list[tuple[int, float, str]]]:
-    """(count from 1, time_s, text) of the subtitles of each stream."""
+    """Return (number from 1, time_s, text) of the subtitles of each stream."""
     tracks: dict[int, list[tuple[int, float, str]]] = {stream.index: [] for stream in streams}
-    taken = 0
+    total_bytes = 0
     for packet in container.demux(streams) if streams else ():
         data = bytes(packet)
-        taken += len(data)
-        if taken > MAX_TEXT_BYTES:
+        total_bytes += len(data)
+        if total_bytes > MAX_TEXT_BYTES:
             raise InputError(f"its subtitles exceed {MAX_TEXT_BYTES / 1e6:.0f} MB", path=path)
         text = _text(data, packet.stream.codec_context.name)
         if packet.pts is not None and text.strip():
@@ -65,7 +77,8 @@ def _tracks(
 
 
 def _text(data: bytes, codec: str) -> str:
-    if codec == "mov_text":  # two bytes of length, the text, then boxes of style
+    """Extract the plain text of one subtitle packet."""
+    if codec == "mov_text":  # two length bytes, the text, then style boxes
         data = data[2 : 2 + int.from_bytes(data[:2], "big")]
     text = data.decode("utf-8", errors="replace")
     if codec in ("ass", "ssa"):  # "ReadOrder,Layer,Style,Name,MarginL,MarginR,MarginV,Effect,Text"

@@ -1,4 +1,4 @@
-"""Our own file of a telemetry track: one CSV row a record, and a JSON object of what holds for all."""
+"""Our own telemetry file: a JSON object of the properties of the track, then one CSV row per record."""
 
 from __future__ import annotations
 
@@ -21,8 +21,17 @@ _MAX_BYTES = 2**30
 
 
 def write_track(path: Path, telemetry: Telemetry) -> None:
-    """First line: what holds for all records, as JSON behind `# `; then a header and the records."""
-    about = {
+    """Write a telemetry track.
+
+    Parameters
+    ----------
+    path : Path
+        Target file. Its first line has the properties of the track as JSON after `# `, followed by a CSV
+        header and the records.
+    telemetry : Telemetry
+        The track.
+    """
+    properties = {
         "version": 1,
         "kind": telemetry.kind,
         "source": telemetry.source,
@@ -42,20 +51,36 @@ def write_track(path: Path, telemetry: Telemetry) -> None:
             telemetry.zoom,
         ]
     )
-    lines = [f"# {json.dumps(about)}", _COLUMNS]
+    lines = [f"# {json.dumps(properties)}", _COLUMNS]
     lines += [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows]
     write_atomically(path, "\n".join(lines) + "\n")
 
 
 def read_track(path: Path) -> Telemetry:
-    """Raises FormatError where the file is not what `write_track` writes."""
+    """Read a telemetry track.
+
+    Parameters
+    ----------
+    path : Path
+        A file written by `write_track`.
+
+    Returns
+    -------
+    Telemetry
+        The track.
+
+    Raises
+    ------
+    FormatError
+        If the file is not as `write_track` writes it.
+    """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"{path}: larger than any track of telemetry")
+            raise FormatError(f"{path}: too large for a telemetry track")
         first, header, *lines = path.read_text(encoding="utf-8").splitlines()
-        about = json.loads(first.removeprefix("# "))
-        if about["version"] != 1 or header != _COLUMNS:
-            raise FormatError(f"{path}: not a track of telemetry of this version")
+        properties = json.loads(first.removeprefix("# "))
+        if properties["version"] != 1 or header != _COLUMNS:
+            raise FormatError(f"{path}: not a telemetry track of this version")
         rows = np.array(
             [[float(cell) if cell else np.nan for cell in line.split(",")] for line in lines]
         ).reshape(len(lines), len(_COLUMNS.split(",")))
@@ -71,11 +96,11 @@ def read_track(path: Path) -> Telemetry:
         )
         return replace(
             track,
-            kind=about["kind"],
-            source=about["source"],
-            abs_reference=HeightReference(about["abs_reference"]),
-            utc_is_local=about["utc_is_local"],
-            notes=tuple(about["notes"]),
+            kind=properties["kind"],
+            source=properties["source"],
+            abs_reference=HeightReference(properties["abs_reference"]),
+            utc_is_local=properties["utc_is_local"],
+            notes=tuple(properties["notes"]),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not a track of telemetry ({error})") from error
+        raise FormatError(f"{path}: not a telemetry track ({error})") from error

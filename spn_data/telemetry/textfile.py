@@ -1,25 +1,43 @@
-"""Bounded reading of text files that a user gave."""
+"""Size-limited reading of text files supplied by the user."""
 
 from __future__ import annotations
 
 import codecs
 import csv
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
 from spn_data.errors import InputError
 
-# A 60 Hz subtitle file takes 1 MB a minute: an hour of flight is far below this.
+# A 60 Hz subtitle file takes 1 MB per minute, so an hour of flight is far below this limit.
 MAX_TEXT_BYTES = 200_000_000
-# Four and a half hours at 60 Hz; a file of tiny records could otherwise fill the memory.
+# Four and a half hours at 60 Hz; a file of tiny records could otherwise exhaust memory.
 MAX_RECORDS = 1_000_000
 
 
 def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file, with "\\n" line ends and no byte-order mark; InputError if it is no text.
+    r"""Read a text file with "\n" line ends and without a byte-order mark.
 
-    UTF-8, or UTF-16 with a byte-order mark. Bytes that are not UTF-8 become U+FFFD: they stand in
-    free text or degree signs, and where one stands in a number the parser reports it.
+    The file is UTF-8, or UTF-16 with a byte-order mark. Bytes that are not UTF-8 become U+FFFD: they occur in
+    free text or degree signs, and the parser reports them inside a number.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    max_bytes : int
+        Largest size accepted.
+
+    Returns
+    -------
+    str
+        Its text.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is too large or is binary.
     """
     path = Path(path)
     try:
@@ -28,7 +46,7 @@ def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
             raise InputError("not a file", path=path)
         if size > max_bytes:
             raise InputError(
-                f"has {size / 1e6:.0f} MB, more than the {max_bytes / 1e6:.0f} MB of any telemetry",
+                f"has {size / 1e6:.0f} MB; telemetry files of up to {max_bytes / 1e6:.0f} MB are supported",
                 path=path,
             )
         with path.open("rb") as file:
@@ -45,20 +63,39 @@ def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def csv_rows(text: str, path: Path | str, what: str) -> Iterator[tuple[int, list[str]]]:
-    """(line, cells) of each row of a CSV that is not empty, the header first; `what` it should hold.
+    """Yield the non-empty rows of a CSV text, header first.
 
-    Commas, semicolons or tabs between cells, whichever the header has most of; with semicolons, a comma in
-    a number is its decimal sign. Raises InputError for an empty file and for quotes that never end.
+    Parameters
+    ----------
+    text : str
+        The text. Cells are separated by commas, semicolons or tabs, whichever is most frequent in the header;
+        with semicolons, a comma in a number is the decimal separator.
+    path : Path or str
+        Names the file in messages.
+    what : str
+        What the file should contain, for messages.
+
+    Yields
+    ------
+    line : int
+        Line number.
+    cells : list of str
+        Stripped cells of the row.
+
+    Raises
+    ------
+    InputError
+        If the file is empty or a quote is never closed.
     """
     lines = text.split("\n")
     skip = 0
-    # Spreadsheets write "sep=;" first, loggers lines of comments.
+    # Spreadsheets start with "sep=;", loggers with comment lines.
     while skip < len(lines) and (
         not lines[skip].strip() or lines[skip].lower().startswith(("sep=", "#"))
     ):
         skip += 1
     if skip == len(lines):
-        raise InputError(f"the file is empty: no {what} in it", path=path)
+        raise InputError(f"the file is empty: it contains no {what}", path=path)
     delimiter = max(",;\t", key=lines[skip].count)
     reader = csv.reader(lines[skip:], delimiter=delimiter)
     try:
@@ -69,4 +106,17 @@ def csv_rows(text: str, path: Path | str, what: str) -> Iterator[tuple[int, list
             if any(cells):
                 yield skip + reader.line_num, cells
     except csv.Error as error:
-        raise InputError(f"is no CSV: {error}", path=path, line=skip + reader.line_num) from error
+        raise InputError(
+            f"is not valid CSV: {error}", path=path, line=skip + reader.line_num
+        ) from error
+
+
+def finite_number(text: str, name: str) -> float:
+    """Parse a finite number; the ValueError names the field."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is {text[:40]!r}, not a number")
+    return value

@@ -1,4 +1,4 @@
-"""Telemetry: where a camera was, when, and how well that is known."""
+"""Telemetry: camera positions, heights and angles over time, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -13,19 +13,37 @@ from spn_data.geometry.geodesy import METRES_PER_DEGREE, HeightReference
 
 @dataclass(frozen=True, eq=False)
 class Telemetry:
-    """Records of one source, in the order of time. What a record does not say is NaN, never zero.
+    """Records of one source in order of time; values that a record does not state are NaN, never zero.
 
-    time_s : (N,) on the video's own clock (0 at its first frame), increasing; for photos, seconds
-        after the first photo, non-decreasing.
-    lat_lon_deg : (N, 2) WGS84; NaN where the record has no fix.
-    rel_alt_m : (N,) height above the point of take-off.
-    abs_alt_m : (N,) height above what `abs_reference` says.
-    sigma_m : (N, 3) standard deviation east, north, up that the source itself states.
-    gimbal_deg : (N, 3) heading, pitch, roll of the camera (`spn_data.geometry.pose.rotations_from_angles`).
-    utc_s : (N,) seconds since 1970; local time of unknown zone where `utc_is_local`.
-    zoom : (N,) focal length times digital zoom in a unit of the source's own: only its changes count.
-    kind : what wrote it, such as "dji-srt", "gpx", "csv", "exif"; source : the file's name.
-    notes : what the user should know of how the source was read, one sentence each.
+    Attributes
+    ----------
+    time_s : ndarray, shape (N,)
+        Seconds on the video's own clock (0 at its first frame), increasing; for photos, seconds after the
+        first photo, non-decreasing.
+    lat_lon_deg : ndarray, shape (N, 2)
+        WGS84 latitude and longitude; NaN if the record has no fix.
+    rel_alt_m : ndarray, shape (N,)
+        Height above the point of take-off.
+    abs_alt_m : ndarray, shape (N,)
+        Height above `abs_reference`.
+    sigma_m : ndarray, shape (N, 3)
+        Standard deviations east, north, up, as stated by the source.
+    gimbal_deg : ndarray, shape (N, 3)
+        Heading, pitch, roll of the camera (`spn_data.geometry.pose.rotations_from_angles`).
+    utc_s : ndarray, shape (N,)
+        Seconds since 1970; local time of unknown zone if `utc_is_local`.
+    zoom : ndarray, shape (N,)
+        Focal length times digital zoom in a source-specific unit: only its changes are meaningful.
+    abs_reference : HeightReference
+        What `abs_alt_m` is measured from.
+    utc_is_local : bool
+        Whether `utc_s` is local time.
+    kind : str
+        Format of the source, such as "dji-srt", "gpx", "csv", "exif".
+    source : str
+        Name of the file.
+    notes : tuple of str
+        What the user should know about how the source was read, one sentence each.
     """
 
     time_s: np.ndarray
@@ -60,7 +78,7 @@ class Telemetry:
         source: str = "",
         notes: tuple[str, ...] = (),
     ) -> Telemetry:
-        """From the columns that are known; the others are NaN."""
+        """Create telemetry from the known columns; the others become NaN."""
         time_s = np.asarray(time_s, dtype=np.float64)
         n = len(time_s)
 
@@ -93,17 +111,17 @@ class Telemetry:
 
     @property
     def has_fix(self) -> np.ndarray:
-        """(N,) bool: the record has a horizontal position."""
+        """Records with a horizontal position, (N,) bool."""
         return np.isfinite(self.lat_lon_deg).all(axis=1)
 
     def select(self, index: np.ndarray) -> Telemetry:
-        """The records of an index or mask (N,)."""
+        """Return the records selected by an index or mask (N,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[index] for name in _COLUMNS}
         return replace(self, **columns)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Telemetry]) -> Telemetry:
-        """Tracks of the parts of one recording, on one clock; what is said of all is the first's.
+        """Join the tracks of the parts of one recording, on one clock; properties are taken from the first.
 
         A record that is not later than all before it is dropped.
         """
@@ -116,16 +134,15 @@ class Telemetry:
         return joined.select(np.concatenate([[True], joined.time_s[1:] > latest[:-1]]))
 
     def shifted(self, offset_s: float) -> Telemetry:
-        """The same records with `offset_s` added to their times."""
+        """Return the same records with `offset_s` added to their times."""
         return replace(self, time_s=self.time_s + offset_s)
 
     def at(self, time_s: np.ndarray, *, max_gap_s: float = 2.5) -> Telemetry:
-        """Interpolated to times (M,): linear in position, along the shorter arc in angle.
+        """Interpolate to times (M,): linearly in position, along the shorter arc in angle.
 
-        Each column is interpolated between its own neighbouring known values; where these lie
-        further apart than `max_gap_s`, or a time lies outside them by more than half the median
-        interval, it is NaN. A source of one record a second whose value stands for the whole second
-        is thus used at its stamp.
+        Each column is interpolated between its own neighbouring known values. It is NaN if these are further
+        apart than `max_gap_s`, or if the time is outside them by more than half the median interval. A source
+        with one record per second, whose value holds for the whole second, is thus used at its time stamp.
         """
         time_s = np.asarray(time_s, dtype=np.float64)
         tables: dict[str, Any] = {
@@ -156,7 +173,7 @@ _COLUMNS = (
 
 
 def _unwrapped(angles_deg: np.ndarray) -> np.ndarray:
-    """Columns of angles (N, K) without jumps of 360 degrees between successive known ones."""
+    """Remove jumps of 360 degrees between successive known values of angle columns (N, K)."""
     result = angles_deg.copy()
     for column in result.T:
         known = np.isfinite(column)
@@ -165,14 +182,14 @@ def _unwrapped(angles_deg: np.ndarray) -> np.ndarray:
 
 
 def _signed(angles_deg: np.ndarray) -> np.ndarray:
-    """Angles in (-180, 180]."""
+    """Wrap angles to (-180, 180]."""
     return 180.0 - (180.0 - angles_deg) % 360.0
 
 
 def _interpolate(
     known_s: np.ndarray, values: np.ndarray, wanted_s: np.ndarray, max_gap_s: float
 ) -> np.ndarray:
-    """values (N, ...) at known_s (N,), linearly at wanted_s (M,); NaN across gaps and outside."""
+    """Interpolate values (N, ...) at known_s (N,) linearly to wanted_s (M,); NaN across gaps and outside."""
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     result = np.full((len(wanted_s), flat.shape[1]), np.nan)
     margin = 0.5 * float(np.median(np.diff(known_s))) if len(known_s) > 1 else 0.0
@@ -187,27 +204,27 @@ def _interpolate(
         left = np.maximum(right - 1, 0)
         inside = (wanted_s >= t[0] - margin) & (wanted_s <= t[-1] + margin)
         exact = np.minimum(np.abs(wanted_s - t[left]), np.abs(wanted_s - t[right])) <= 1e-6
-        # Beyond an end the nearest end's value holds for the margin.
+        # Within the margin beyond an end, the value at that end holds.
         beyond = (wanted_s < t[0]) | (wanted_s > t[-1])
         good = inside & ((t[right] - t[left] <= max_gap_s) | exact | beyond)
         result[good, column] = np.interp(wanted_s[good], t, v)
     return result.reshape(len(wanted_s), *values.shape[1:])
 
 
-def increasing(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """The index that puts records of times (N,) in order, one record a time, and what was done."""
+def time_order(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return the index that sorts records by times (N,), one record per time, and notes on what changed."""
     notes = []
     if np.any(np.diff(time_s) < 0):
-        notes.append("its records were not in the order of time and were sorted")
-    # Of records with one time the first in the file counts.
+        notes.append("the records were not in order of time and were sorted")
+    # Of several records with the same time, the first in the file counts.
     index = np.unique(time_s, return_index=True)[1]
     if len(index) < len(time_s):
-        notes.append(f"records with the time of another, left out: {len(time_s) - len(index)}")
+        notes.append(f"records left out because of a duplicate time: {len(time_s) - len(index)}")
     return index, notes
 
 
 def coordinate_step_m(lat_lon_deg: np.ndarray) -> float:
-    """The step in metres of latitude to which coordinates (N, 2) in degrees are rounded; or NaN.
+    """Return the rounding step of coordinates (N, 2) in degrees, in metres of latitude; NaN if unknown.
 
     Some drones write 4 decimals, steps of 11 m: an error of step / sqrt(12) that no source states.
     """
@@ -222,14 +239,34 @@ def coordinate_step_m(lat_lon_deg: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class TelemetrySummary:
-    """What a source of telemetry holds, for the user to see before relying on it."""
+    """Overview of a telemetry source, shown to the user before it is relied on.
+
+    Attributes
+    ----------
+    kind : str
+        Format of the source.
+    records, with_fix : int
+        Number of records, and of those with a fix.
+    rate_hz : float
+        Rate of records with a fix; NaN for fewer than two.
+    duration_s : float
+        Time between the first and the last record.
+    gaps : tuple of (float, float)
+        (from_s, to_s) of gaps without a fix.
+    has_rel_alt, has_abs_alt, has_gimbal, has_sigma : bool
+        Whether any record states these values.
+    abs_reference : HeightReference
+        Reference of the absolute height.
+    notes : tuple of str
+        As in `Telemetry`.
+    """
 
     kind: str
     records: int
     with_fix: int
-    rate_hz: float  # of records with a fix; NaN for fewer than two
+    rate_hz: float
     duration_s: float
-    gaps: tuple[tuple[float, float], ...]  # (from_s, to_s) without a fix
+    gaps: tuple[tuple[float, float], ...]
     has_rel_alt: bool
     has_abs_alt: bool
     abs_reference: HeightReference
@@ -239,14 +276,24 @@ class TelemetrySummary:
 
 
 def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySummary:
-    """Counts, rate and gaps of a source.
+    """Summarize counts, rate and gaps of a source.
 
-    A gap is longer than `max_gap_s` and than 2.5 usual intervals: photos are seconds apart.
+    Parameters
+    ----------
+    telemetry : Telemetry
+        The source.
+    max_gap_s : float
+        A gap is longer than this and than 2.5 median intervals, as photos are seconds apart.
+
+    Returns
+    -------
+    TelemetrySummary
+        The overview.
     """
     fixed_s = telemetry.time_s[telemetry.has_fix]
     steps = np.diff(fixed_s)
     rate = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else float("nan")
-    # The first and the last record bound the gaps before the first and after the last fix.
+    # The first and last records bound the gaps before the first fix and after the last.
     bounded_s = np.concatenate([telemetry.time_s[:1], fixed_s, telemetry.time_s[-1:]])
     usual_s = 2.5 * float(np.median(steps)) if len(steps) else 0.0
     gaps = tuple(

@@ -11,7 +11,7 @@ import numpy as np
 
 from spn_data.geometry.pose import Poses, canonical_quats
 from spn_data.matching.features import FeatureOptions, extract
-from spn_data.matching.pairs import PairOptions, appearance_vocabulary, describe_appearance
+from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_model.evaluation.metrics import DEG_PER_M, Estimates, Evaluation, nearest_rows
 
 MEAN, ORACLE = "mean training pose", "nearest training pose (oracle)"
@@ -156,12 +156,12 @@ def vlad(training: Images, options: VladOptions | None = None) -> Describe:
     count = min(len(training), options.vocabulary_images)
     rows = np.unique(np.linspace(0, len(training) - 1, count).round().astype(np.int64))
     words = PairOptions(words=options.words, seed=options.seed)
-    vocabulary = appearance_vocabulary([_sift(training, int(row), options) for row in rows], words)
+    vocabulary = visual_vocabulary([_sift(training, int(row), options) for row in rows], words)
 
     def describe(images: Images) -> np.ndarray:
         found = np.zeros((len(images), vocabulary.size), np.float32)
         for row in range(len(images)):
-            found[row] = describe_appearance(_sift(images, row, options), vocabulary)
+            found[row] = vlad_descriptor(_sift(images, row, options), vocabulary)
         return found
 
     return describe

@@ -18,7 +18,7 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
-from spn_data.telemetry.exif import telemetry_of_photos
+from spn_data.telemetry.exif import telemetry_from_photos
 from spn_model.onboard.view import View
 
 _REMEDY = (
@@ -142,7 +142,7 @@ def _open_flight(source: Source, given: Camera | None) -> tuple[Flight, list[str
     readable = [row for row, metadata in enumerate(headers.metadata) if metadata is not None]
     if all(photos[row] is None for row in readable):
         raise InputError(_REMEDY, path=source.parts[readable[0]])
-    telemetry = telemetry_of_photos(known, source=source.sequence)
+    telemetry = telemetry_from_photos(known, source=source.sequence)
     time_s = np.full(len(source.parts), np.nan)
     time_s[readable] = telemetry.time_s
     notes = []

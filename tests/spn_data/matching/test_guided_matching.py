@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
-from spn_data.matching.guided import match_along_lines
+from spn_data.matching.guided import match_guided
 from spn_data.matching.putative import MatchOptions, match_descriptors, unit_descriptors
 
 CAMERA = Camera.from_horizontal_fov(800, 600, 70)
@@ -66,7 +66,7 @@ def test_it_finds_what_comparing_all_and_masking_finds(move) -> None:
     rng = np.random.default_rng(4)
     noisy = (descriptors + rng.integers(-20, 20, descriptors.shape)).clip(0, 255).astype(np.uint8)
     order = rng.permutation(len(b))
-    found = match_along_lines(a, descriptors, b[order], noisy[order], fundamental, OPTIONS)
+    found = match_guided(a, descriptors, b[order], noisy[order], fundamental, OPTIONS)
     expected = compared_all(a, descriptors, b[order], noisy[order], fundamental)
     # Sums in another order may tip a tie or a limit.
     assert len(expected ^ {(int(i), int(j)) for i, j in found}) <= 2
@@ -83,7 +83,7 @@ def test_most_of_what_repeats_elsewhere_is_matched_along_the_line() -> None:
     both = np.concatenate([descriptors, descriptors])
     both = (both + rng.integers(-20, 20, both.shape)).clip(0, 255).astype(np.uint8)
     assert len(match_descriptors(descriptors, both, OPTIONS)) < 0.02 * len(a)
-    found = match_along_lines(a, descriptors, places, both, fundamental, OPTIONS)
+    found = match_guided(a, descriptors, places, both, fundamental, OPTIONS)
     assert len(found) > 0.8 * len(a)
     assert np.mean(found[:, 0] == found[:, 1]) > 0.99
 
@@ -100,16 +100,16 @@ def test_what_is_alike_everywhere_gives_few_matches() -> None:
     )
     places = rng.uniform([0, 0], [800, 600], (2, 2000, 2))
     fundamental = views(MOVES[2])[3]
-    assert len(match_along_lines(places[0], a, places[1], b, fundamental, OPTIONS)) < 20
+    assert len(match_guided(places[0], a, places[1], b, fundamental, OPTIONS)) < 20
     fooled = replace(OPTIONS, guided_step=10**6, guided_ratio=OPTIONS.max_ratio)
-    assert len(match_along_lines(places[0], a, places[1], b, fundamental, fooled)) > 200
+    assert len(match_guided(places[0], a, places[1], b, fundamental, fooled)) > 200
 
 
 @pytest.mark.parametrize("move", MOVES)
 def test_no_match_is_off_its_line(move) -> None:
     a, b, descriptors, fundamental = views(move)
     others = np.random.default_rng(6).permutation(b)
-    found = match_along_lines(a, descriptors, others, descriptors, fundamental, OPTIONS)
+    found = match_guided(a, descriptors, others, descriptors, fundamental, OPTIONS)
     off = off_lines(fundamental, a, others)[found[:, 0], found[:, 1]]
     assert (off < OPTIONS.guided_px + 0.01).all()
     assert len(found) < 0.1 * len(a)
@@ -118,5 +118,5 @@ def test_no_match_is_off_its_line(move) -> None:
 def test_without_features_there_are_no_matches() -> None:
     a, b, descriptors, fundamental = views(MOVES[0], 20)
     none = np.empty((0, 2)), np.empty((0, 128), np.uint8)
-    assert match_along_lines(*none, b, descriptors, fundamental, OPTIONS).shape == (0, 2)
-    assert match_along_lines(a, descriptors, *none, fundamental, OPTIONS).shape == (0, 2)
+    assert match_guided(*none, b, descriptors, fundamental, OPTIONS).shape == (0, 2)
+    assert match_guided(a, descriptors, *none, fundamental, OPTIONS).shape == (0, 2)

@@ -10,7 +10,7 @@ from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import ImageForMatching, match_pairs, verification_options
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import FeatureOptions, Features, extract
-from spn_data.matching.putative import DescriptorComparison, MatchOptions, match_descriptors
+from spn_data.matching.putative import MatchOptions, PutativeMatcher, match_descriptors
 
 
 @pytest.fixture(scope="module")
@@ -93,12 +93,12 @@ def test_a_comparison_that_grows_ends_in_the_matches_of_all_at_once() -> None:
     a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
     of_a = np.concatenate([rng.permutation(400), np.arange(50)])  # the last ones a second time
     b = np.clip(a[of_a] + rng.normal(0, 15, size=(450, 128)), 0, 255).astype(np.uint8)
-    comparison = DescriptorComparison(a, b)
-    assert len(comparison.matches(MatchOptions())) == 0
+    matcher = PutativeMatcher(a, b)
+    assert len(matcher.matches(MatchOptions())) == 0
     for n in (1, 100, 300, 500, 700):
-        comparison.extend(n)
+        matcher.extend(n)
         expected = match_descriptors(a[:n], b[:n], MatchOptions())
-        assert np.array_equal(comparison.matches(MatchOptions()), expected)
+        assert np.array_equal(matcher.matches(MatchOptions()), expected)
     assert len(expected) > 300
     assert (expected[:, 0] < 50).sum() < 10, "most doubles pass no ratio test"
 

@@ -7,11 +7,11 @@ import numpy as np
 from spn_data.matching.pairs import (
     PairOptions,
     appearance_pairs,
-    appearance_vocabulary,
     choose_pairs,
-    describe_appearance,
     sequence_pairs,
     spatial_pairs,
+    visual_vocabulary,
+    vlad_descriptor,
 )
 
 
@@ -64,8 +64,8 @@ def test_a_place_seen_again_is_found_by_appearance() -> None:
     again = [np.clip(d[:200] + rng.normal(0, 4, size=(200, 128)), 0, 255) for d in first]
     descriptors = [d.astype(np.uint8) for d in [*first, *again]]
     options = PairOptions(overlap=3, far_steps=1, appearance_neighbors=1, words=16)
-    vocabulary = appearance_vocabulary(descriptors, options)
-    appearance = np.stack([describe_appearance(d, vocabulary) for d in descriptors])
+    vocabulary = visual_vocabulary(descriptors, options)
+    appearance = np.stack([vlad_descriptor(d, vocabulary) for d in descriptors])
     pairs = appearance_pairs(np.array(["a"] * 40), appearance, options)
     assert {(k, k + 20) for k in range(20)} <= pairs
     assert len(pairs) < 30
@@ -73,13 +73,13 @@ def test_a_place_seen_again_is_found_by_appearance() -> None:
 
 def test_an_image_without_features_does_not_stop_the_others() -> None:
     none = np.zeros((0, 128), np.uint8)
-    vocabulary = appearance_vocabulary([none, none], PairOptions())
-    assert describe_appearance(none, vocabulary).shape == (0,)
+    vocabulary = visual_vocabulary([none, none], PairOptions())
+    assert vlad_descriptor(none, vocabulary).shape == (0,)
 
 
 def test_few_distinct_features_make_a_vocabulary_without_a_warning() -> None:
     few = np.random.default_rng(0).integers(0, 255, (3, 128)).astype(np.uint8)
-    vocabulary = appearance_vocabulary([np.repeat(few, 40, axis=0)], PairOptions())
-    appearance = describe_appearance(few, vocabulary)
+    vocabulary = visual_vocabulary([np.repeat(few, 40, axis=0)], PairOptions())
+    appearance = vlad_descriptor(few, vocabulary)
     assert np.isfinite(appearance).all()
     assert np.linalg.norm(appearance) < 1.001

@@ -81,21 +81,21 @@ def test_gpx_out_of_order_and_with_damaged_points(tmp_path):
     t = read_gpx(write(tmp_path, gpx(point("02"), point("01"), point("01"), *bad), "a.gpx"))
     np.testing.assert_allclose(t.time_s, [0.0, 1.0])
     assert any("were sorted" in note for note in t.notes)
-    assert any("time of another, left out: 1" in note for note in t.notes)
-    assert any("points left out: 2, the first number 4: lat is 'x'" in note for note in t.notes)
+    assert any("duplicate time: 1" in note for note in t.notes)
+    assert any("points left out: 2, the first is number 4: lat is 'x'" in note for note in t.notes)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "a.gpx: the file is empty"),
-        ("<gpx><trk>", "a.gpx:1: is no valid XML"),
-        ("\n\n<gpx>\n<trk", "a.gpx:4: is no valid XML"),
-        ("<kml/>", "a.gpx: is XML but no GPX: its root is <kml>"),
-        (gpx(extra="<wpt lat='1' lon='2'/>"), "a.gpx: holds no track points .*only wpt"),
+        ("<gpx><trk>", "a.gpx:1: is not valid XML"),
+        ("\n\n<gpx>\n<trk", "a.gpx:4: is not valid XML"),
+        ("<kml/>", "a.gpx: is XML but not GPX: its root element is <kml>"),
+        (gpx(extra="<wpt lat='1' lon='2'/>"), "a.gpx: contains no track points .*only wpt"),
         (gpx("<trkpt lat='1' lon='1'/>"), "a.gpx: none of its 1 track points is usable: .*no time"),
-        (gpx(point("99")), "a.gpx: none of its 1 .*is no time such as"),
-        (gpx(point("00", lat="91")), "a.gpx: none of its 1 .*no position on Earth"),
+        (gpx(point("99")), "a.gpx: none of its 1 .*is not a time like"),
+        (gpx(point("00", lat="91")), "a.gpx: none of its 1 .*not a position on Earth"),
         ("<!DOCTYPE g [<!ENTITY a 'b'>]><gpx>&a;</gpx>", "a.gpx: its XML is refused"),
     ],
 )
@@ -234,22 +234,22 @@ def test_csv_with_few_damaged_rows(tmp_path):
     [
         ("", "log.csv: the file is empty"),
         ("# only a comment\n", "log.csv: the file is empty"),
-        ("time_s,lat,lon\n", "log.csv:1: a header and no rows"),
+        ("time_s,lat,lon\n", "log.csv:1: has a header but no rows"),
         ("time_s,lat\n0,1\n", "log.csv:1: has no column for longitude: found time_s, lat; expected long"),
         ("lat,lon\n0,1\n", "log.csv:1: has no column for time: .*time_s or datetime"),
         ("a,b\n0,1\n", "log.csv:1: has no column for time and latitude and longitude"),
         (",,\n", "log.csv:1: has no column .*found none"),
         ("hello world\n", "log.csv:1: has no column"),
         ("time_s,lat,lon\n0,x,1\n", "log.csv:2: lat is 'x', not a number; 1 of 1 rows"),
-        ("time_s,lat,lon\n0,1,1\nnoon,1,1\n", "log.csv:3: time_s is 'noon', no number and no date"),
+        ("time_s,lat,lon\n0,1,1\nnoon,1,1\n", "log.csv:3: time_s is 'noon', neither a number nor a date"),
         ("time_s,lat,lon\n0,inf,1\n", "log.csv:2: lat is 'inf', not a number"),
-        ("time_s,lat,lon\n0,91,1\n", "log.csv:2: 91.0, 1.0 is no position on Earth"),
-        ("time_s,lat,lon\n0,1\n", "log.csv:2: 2 cells, the header has 3"),
-        ("time_s,lat,lon\n,1,1\n", "log.csv:2: it has no time"),
-        ("timestamp,lat,lon\n12,1,1\n", "log.csv:2: timestamp is 12, no date"),
-        ("time_s,lat,lon,altitude(furlong)\n0,1,1,1\n", "log.csv:1: the unit 'furlong' of column"),
+        ("time_s,lat,lon\n0,91,1\n", "log.csv:2: 91.0, 1.0 is not a position on Earth"),
+        ("time_s,lat,lon\n0,1\n", "log.csv:2: 2 cells, but the header has 3"),
+        ("time_s,lat,lon\n,1,1\n", "log.csv:2: the row has no time"),
+        ("timestamp,lat,lon\n12,1,1\n", "log.csv:2: timestamp is 12, not a date"),
+        ("time_s,lat,lon,altitude(furlong)\n0,1,1,1\n", "log.csv:1: unknown unit 'furlong' in column"),
         ("time_s,lat,lon,altitude,alt_reference\n0,1,1,1,moon\n", "log.csv:1: .* references are moon"),
-        ('time_s,lat,lon\n"' + "9" * 200_000 + "\n", "log.csv:.: is no CSV"),
+        ('time_s,lat,lon\n"' + "9" * 200_000 + "\n", "log.csv:.: is not valid CSV"),
     ],
 )  # fmt: skip
 def test_unusable_csv_is_refused(tmp_path, text, message):
@@ -333,7 +333,7 @@ def test_video_without_subtitles_has_none(tmp_path, shared_data):
 def test_subtitles_of_other_content_are_refused(tmp_path):
     """A film's subtitles are refused with the path, and so is what is no video."""
     path = video(tmp_path / "a.mp4", [(0.0, "Hello"), (1.0, "Bye")], "mov_text")
-    with pytest.raises(InputError, match=r"a.mp4: no subtitle record holds drone telemetry"):
+    with pytest.raises(InputError, match=r"a.mp4: no subtitle record contains drone telemetry"):
         read_subtitles(path)
     for name, data in (("b.mp4", b"text"), ("c.mp4", b"")):
         (tmp_path / name).write_bytes(data)
@@ -362,8 +362,11 @@ def test_the_reader_is_chosen_by_name_and_content(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("a.kml", r"a.kml: .kml is no telemetry format; supported are DJI subtitles \(.srt\), GPX"),
-        ("a", "a: a file without a suffix is no telemetry format"),
+        (
+            "a.kml",
+            r"a.kml: .kml is not a telemetry format; supported are DJI subtitles \(.srt\), GPX",
+        ),
+        ("a", "a: a file without a suffix is not a telemetry format"),
         ("a.csv", "a.csv: cannot be read: No such file"),
     ],
 )

@@ -14,7 +14,7 @@ from PIL import Image, PngImagePlugin
 
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.telemetry.exif import PhotoMetadata, read_photo, telemetry_of_photos
+from spn_data.telemetry.exif import PhotoMetadata, read_photo, telemetry_from_photos
 from spn_data.telemetry.track import summarize
 
 NAN = float("nan")
@@ -69,7 +69,7 @@ def test_real_photo_with_xmp(shared_data):
 def test_two_passes_are_one_track_with_a_pause(shared_data):
     """All 172 photos have a fix, and the pause between the passes is the only gap."""
     paths = sorted((shared_data / "photos-two-passes").glob("*.JPG"))
-    t = telemetry_of_photos([read_photo(path) for path in paths], source="photos")
+    t = telemetry_from_photos([read_photo(path) for path in paths], source="photos")
     summary = summarize(t)
     assert (summary.records, summary.with_fix, summary.gaps) == (172, 172, ((494.0, 766.0),))
     assert t.time_s[0] == 0.0
@@ -91,7 +91,7 @@ def test_hemispheres_and_clock_with_zone(tmp_path):
     assert photo.local_s == 1714564800.25
     assert photo.utc_s == 1714564800.25 - 7200
     assert photo.altitude_m == 123.4
-    t = telemetry_of_photos([photo])
+    t = telemetry_from_photos([photo])
     assert not t.utc_is_local
     assert t.utc_s[0] == photo.utc_s
 
@@ -138,7 +138,7 @@ def test_xmp_position_serves_where_exif_has_none(tmp_path):
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps={}, xmp=xmp))
     assert (photo.lat_deg, photo.lon_deg, photo.altitude_m) == (-33.5, 70.5, 88.5)
     assert photo.altitude_reference is HeightReference.UNKNOWN
-    assert any("RtkAlt" in note for note in telemetry_of_photos([photo]).notes)
+    assert any("RtkAlt" in note for note in telemetry_from_photos([photo]).notes)
     assert read_photo(jpeg(tmp_path / "b.jpg", xmp=xmp)).lat_deg == pytest.approx(-33.51, abs=1e-9)
 
 
@@ -170,21 +170,21 @@ def photo(name, **values) -> PhotoMetadata:
     ("times", "expected", "words"),
     [
         ([10.0, 10.0, 12.5], [0.0, 0.0, 2.5], ""),
-        ([10.0, NAN, 12.0], [0.0, 1.0, 2.0], "1 photos have no time, the first b.jpg"),
-        ([10.0, 14.0, 12.0], [0.0, 1.0, 2.0], "c.jpg was taken before the photo ahead of it"),
+        ([10.0, NAN, 12.0], [0.0, 1.0, 2.0], "1 photos have no time, the first is b.jpg"),
+        ([10.0, 14.0, 12.0], [0.0, 1.0, 2.0], "c.jpg is older than the photo before it"),
     ],
 )
 def test_photo_times(times, expected, words):
     """Times count from the first photo; missing or decreasing ones are replaced, and it is said."""
     photos = [photo(n, local_s=t) for n, t in zip(("a.jpg", "b.jpg", "c.jpg"), times, strict=True)]
-    t = telemetry_of_photos(photos)
+    t = telemetry_from_photos(photos)
     np.testing.assert_allclose(t.time_s, expected)
     assert [words in note for note in t.notes] == ([True] if words else [])
 
 
 def test_no_photos_are_no_records():
     """No photos give telemetry without records."""
-    assert len(telemetry_of_photos([])) == 0
+    assert len(telemetry_from_photos([])) == 0
 
 
 def test_mixed_references_are_unknown():
@@ -193,8 +193,8 @@ def test_mixed_references_are_unknown():
         photo("a", altitude_m=1.0, altitude_reference=HeightReference.AMSL),
         photo("b", altitude_m=1.0),
     ]
-    assert telemetry_of_photos(both).abs_reference is HeightReference.UNKNOWN
-    assert telemetry_of_photos(both[:1] * 2).abs_reference is HeightReference.AMSL
+    assert telemetry_from_photos(both).abs_reference is HeightReference.UNKNOWN
+    assert telemetry_from_photos(both[:1] * 2).abs_reference is HeightReference.AMSL
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_mixed_references_are_unknown():
     [
         ({}, b"<x:xmpmeta", "damaged XMP"),
         ({}, b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "damaged XMP"),
-        ({piexif.GPSIFD.GPSLatitude: ((99, 1), (0, 1), (0, 1))}, None, "no position on Earth"),
+        ({piexif.GPSIFD.GPSLatitude: ((99, 1), (0, 1), (0, 1))}, None, "not a position on Earth"),
         ({piexif.GPSIFD.GPSLatitude: ((9, 0), (0, 1), (0, 1))}, None, ""),
         ({piexif.GPSIFD.GPSLatitudeRef: "?"}, None, ""),
         ({piexif.GPSIFD.GPSLatitude: ((9, 1), (400, 1), (0, 1))}, None, ""),
@@ -215,8 +215,8 @@ def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
     assert found.width == 40
     assert math.isnan(found.lat_deg) == bool(gps)
     assert [words in note for note in found.notes] == ([True] if words else [])
-    together = telemetry_of_photos([found, found], ["x", "y"]).notes
-    assert any("damaged metadata: 2, the first x: " in note for note in together) == bool(words)
+    together = telemetry_from_photos([found, found], ["x", "y"]).notes
+    assert any("damaged metadata: 2, the first is x: " in note for note in together) == bool(words)
 
 
 def test_unset_clock_and_strange_orientation(tmp_path):

@@ -108,7 +108,7 @@ def test_lost_fixes_are_a_gap_with_heights(shared_data):
         ("mavic_pro_buggy.SRT", "read as longitude, latitude"),
         ("matrice_300.srt", "read as latitude, longitude"),
         ("matrice_300.srt", "steps of 11 m"),
-        ("mavic_2pro_new.SRT", "changes 9.6 times a second in 24.2 records"),
+        ("mavic_2pro_new.SRT", "changes 9.6 times per second, but there are 24.2 records"),
         ("mavic_2pro_new.SRT", "clock jumps against the video 11 times"),
         ("mavic_air2.srt", "unknown reference"),
         ("broken_incomplete.SRT", "left out: 1, the first at line 116"),
@@ -245,7 +245,7 @@ def test_garbage_among_good_records_is_counted():
     assert len(t) == 6
     assert t.has_fix.sum() == 5
     assert any("left out: 1, the first at line 14: latitude is '50.x'" in n for n in t.notes)
-    assert any("not on Earth: 1, the first 98.0, 8.25 at line 24" in n for n in t.notes)
+    assert any("not on Earth: 1, the first is 98.0, 8.25 at line 24" in n for n in t.notes)
 
 
 def test_heights_below_land_are_said():
@@ -260,12 +260,15 @@ def test_heights_below_land_are_said():
     [
         ("", "x.srt: the file is empty"),
         ("  \n\n", "x.srt: the file is empty"),
-        ("1\n2\n3\n", "x.srt: no subtitle record holds drone telemetry"),
-        (record("Hello, and welcome") + record("to the film"), "x.srt:2: no subtitle record holds"),
-        ("just a text\nof two lines", "x.srt:1: no subtitle record holds"),
+        ("1\n2\n3\n", "x.srt: no subtitle record contains drone telemetry"),
+        (
+            record("Hello, and welcome") + record("to the film"),
+            "x.srt:2: no subtitle record contains",
+        ),
+        ("just a text\nof two lines", "x.srt:1: no subtitle record contains"),
         (record("[latitude: abc] [longitude: 8]"), "x.srt:2: .*latitude is 'abc', not a number"),
-        (record("GPS(500.0,20.0,3)"), "x.srt:2: .*no position on Earth"),
-        (record("GPS(5.0)"), "x.srt:2: .*is no position"),
+        (record("GPS(500.0,20.0,3)"), "x.srt:2: .*not a position on Earth"),
+        (record("GPS(5.0)"), "x.srt:2: .*is not a position"),
         (record("G.PRY (1.0, 2.0)"), "x.srt:2: .*not pitch, roll, yaw"),
         (f"1\n{KEYED}\n2\n{KEYED}\n", "x.srt:1: the records have neither subtitle times"),
     ],

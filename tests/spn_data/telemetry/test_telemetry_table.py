@@ -54,7 +54,7 @@ def test_a_damaged_track_is_a_format_error(tmp_path: Path, damage: str) -> None:
     write_track(path, full_track())
     text = path.read_text()
     path.write_text(text[:-30] if damage == "cut" else damage)
-    with pytest.raises(FormatError, match=r"track\.csv: not a track of telemetry"):
+    with pytest.raises(FormatError, match=r"track\.csv: not a telemetry track"):
         read_track(path)
 
 

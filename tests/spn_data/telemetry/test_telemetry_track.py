@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spn_data.telemetry.track import Telemetry, coordinate_step_m, increasing, summarize
+from spn_data.telemetry.track import Telemetry, coordinate_step_m, summarize, time_order
 
 RNG = np.random.default_rng(7)
 
@@ -176,7 +176,7 @@ def test_coordinate_step_is_read_from_the_decimals():
 
 def test_increasing_sorts_and_keeps_the_first_of_equal_times():
     """Records are put in order; of two with one time the first in the file stays; both are said."""
-    index, notes = increasing(np.array([2.0, 1.0, 2.0, 3.0]))
+    index, notes = time_order(np.array([2.0, 1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(index, [1, 0, 3])
     assert len(notes) == 2
-    assert increasing(np.array([1.0, 2.0]))[1] == []
+    assert time_order(np.array([1.0, 2.0]))[1] == []

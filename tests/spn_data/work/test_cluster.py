@@ -128,7 +128,7 @@ def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -
 def test_the_error_of_a_call_is_raised_here(started: Cluster) -> None:
     started.add_worker()
     batch = ("a.jpg", ("a.jpg", b"no image", None, FeatureOptions()))
-    with pytest.raises(InputError, match=r"a\.jpg: is no image that can be decoded"):
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded as an image"):
         run_on_cluster(started.address, extract_from_bytes, [batch], print)
 
 
