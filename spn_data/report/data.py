@@ -1,4 +1,4 @@
-"""What the report shows, gathered as plain values."""
+"""Content of the report as plain values."""
 
 from __future__ import annotations
 
@@ -25,15 +25,36 @@ STRATA = tuple(stratum.value for stratum in Stratum)
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """N frames with what became of each, in the order of sequence and time. What is not known is NaN.
+    """Status and pose of N frames, sorted by sequence and time; unknown values are NaN.
 
-    names, sequences, cameras : (N,) str; evaluation : (N,) bool, of an evaluation sequence, not of the map;
-    tracked : (N,) bool, not among the chosen frames; time_s : (N,) since the sequence's first frame.
-    status : (N,) str, "registered", "failed", "skipped" or "unreadable"; reason : (N,) str.
-    poses : of the registered; sigma_m, sigma_deg : (N,) root of the trace of their covariance, 1 sigma.
-    inliers : (N,) int, map points that the pose rests on; error_px : (N,) root mean square residual.
-    gnss_m : (N, 3) fix minus pose, east north up; gnss_outlier : (N,) bool.
-    stratum : (N,) str, coverage; group : (N,) str, of the split; empty where there is none.
+    Attributes
+    ----------
+    names, sequences, cameras : ndarray of str, shape (N,)
+        Image name, sequence and camera of each frame.
+    evaluation : ndarray of bool, shape (N,)
+        Whether the frame belongs to an evaluation sequence, not to the map.
+    tracked : ndarray of bool, shape (N,)
+        Whether the frame is not among the chosen frames.
+    time_s : ndarray, shape (N,)
+        Time since the first frame of the sequence.
+    status : ndarray of str, shape (N,)
+        "registered", "failed", "skipped" or "unreadable".
+    reason : ndarray of str, shape (N,)
+        Why the frame has this status.
+    poses : Poses
+        Poses of the registered frames.
+    sigma_m, sigma_deg : ndarray, shape (N,)
+        Root of the trace of the position and rotation covariance, 1 sigma.
+    inliers : ndarray of int, shape (N,)
+        Number of map points that support the pose.
+    error_px : ndarray, shape (N,)
+        RMS reprojection error.
+    gnss_m : ndarray, shape (N, 3)
+        GNSS fix minus pose, east, north, up.
+    gnss_outlier : ndarray of bool, shape (N,)
+        Whether the fix is an outlier.
+    stratum, group : ndarray of str, shape (N,)
+        Coverage stratum and group of the split; empty if there is none.
     """
 
     names: np.ndarray
@@ -64,21 +85,21 @@ class FrameTable:
 
     @property
     def registered(self) -> np.ndarray:
-        """(N,) bool."""
+        """Mask (N,) of the frames with a pose."""
         return self.status == REGISTERED
 
     @property
     def tried(self) -> np.ndarray:
-        """(N,) bool: a pose was looked for."""
+        """Mask (N,) of the frames for which a pose was attempted."""
         return self.registered | (self.status == FAILED)
 
     def select(self, index: np.ndarray) -> FrameTable:
-        """The rows of an index or mask (N,)."""
+        """Return the rows of an index or mask (N,)."""
         return FrameTable(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @classmethod
     def concatenate(cls, parts: list[FrameTable]) -> FrameTable:
-        """The rows of several, one after the other."""
+        """Concatenate the rows of several tables."""
         columns: dict[str, Any] = {
             f.name: np.concatenate([getattr(part, f.name) for part in parts])
             for f in fields(cls)
@@ -88,7 +109,7 @@ class FrameTable:
 
     @staticmethod
     def no_facts(n: int) -> dict[str, np.ndarray]:
-        """The columns of `with_facts`, for N frames of which nothing of that kind is known."""
+        """Return the columns filled by `with_facts` for N frames, all unknown."""
         return {
             "gnss_m": np.full((n, 3), np.nan),
             "gnss_outlier": np.zeros(n, bool),
@@ -102,20 +123,20 @@ class FrameTable:
         strata: Mapping[str, str],
         groups: Mapping[str, str],
     ) -> FrameTable:
-        """The same frames with what is known of them by name: (GNSS residual, outlier), stratum, group."""
+        """Return the frames with facts added by name: (GNSS residual, outlier), stratum, group."""
         names = self.names.tolist()
         unknown = (np.full(3, np.nan), False)
-        found = [residuals.get(name, unknown) for name in names]
+        fixes = [residuals.get(name, unknown) for name in names]
         return replace(
             self,
-            gnss_m=np.array([residual for residual, _ in found], dtype=np.float64).reshape(-1, 3),
-            gnss_outlier=np.array([outlier for _, outlier in found], dtype=bool),
+            gnss_m=np.array([residual for residual, _ in fixes], dtype=np.float64).reshape(-1, 3),
+            gnss_outlier=np.array([outlier for _, outlier in fixes], dtype=bool),
             stratum=np.array([strata.get(name, "") for name in names], dtype=np.str_),
             group=np.array([groups.get(name, "") for name in names], dtype=np.str_),
         )
 
     def reasons(self, mask: np.ndarray) -> list[tuple[str, int]]:
-        """Why frames of a mask failed, most frequent first; figures in a reason are shown as N."""
+        """Count the reasons of failed frames in a mask, most frequent first; numbers are replaced by N."""
         failed = mask & (self.status == FAILED)
         kinds = [re.sub(r"\d+(\.\d+)?", "N", reason) for reason in self.reason[failed].tolist()]
         return Counter(kinds).most_common()
@@ -123,9 +144,16 @@ class FrameTable:
 
 @dataclass(frozen=True)
 class StageFacts:
-    """A stage that stands; stale : why it no longer fits what it was made from, None where it does.
+    """An existing stage.
 
-    command : that makes it; words in capitals stand for what the user gave.
+    Attributes
+    ----------
+    record : StageRecord
+        Record of the stage.
+    stale : str or None
+        Why the stage no longer matches its inputs; None if it does.
+    command : str
+        Command that makes the stage; words in capitals are placeholders for the user's arguments.
     """
 
     record: StageRecord
@@ -135,7 +163,19 @@ class StageFacts:
 
 @dataclass(frozen=True)
 class PlaceToFly:
-    """A view that mapping lacks: of a camera there, and how many evaluation frames it would help."""
+    """A camera pose missing in the mapping flights.
+
+    Attributes
+    ----------
+    east_north_up_m : tuple of float
+        Position in the world.
+    lat_lon_deg : tuple of float
+        Position in WGS84.
+    heading_deg, pitch_deg : float
+        Viewing direction.
+    frames : int
+        Number of evaluation frames it would help.
+    """
 
     east_north_up_m: tuple[float, float, float]
     lat_lon_deg: tuple[float, float]
@@ -146,10 +186,18 @@ class PlaceToFly:
 
 @dataclass(frozen=True)
 class CoverageFacts:
-    """How mapping covers other frames.
+    """How well mapping frames cover other frames.
 
-    strata : by sequence, number of frames by stratum, those without a pose as "failed"; fly_again : in the
-    order of a short path; limits : of the strata, in words; stale : why it no longer fits the area, or None.
+    Attributes
+    ----------
+    strata : dict of str to dict of str to int
+        Number of frames by stratum for each sequence; frames without a pose are counted as "failed".
+    fly_again : tuple of PlaceToFly
+        Missing mapping views, in the order of a short path.
+    limits : str
+        Limits of the strata in words.
+    stale : str or None
+        Why the coverage no longer matches the area; None if it does.
     """
 
     strata: dict[str, dict[str, int]]
@@ -160,10 +208,20 @@ class CoverageFacts:
 
 @dataclass(frozen=True)
 class MethodErrors:
-    """What a network, or what stands beside it, is worth on one group; None is unknown, or no number.
+    """Errors of a network or a baseline on one group; None if unknown or not finite.
 
-    position, rotation_deg : median, mean and p95; within : (limit, degrees, share); signed : (axis, median,
-    estimated minus true); ratio : of the stated covariances, 1 is right.
+    Attributes
+    ----------
+    frames, located : int
+        Number of frames, and of those with an estimated pose.
+    position, rotation_deg : tuple of float or None
+        Median, mean and 95th percentile of the errors.
+    within : tuple of (float, float, float)
+        Position limit, rotation limit in degrees, and share of frames within both.
+    signed : tuple of (str, float or None)
+        Axis and median of the signed error, estimated minus true.
+    ratio : float or None
+        Calibration of the stated covariances: median NEES relative to its expected median, 1 is ideal.
     """
 
     frames: int
@@ -177,8 +235,25 @@ class MethodErrors:
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """A trained network; None where nothing tells. checkpoint : fingerprint of what was judged; images,
-    minutes : of the whole training; kept_minutes : of it, when this network was the best so far."""
+    """A trained network; values are None if unknown.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of the network.
+    checkpoint : str
+        Fingerprint of the evaluated checkpoint.
+    parameters, size_bytes : int or None
+        Number of parameters and size of the checkpoint.
+    images : int or None
+        Number of images seen in the whole training.
+    minutes : float or None
+        Duration of the whole training.
+    kept_minutes : float or None
+        Training time after which this network was the best so far.
+    ms_an_image : float or None
+        Time per pose in milliseconds.
+    """
 
     kind: str
     checkpoint: str
@@ -192,7 +267,7 @@ class NetworkFacts:
 
 @dataclass(frozen=True)
 class Figure:
-    """caption : in words; width_px : that it was drawn for; svg : the file's bytes."""
+    """A figure of an evaluation. width_px : width it was drawn for; svg : content of the file."""
 
     caption: str
     width_px: int
@@ -201,12 +276,34 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class RunFacts:
-    """What `spn-model evaluate` left in one folder of runs/.
+    """Results of `spn-model evaluate` in one folder of runs/.
 
-    networks : by name; is_outdated : one was trained on since. groups : role and methods, by name of the
-    group; dataset : fingerprint of what they were judged on; is_current : that is the area's data set of now.
-    published : rows (network, group, position, rotation in degrees) of the paper. left_out : figures not
-    shown.
+    Attributes
+    ----------
+    name : str
+        Name of the folder.
+    units : str
+        Unit of positions, "m" or "model".
+    dataset : str
+        Fingerprint of the dataset used for evaluation.
+    is_current : bool
+        Whether that is the area's current dataset.
+    is_outdated : bool
+        Whether one of the networks was trained further since the evaluation.
+    networks : dict of str to NetworkFacts
+        Networks by name.
+    groups : dict of str to (str, dict of str to MethodErrors)
+        Role and errors by method of each group, by its name.
+    retrieval : dict of str to str
+        Name of the better retrieval baseline by group.
+    published : tuple of (str, str, float, float)
+        Results of the paper: network, group, position, rotation in degrees.
+    notes : tuple of str
+        Notes of the evaluation.
+    figures : tuple of Figure
+        Figures to show.
+    left_out : int
+        Number of figures not shown.
     """
 
     name: str
@@ -225,13 +322,42 @@ class RunFacts:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReportData:
-    """An area at one moment.
+    """State of an area at one moment.
 
-    title : name of its folder; path : of it; made : UTC, ISO 8601; units : "m", or "model" where nothing is
-    known of metres, north and up. stages : those that stand, in the order of work.
-    fov_tan : by camera, tangents of half the horizontal and vertical field of view.
-    evaluation_records : of the stages of evaluation sequences, by name. coverage : of these; plan : of
-    planned waypoints. runs : networks that were judged; broken_runs : why others cannot be shown.
+    Attributes
+    ----------
+    title, path : str
+        Name and path of the area's folder.
+    made : str
+        Time of the report in UTC, ISO 8601.
+    version : str
+        Version of the program.
+    units : str
+        "m", or "model" if metres, north and up are unknown.
+    stages : tuple of StageFacts
+        Existing stages in processing order.
+    frames_record, model_record : StageRecord or None
+        Records of the stages with frames and model.
+    geo : GeoFit or None
+        Georegistration; None if there is none.
+    frames : FrameTable
+        All frames.
+    points : MapPoints or None
+        Points of the map.
+    fov_tan : dict of str to (float, float)
+        Tangents of half the horizontal and vertical field of view by camera.
+    coverage, plan : CoverageFacts or None
+        Coverage of the evaluation sequences and of planned waypoints.
+    split : Split or None
+        Split of the frames.
+    audit : tuple of AuditFinding or None
+        Findings of the audit of the split.
+    evaluation_records : dict of str to StageRecord
+        Records of the stages of evaluation sequences, by name.
+    runs : tuple of RunFacts
+        Evaluated networks.
+    broken_runs : tuple of str
+        Why other runs cannot be shown.
     """
 
     title: str
@@ -256,5 +382,5 @@ class ReportData:
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:
-        """Names, sorted."""
+        """Sorted names of the evaluation sequences."""
         return tuple(sorted(set(self.frames.sequences[self.frames.evaluation].tolist())))

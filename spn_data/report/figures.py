@@ -1,4 +1,4 @@
-"""The figures that matter, as tiles."""
+"""Key figures of the area as tiles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spn_data.storage.stage_record import StageRecord
 
 
 def key_figures(data: ReportData) -> str:
-    """Tiles with the figures that matter, each with its unit."""
+    """Return the tiles with the key figures, each with its unit."""
     tiles = []
     unit = "m" if data.units == "m" else "model units"
     if data.model_record is not None:
@@ -31,14 +31,14 @@ def key_figures(data: ReportData) -> str:
         origin = data.geo.origin
         tiles.append(
             _tile(
-                "Place in the world",
-                f"{figure(2 * stated.horizontal_m, '.2f')} m",
+                "Georegistration",
+                f"{format_value(2 * stated.horizontal_m, '.2f')} m",
                 "horizontal uncertainty of the whole map (2 sigma)",
                 [
-                    f"vertical {figure(2 * stated.vertical_m, '.2f')} m (2 sigma)",
-                    f"tilt {figure(stated.tilt_deg, '.2f')} deg, "
-                    f"heading {figure(stated.heading_deg, '.2f')} deg (1 sigma)",
-                    f"scale {figure(stated.scale, '.2%')} (1 sigma)",
+                    f"vertical {format_value(2 * stated.vertical_m, '.2f')} m (2 sigma)",
+                    f"tilt {format_value(stated.tilt_deg, '.2f')} deg, "
+                    f"heading {format_value(stated.heading_deg, '.2f')} deg (1 sigma)",
+                    f"scale {format_value(stated.scale, '.2%')} (1 sigma)",
                     f"origin {origin.lat_deg:.6f}, {origin.lon_deg:.6f}, height {origin.alt_m:.2f} m "
                     f"({origin.height_reference})",
                 ],
@@ -47,21 +47,22 @@ def key_figures(data: ReportData) -> str:
         tiles.append(
             _tile(
                 "GNSS residuals",
-                f"{figure(summary.horizontal_rmse_m, '.2f')} m",
-                "horizontal (RMSE): noise of the receiver, not the error of poses",
+                f"{format_value(summary.horizontal_rmse_m, '.2f')} m",
+                "horizontal RMSE: noise of the receiver, not errors of poses",
                 [
-                    f"vertical {figure(summary.vertical_rmse_m, '.2f')} m",
-                    f"CE90 {figure(summary.ce90_m, '.2f')} m, LE90 {figure(summary.le90_m, '.2f')} m",
-                    f"{summary.fixes:,} fixes, of these outliers: {summary.outliers:,}",
+                    f"vertical {format_value(summary.vertical_rmse_m, '.2f')} m",
+                    f"CE90 {format_value(summary.ce90_m, '.2f')} m, "
+                    f"LE90 {format_value(summary.le90_m, '.2f')} m",
+                    f"{summary.fixes:,} fixes, {summary.outliers:,} of them outliers",
                 ],
             )
         )
     elif data.model_record is not None:
         tiles.append(
             _tile(
-                "Place in the world",
+                "Georegistration",
                 "units: model",
-                "lengths are no metres; north and up are unknown",
+                "lengths are not in metres; north and up are unknown",
                 [],
             )
         )
@@ -71,28 +72,29 @@ def key_figures(data: ReportData) -> str:
         tiles.append(_labels_tile(f"Evaluation: {name}", data.frames, mine, unit, more))
     tracked = data.frames.tracked & ~data.frames.evaluation & data.frames.tried
     if tracked.any():
-        tiles.append(_labels_tile("Tracked frames of mapping", data.frames, tracked, unit, []))
+        tiles.append(_labels_tile("Tracked mapping frames", data.frames, tracked, unit, []))
     if data.split is not None:
         counts = data.split.counts()
         others = [f"{n:,} {group}" for group, n in counts.items() if group != TRAIN]
         optimistic = [OPTIMISTIC] if data.split.optimistic else []
         tiles.append(
-            _tile("Split", f"{counts.get(TRAIN, 0):,}", "frames to train on", others + optimistic)
+            _tile("Split", f"{counts.get(TRAIN, 0):,}", "training frames", others + optimistic)
         )
     return f'<section class="tiles">{"".join(tiles)}</section>' if tiles else ""
 
 
 def _lens_and_gnss(record: StageRecord | None) -> list[str]:
-    """What a sequence's registration found of its lens, and how its own GNSS compares."""
+    """Describe the lens estimated at registration, and how the sequence's own GNSS compares."""
     if record is None:
         return []
     lines = []
     if record.counts.get("fov_deg"):
-        lines.append(f"lens {record.counts['fov_deg']:.1f} deg wide")
+        lines.append(f"horizontal field of view {record.counts['fov_deg']:.1f} deg")
     if gnss := record.counts.get("gnss"):
         offset_m = float(np.hypot(gnss["offset_e_m"], gnss["offset_n_m"]))
         lines.append(
-            f"own GNSS, not used: {offset_m:.2f} m beside (median), scatter {gnss['scatter_h_m']:.2f} m"
+            f"own GNSS (not used): horizontal offset {offset_m:.2f} m (median), "
+            f"scatter {gnss['scatter_h_m']:.2f} m"
         )
     return lines
 
@@ -113,7 +115,7 @@ def _labels_tile(
     chosen, tracked = mask & ~frames.tracked, mask & frames.tracked
     if chosen.any() and tracked.any():
         lines.append(
-            f"of these tracked: {(tracked & frames.registered).sum():,} of {tracked.sum():,}"
+            f"tracked frames: {(tracked & frames.registered).sum():,} of {tracked.sum():,}"
         )
     lines += more
     return _tile(title, f"{registered.sum():,} of {mask.sum():,}", "frames have a pose", lines)
@@ -127,6 +129,6 @@ def _tile(title: str, value: str, what: str, lines: Iterable[str]) -> str:
     )
 
 
-def figure(value: float, form: str) -> str:
-    """A figure for people; NaN and infinity are unknown."""
-    return format(value, form) if np.isfinite(value) else "unknown"
+def format_value(value: float, spec: str) -> str:
+    """Format a number; NaN and infinity are shown as "unknown"."""
+    return format(value, spec) if np.isfinite(value) else "unknown"

@@ -1,4 +1,4 @@
-"""The page: one file with everything in it."""
+"""The report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -19,13 +19,27 @@ _SCRIPTS = ("data", "draw", "view", "timeline", "table", "main")
 
 
 def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_000) -> str:
-    """HTML of the report, in ASCII; it loads nothing from anywhere."""
+    """Render the report as self-contained HTML in ASCII, which loads nothing from elsewhere.
+
+    Parameters
+    ----------
+    data : ReportData
+        What to show.
+    max_points : int
+        Maximum number of map points in the page.
+    max_frames : int
+        Approximate maximum number of frames in the page (`thin_frames`).
+
+    Returns
+    -------
+    str
+        The page.
+    """
     frames, left_out = thin_frames(data.frames, max_frames)
-    judged = verdict(data)
-    shown = {
+    sections_by_name = {
         "title": escape(data.title),
         "heading": sections.heading(data),
-        "verdict": sections.verdict_box(judged),
+        "verdict": sections.verdict_box(verdict(data)),
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data),
@@ -39,8 +53,8 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "data": script_json(pack_scene(data, frames, max_points)),
         "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
     }
-    page = Template(_asset("page.html")).substitute(shown)
-    # ASCII whatever encoding the file is written or served with; a name that is no valid text shows as "?".
+    page = Template(_asset("page.html")).substitute(sections_by_name)
+    # ASCII is safe whatever encoding the file is served with; names that are not valid text show as "?".
     return page.encode("ascii", "xmlcharrefreplace").decode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""The networks of an area beside what needs none: tables, figures, and how short a training was."""
+"""Section on networks: accuracy compared with baselines, amount of training, and figures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from html import escape
 
 from spn_data.report.data import MethodErrors, NetworkFacts, ReportData, RunFacts
 
-# A training that has shown fewer images is called short: two cores show several times as many in 30 minutes.
+# A training with fewer images is called short: two cores process several times as many in 30 minutes.
 SHORT_IMAGES = 30_000
 _ROLES = {"test": "test frames", "validation": "validation frames", "train": "training images"}
 _ORDER = tuple(_ROLES)
@@ -16,20 +16,20 @@ _NOTHING = "&ndash;"
 
 
 def networks(data: ReportData) -> str:
-    """Tables with all networks of one data set and one world, then each run's figures."""
+    """Return tables with all networks evaluated on the same dataset, then the figures of each run."""
     if not data.runs and not data.broken_runs:
         return ""
     parts = ['<section id="networks"><h2>Networks</h2>']
     parts += [f'<p class="note warn">{escape(text)}</p>' for text in data.broken_runs]
     single = [run for run in data.runs if len(run.networks) == 1]
-    # What was judged on other frames stands in a table of its own.
+    # Evaluations on other datasets get tables of their own.
     for dataset in dict.fromkeys(
         run.dataset for run in sorted(single, key=lambda r: not r.is_current)
     ):
         runs = [run for run in single if run.dataset == dataset]
         if not runs[0].is_current:
             parts.append(
-                '<p class="note warn">Judged on an earlier data set than the area holds now: '
+                '<p class="note warn">Evaluated on an earlier dataset than the current one: '
                 f"{escape(', '.join(run.name for run in runs))}.</p>"
             )
         parts.append(_trained(runs))
@@ -37,7 +37,7 @@ def networks(data: ReportData) -> str:
     for run in data.runs:
         if run.is_outdated:
             parts.append(
-                f'<p class="note warn">{escape(run.name)}: trained since it was judged; '
+                f'<p class="note warn">{escape(run.name)}: trained further since its evaluation; '
                 "run spn-model evaluate again.</p>"
             )
         else:
@@ -46,44 +46,44 @@ def networks(data: ReportData) -> str:
 
 
 def _trained(runs: Iterable[RunFacts]) -> str:
-    """What each network is and how long it was trained; short trainings are named as such."""
+    """Describe each network and its training; note which trainings were short."""
     rows, short = [], []
     for run in runs:
         for name, network in run.networks.items():
-            rows.append((escape(name), *_described(network)))
+            rows.append((escape(name), *_network_cells(network)))
             if network.images is not None and network.images < SHORT_IMAGES:
                 short.append(f"{name} ({network.images:,} images)")
     header = (
-        *("network", "kind", "parameters", "size", "trained for", "kept after", "images seen"),
-        "a pose takes",
+        *("network", "kind", "parameters", "size", "training time", "best after", "images seen"),
+        "time per pose",
     )
-    told = (
-        f'<p class="note warn">A short training: {escape(", ".join(short))}. What a longer one would give '
-        "is not known from this.</p>"
+    note = (
+        f'<p class="note warn">Short training: {escape(", ".join(short))}. Results after longer training '
+        "may differ.</p>"
         if short
         else ""
     )
-    return _table(header, rows, "trained") + told
+    return _table(header, rows, "trained") + note
 
 
-def _described(network: NetworkFacts) -> tuple[str, ...]:
-    def told(value: float | None, form: str, unit: str) -> str:
-        return _NOTHING if value is None else f"{value:{form}}{unit}"
+def _network_cells(network: NetworkFacts) -> tuple[str, ...]:
+    def cell(value: float | None, spec: str, unit: str) -> str:
+        return _NOTHING if value is None else f"{value:{spec}}{unit}"
 
     size = None if network.size_bytes is None else network.size_bytes / 1e6
     return (
         escape(network.kind),
-        told(network.parameters, ",", ""),
-        told(size, ".1f", " MB"),
-        told(network.minutes, ".1f", " min"),
-        told(network.kept_minutes, ".1f", " min"),
-        told(network.images, ",", ""),
-        told(network.ms_an_image, ".1f", " ms"),
+        cell(network.parameters, ",", ""),
+        cell(size, ".1f", " MB"),
+        cell(network.minutes, ".1f", " min"),
+        cell(network.kept_minutes, ".1f", " min"),
+        cell(network.images, ",", ""),
+        cell(network.ms_an_image, ".1f", " ms"),
     )
 
 
 def _tables(runs: list[RunFacts]) -> list[str]:
-    """A table a group: networks first, then what needs none, the paper's at the end."""
+    """Return one table per group: networks first, then baselines, then the results of the paper."""
     names = {name: runs[0].groups[name][0] for name in runs[0].groups}
     order = sorted(names, key=lambda n: (_ORDER.index(names[n]) if names[n] in _ORDER else 9, n))
     return [_group(name, names[name], runs) for name in order]
@@ -91,17 +91,17 @@ def _tables(runs: list[RunFacts]) -> list[str]:
 
 def _group(name: str, role: str, runs: list[RunFacts]) -> str:
     of_networks: dict[str, MethodErrors] = {}
-    beside: dict[str, MethodErrors] = {}
+    baselines: dict[str, MethodErrors] = {}
     for run in runs:
         for method, errors in run.groups.get(name, ("", {}))[1].items():
             is_network = any(method == n or method.startswith(f"{n}, ") for n in run.networks)
-            (of_networks if is_network else beside).setdefault(method, errors)
-    first = next(iter({**of_networks, **beside}.values()), None)
+            (of_networks if is_network else baselines).setdefault(method, errors)
+    first = next(iter({**of_networks, **baselines}.values()), None)
     if first is None:
         return ""
     unit = "m" if runs[0].units == "m" else "units"
     better = next((run.retrieval[name] for run in runs if name in run.retrieval), "")
-    ordered = {**of_networks, **{m: beside[m] for m in sorted(beside, key=_rank)}}
+    ordered = {**of_networks, **{m: baselines[m] for m in sorted(baselines, key=_rank)}}
     rows = [
         (_bold(method, method in of_networks, method == better), *_cells(errors, first, unit))
         for method, errors in ordered.items()
@@ -124,15 +124,15 @@ def _group(name: str, role: str, runs: list[RunFacts]) -> str:
         "covariance",
     )
     note = (
-        "* In another court, with other cameras; whether means or medians is not said. "
+        "* In another courtyard with other cameras; the paper does not state whether means or medians. "
         if published
         else ""
     )
     return (
         f"<h3>{escape(name)}: {first.frames:,} {escape(_ROLES.get(role, role))}</h3>"
         f"{_table(header, rows, 'errors')}"
-        f'<p class="note">{note}Nothing is aligned. {_axis(first)}'
-        "Covariance: median squared error over what is stated, 1 is right.</p>"
+        f'<p class="note">{note}Estimates are not aligned to the labels. {_axis(first)}'
+        "Covariance: median NEES relative to its expected median; 1 is ideal.</p>"
     )
 
 
@@ -145,13 +145,13 @@ def _axis(errors: MethodErrors) -> str:
 
 
 def _rank(method: str) -> tuple[int, str]:
-    """From what knows least to what knows most."""
+    """Return a sort key from the least informed baseline to the most informed one."""
     kinds = ("mean", "retrieval", "nearest")
     return next((k for k, kind in enumerate(kinds) if method.startswith(kind)), 9), method
 
 
 def _cells(errors: MethodErrors, first: MethodErrors, unit: str) -> list[str]:
-    """Of the columns that `first` has."""
+    """Format the errors in the columns of `first`."""
     pairs = [
         f"{position:.2f} {unit}, {rotation:.1f}&deg;"
         if position is not None and rotation is not None
@@ -176,7 +176,7 @@ def _bold(method: str, is_network: bool, is_better: bool) -> str:
 
 
 def _figures(run: RunFacts, *, opened: bool) -> str:
-    """Figures as images: a browser runs no script of an image, and fetches nothing for it."""
+    """Embed the figures as images: a browser neither runs scripts of an image nor fetches anything for it."""
     if not run.figures and not run.left_out:
         return ""
     shown = "".join(
@@ -185,20 +185,22 @@ def _figures(run: RunFacts, *, opened: bool) -> str:
         for figure in run.figures
     )
     left_out = (
-        f"{run.left_out} figures are left out: too large, or no figures. " if run.left_out else ""
+        f"{run.left_out} figures are omitted: too large or not readable as SVG. "
+        if run.left_out
+        else ""
     )
-    told = left_out + " ".join(run.notes)
+    text = left_out + " ".join(run.notes)
     return (
         f"<details{' open' if opened else ''}><summary>Figures of <b>{escape(run.name)}</b></summary>"
-        f'<p class="note">{escape(told)}</p>{shown}</details>'
+        f'<p class="note">{escape(text)}</p>{shown}</details>'
     )
 
 
 def _table(header: tuple[str, ...], rows: Iterable[Iterable[str]], kind: str) -> str:
-    """Cells are HTML already, as many in a row as there are titles."""
+    """Format a table; cells are HTML already, and each row has as many as the header."""
     cells = [tuple(row) for row in rows]
     if any(len(row) != len(header) for row in cells):
-        raise ValueError(f"a row of {kind} does not fit {header}")
+        raise ValueError(f"a row of table {kind} does not match its header {header}")
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in cells)
     return (

@@ -1,4 +1,4 @@
-"""Arrays and texts inside a page: little-endian binary in base64, and JSON that no text can break out of."""
+"""Arrays and texts embedded in a page: little-endian binary in base64, and script-safe JSON."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ _KINDS = {"f4": "<f4", "i2": "<i2", "i4": "<i4", "u1": "|u1"}
 
 
 def pack(values: np.ndarray, kind: str) -> dict[str, str]:
-    """An array, flattened, as {"kind", "base64"}; kind: f4, i2, i4 or u1. NaN stays NaN in f4."""
+    """Pack a flattened array as {"kind", "base64"}; kind: f4, i2, i4 or u1. NaN stays NaN in f4."""
     flat = np.ascontiguousarray(values).astype(_KINDS[kind]).ravel()
     return {"kind": kind, "base64": base64.b64encode(flat.tobytes()).decode("ascii")}
 
 
 def pack_texts(values: np.ndarray) -> dict[str, Any]:
-    """Texts (N,) that repeat: the different ones once, and which of them each is."""
-    different, which = np.unique(values, return_inverse=True)
-    return {"texts": different.tolist(), "which": pack(which, "i4")}
+    """Pack repetitive texts (N,) as the distinct ones and the index of each text."""
+    distinct, which = np.unique(values, return_inverse=True)
+    return {"texts": distinct.tolist(), "which": pack(which, "i4")}
 
 
 def script_json(value: Any) -> str:
-    """JSON to stand inside <script>: ASCII, and without `<`, `>` and `&` no tag can begin or end there."""
+    """Return JSON for a <script> element: ASCII, with `<`, `>` and `&` escaped so that no tag can occur."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

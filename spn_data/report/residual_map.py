@@ -1,4 +1,4 @@
-"""GNSS residuals seen from above, as SVG."""
+"""GNSS residuals in plan view, as SVG."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from spn_data.report.data import FrameTable
 
 _WIDTH, _MARGIN = 640.0, 40.0
 _MAX_ARROWS = 2000
-_MOST_EXTENT = 0.2  # of the flight: longer arrows are cut, or one outlier would fill the page
+_MAX_EXTENT = (
+    0.2  # of the flight's extent: longer arrows are truncated, or one outlier would fill the page
+)
 
 
 def residual_map(frames: FrameTable) -> str:
-    """Cameras in plan view, each with an arrow to where GNSS saw it, longer than life by a round factor.
+    """Draw cameras in plan view, each with an arrow to its GNSS fix, enlarged by a round factor.
 
-    Empty where fewer than two frames have a residual.
+    Returns an empty string if fewer than two frames have a residual.
     """
     rows = np.flatnonzero(np.isfinite(frames.gnss_m[:, :2]).all(axis=1) & frames.registered)
     if len(rows) < 2:
@@ -30,7 +32,7 @@ def residual_map(frames: FrameTable) -> str:
     usual = max(float(np.percentile(fitting if len(fitting) else lengths, 90)), 1e-3)
     extent = max(float(np.ptp(xy, axis=0).max()), 1e-3)
     factor = max(1.0, round_down(0.1 * extent / usual))
-    longest = _MOST_EXTENT * extent / factor
+    longest = _MAX_EXTENT * extent / factor
     ends = (
         xy + factor * arrows[:, :2] * np.minimum(1.0, longest / np.maximum(lengths, 1e-9))[:, None]
     )
@@ -65,12 +67,12 @@ def residual_map(frames: FrameTable) -> str:
         f'<g class="north"><path d="M{size[0] - 24:.0f} 46V14m-6 10 6-10 6 10"/>'
         f'<text x="{size[0] - 24:.0f}" y="60" text-anchor="middle">N</text></g>'
     )
-    larger = "to scale" if factor == 1 else f"{factor:g} times longer than they are"
-    note = f"Lines lead from each camera to its GNSS fix (dot), {larger}; {len(rows):,} frames."
+    enlarged = "drawn to scale" if factor == 1 else f"drawn {factor:g} times longer"
+    note = f"Lines connect each camera to its GNSS fix (dot), {enlarged}; {len(rows):,} frames."
     if np.any(frames.gnss_outlier[rows]):
-        note += " Dashed: outliers, which the fit left out."
+        note += " Dashed lines are outliers excluded from the fit."
     if np.any(lengths > longest):
-        note += f" Longer ones than {longest:.1f} m are cut there."
+        note += f" Residuals longer than {longest:.1f} m are truncated."
     return (
         f'<svg class="residuals" viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" role="img" '
         f'aria-label="GNSS residuals in plan view">{"".join(parts)}</svg><p class="note">{note}</p>'
@@ -78,13 +80,13 @@ def residual_map(frames: FrameTable) -> str:
 
 
 def round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is no larger. Raises ValueError unless positive."""
+    """Round a positive value down to 1, 2 or 5 times a power of ten; raise ValueError if not positive."""
     power = 10.0 ** math.floor(math.log10(value))
     return max(m * power for m in (1, 2, 5) if m * power <= value * (1 + 1e-9))
 
 
 def _paths(sequences: np.ndarray, plan: np.ndarray) -> list[str]:
-    """A thin line through the cameras of each sequence, in order of time."""
+    """Draw a thin line through the cameras of each sequence in temporal order."""
     return [
         '<path class="path" d="M' + "L".join(_xy(p) for p in plan[sequences == name]) + '"/>'
         for name in np.unique(sequences)

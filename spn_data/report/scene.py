@@ -1,4 +1,4 @@
-"""What the 3D view draws, packed: points thinned and quantised, cameras, GNSS fixes, places to fly again."""
+"""Packed content of the 3D view: thinned and quantized points, cameras, GNSS fixes, places to fly again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _STEPS = 32767  # of int16
 
 @dataclass(frozen=True, eq=False)
 class Display:
-    """How the world is turned for showing: ``shown = rotation @ (x - center)``, with up along z.
+    """Transformation from the world to the view, ``shown = rotation @ (x - center)``, with up along z.
 
     radius : distance from the centre within which points are shown, in the world's unit.
     """
@@ -26,14 +26,14 @@ class Display:
     radius: float
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) as shown."""
+        """Transform points (N, 3) to the view."""
         return (points - self.center) @ self.rotation.T
 
 
 def display_of(frames: FrameTable, points: MapPoints | None, *, has_up: bool) -> Display:
-    """Centred on the cameras and the bulk of the points.
+    """Choose a view centred on the cameras and the bulk of the points.
 
-    Without a known up, the cameras' mean upward direction stands in, for looking only.
+    If up is unknown, the cameras' mean upward direction is used instead, for display only.
     """
     centers = frames.poses.centers[frames.registered]
     rotation = np.eye(3)
@@ -46,21 +46,21 @@ def display_of(frames: FrameTable, points: MapPoints | None, *, has_up: bool) ->
     if len(centers):
         low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
     center = (low + high) / 2
-    # Some points of any map lie far beyond it: they would shrink all else to a dot.
+    # Some points of any map are far outside; with them, everything else would shrink to a dot.
     radius = 1.5 * float(np.linalg.norm(high - low) / 2)
     return Display(rotation, center, max(radius, 1e-6))
 
 
 def _turn_to_z(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes a direction to z."""
+    """Return a rotation (3, 3) that takes a direction to z."""
     z = up / max(float(np.linalg.norm(up)), 1e-12)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
 
 
-def thin(points: MapPoints, display: Display, limit: int) -> tuple[np.ndarray, int]:
-    """Rows of at most `limit` points to show, drawn evenly, and how many lie too far out to be shown."""
+def thin_points(points: MapPoints, display: Display, limit: int) -> tuple[np.ndarray, int]:
+    """Sample at most `limit` points to show; return their rows and the number of points too far out."""
     near = np.linalg.norm(points.xyz - display.center, axis=1) <= display.radius
     rows = np.flatnonzero(near)
     if len(rows) > limit:
@@ -69,8 +69,8 @@ def thin(points: MapPoints, display: Display, limit: int) -> tuple[np.ndarray, i
 
 
 def pack_points(points: MapPoints, display: Display, limit: int) -> dict[str, Any]:
-    """Positions in steps of `step`, colours, and what was left out."""
-    rows, far = thin(points, display, limit)
+    """Pack positions in multiples of `step`, colours, and how many points were omitted."""
+    rows, far = thin_points(points, display, limit)
     step = display.radius / _STEPS
     return {
         "xyz": pack(np.round(display.apply(points.xyz[rows]) / step), "i2"),
@@ -83,7 +83,7 @@ def pack_points(points: MapPoints, display: Display, limit: int) -> dict[str, An
 
 
 def pack_frames(frames: FrameTable) -> dict[str, Any]:
-    """All columns of the table, for the page's script."""
+    """Pack all columns of the frame table for the page's script."""
     numbers = {
         "time_s": frames.time_s,
         "center": frames.poses.centers,
@@ -117,7 +117,7 @@ def pack_frames(frames: FrameTable) -> dict[str, Any]:
 
 
 def pack_scene(data: ReportData, frames: FrameTable, max_points: int) -> dict[str, Any]:
-    """Everything that the page's script needs."""
+    """Pack everything that the page's script needs."""
     display = display_of(data.frames, data.points, has_up=data.units == "m")
     again = [p for facts in (data.coverage, data.plan) if facts for p in facts.fly_again]
     return {

@@ -1,4 +1,4 @@
-"""Sections of the page that are plain HTML; all text of the area is escaped here."""
+"""Sections of the page in plain HTML; all text from the area is escaped here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
-from spn_data.report.figures import figure
+from spn_data.report.figures import format_value
 from spn_data.report.residual_map import residual_map
 from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
 from spn_data.split import audit
@@ -18,18 +18,18 @@ from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import limitations
 from spn_data.storage.stage_record import StageRecord
 
-_REASONS_SHOWN = 6  # of one sequence
-_PLACES_SHOWN = 8  # to fly again, before the list is folded
-_MOST_EVIDENCE = 50  # lines shown of one check
+_REASONS_SHOWN = 6  # per sequence
+_PLACES_SHOWN = 8  # to fly again, before the rest is collapsed
+_EVIDENCE_SHOWN = 50  # lines per check
 _MARKS = {
     Level.GOOD: ("&#10003;", "good"),
-    Level.CAUTION: ("!", "but"),
+    Level.CAUTION: ("!", "caution"),
     Level.STOP: ("&#10005;", "stop"),
 }
 
 
 def heading(data: ReportData) -> str:
-    """Name of the area, where it is, when this was written."""
+    """Return the name and path of the area and the time of the report."""
     unit = "" if data.units == "m" else ' <span class="unit">units: model</span>'
     return (
         f"<h1>{escape(data.title)}{unit}</h1>"
@@ -39,14 +39,14 @@ def heading(data: ReportData) -> str:
 
 
 def verdict_box(verdict: AreaVerdict) -> str:
-    """The answer, what to do next, and the reasons."""
+    """Return the verdict, the next step, and the findings."""
     mark = _MARKS[verdict.level][0]
     step = verdict.next_step
-    following = f'<p class="next"><b>Next:</b> {_what_to_do(step)}</p>' if step else ""
+    next_step = f'<p class="next"><b>Next:</b> {_what_to_do(step)}</p>' if step else ""
     findings = "".join(_finding(f, is_next=f is step) for f in verdict.findings)
     return (
         f'<section id="verdict" class="{verdict.level}"><h2><span class="mark">{mark}</span>'
-        f"{escape(verdict.headline)}</h2>{following}<ul>{findings}</ul></section>"
+        f"{escape(verdict.headline)}</h2>{next_step}<ul>{findings}</ul></section>"
     )
 
 
@@ -65,27 +65,27 @@ def _what_to_do(finding: VerdictReason) -> str:
 
 
 def view(data: ReportData, max_points: int) -> str:
-    """Place of the 3D view; the script draws it."""
+    """Return the container of the 3D view, which the script draws."""
     thinned = ""
     if data.points is not None and len(data.points) > max_points:
         thinned = f" {max_points:,} of {len(data.points):,} points are shown."
     frame = (
         "Grid in metres; the arrow points north."
         if data.units == "m"
-        else "Grid in units of the model; up is a guess from the cameras, north is unknown."
+        else "Grid in model units; up is estimated from the cameras, north is unknown."
     )
     return (
         '<section><h2>Map</h2><div class="view"><canvas id="view" tabindex="0" '
         'aria-label="3D view of the map"></canvas><div id="north" hidden>N</div>'
         '<details id="legend"></details><div id="picked"></div></div>'
-        f'<p class="note">Drag to turn, right button or two fingers to move, wheel (after a click) or '
-        f"pinch to zoom; click a camera for its figures. {frame}{thinned}"
+        f'<p class="note">Drag to rotate, use the right button or two fingers to pan, the wheel (after a '
+        f"click) or pinch to zoom; click a camera for details. {frame}{thinned}"
         '<span id="fallback"></span></p></section>'
     )
 
 
 def residuals(data: ReportData) -> str:
-    """Plan view of GNSS residuals."""
+    """Return the plan view of GNSS residuals."""
     if data.geo is None:
         return ""
     drawn = residual_map(data.frames)
@@ -95,15 +95,15 @@ def residuals(data: ReportData) -> str:
     extra = ""
     if held_out.frames:
         extra = (
-            f'<p class="note">On fixes that the fit has not seen ({held_out.folds} blocks of time): '
-            f"{figure(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
-            f"{figure(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
+            f'<p class="note">Held-out fixes ({held_out.folds} blocks of time): '
+            f"{format_value(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
+            f"{format_value(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
         )
-    return f"<section><h2>GNSS residuals from above</h2>{drawn}{extra}</section>"
+    return f"<section><h2>GNSS residuals in plan view</h2>{drawn}{extra}</section>"
 
 
 def timeline(data: ReportData, left_out: dict[str, int]) -> str:
-    """Frames over time (drawn by the script), and why frames failed."""
+    """Return frames over time, which the script draws, and the reasons of failed frames."""
     frames = data.frames
     if not len(frames):
         return ""
@@ -118,7 +118,7 @@ def timeline(data: ReportData, left_out: dict[str, int]) -> str:
     failures = (
         _table(("sequence", "why frames have no pose", "frames"), rows, "failures")
         if rows
-        else '<p class="note">No frame that was tried is without a pose.</p>'
+        else '<p class="note">All attempted frames have a pose.</p>'
     )
     return (
         '<section><h2>Frames over time</h2><div id="timeline"></div>'
@@ -130,11 +130,11 @@ def _left_out(left_out: dict[str, int]) -> str:
     if not left_out:
         return ""
     what = " and ".join(f"{n:,} {kind}" for kind, n in left_out.items())
-    return f'<p class="note">Thinned out: {escape(what)} are neither drawn nor listed.</p>'
+    return f'<p class="note">To limit the size of this page, {escape(what)} are neither drawn nor listed.</p>'
 
 
 def coverage(data: ReportData) -> str:
-    """Strata of each sequence as bars, and the places to fly again; the same of planned waypoints."""
+    """Return strata as bars and the places to fly again, for evaluation sequences and planned waypoints."""
     parts = []
     for title, facts in (("Coverage", data.coverage), ("Coverage of planned waypoints", data.plan)):
         if facts is None:
@@ -148,7 +148,7 @@ def coverage(data: ReportData) -> str:
 
 
 def _fly_again(places: Sequence[PlaceToFly]) -> str:
-    """Table of places; a long one is folded after its first rows."""
+    """Return a table of places; a long one is collapsed after its first rows."""
     header = (
         *("", "latitude, longitude", "east, north, up (m)", "heading (deg)", "pitch (deg)"),
         "frames helped",
@@ -194,7 +194,7 @@ def _strata_bar(name: str, counts: dict[str, int]) -> str:
 
 
 def split(data: ReportData) -> str:
-    """Groups of the split, and what the audit found."""
+    """Return the groups of the split and the findings of the audit."""
     if data.split is None:
         return ""
     left_out = int((data.split.group == LEFT_OUT).sum())
@@ -203,13 +203,13 @@ def split(data: ReportData) -> str:
         "<section><h2>Split and audit</h2>",
         _table(("group", "frames"), [(group, f"{n:,}") for group, n in rows], "groups"),
     ]
-    said = (*data.split.notes, *limitations(data.split))
-    parts += [f'<p class="note">{escape(note)}</p>' for note in said]
+    notes = (*data.split.notes, *limitations(data.split))
+    parts += [f'<p class="note">{escape(note)}</p>' for note in notes]
     return "".join(parts) + "".join(_check(check) for check in data.audit or ()) + "</section>"
 
 
 def _check(check: audit.AuditFinding) -> str:
-    """One line of the audit; its evidence folds out."""
+    """Return one line of the audit with its evidence collapsed."""
     level = {
         audit.AuditVerdict.PASS: Level.GOOD,
         audit.AuditVerdict.NOTICE: Level.CAUTION,
@@ -218,8 +218,8 @@ def _check(check: audit.AuditFinding) -> str:
     mark, word = _MARKS[level]
     text = f"<b>{escape(check.check)}</b>: {escape(check.text)}"
     if check.evidence:
-        more = len(check.evidence) - _MOST_EVIDENCE
-        lines = [*check.evidence[:_MOST_EVIDENCE], *([f"and {more:,} more"] if more > 0 else [])]
+        more = len(check.evidence) - _EVIDENCE_SHOWN
+        lines = [*check.evidence[:_EVIDENCE_SHOWN], *([f"and {more:,} more"] if more > 0 else [])]
         listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
         text = f"<details><summary>{text}</summary><ul>{listed}</ul></details>"
     return (
@@ -229,7 +229,7 @@ def _check(check: audit.AuditFinding) -> str:
 
 
 def table(frames: FrameTable) -> str:
-    """Place of the table of all frames; the script fills it."""
+    """Return the container of the table of all frames, which the script fills."""
     failed = int((frames.status == FAILED).sum())
     return (
         f'<section><h2>All frames</h2><div id="table" data-frames="{len(frames)}" '
@@ -238,7 +238,7 @@ def table(frames: FrameTable) -> str:
 
 
 def stages(data: ReportData) -> str:
-    """What each stage was made with, folded up."""
+    """Return options, versions and inputs of each stage, collapsed."""
     parts = ["<section><h2>How it was made</h2>"]
     for stage in data.stages:
         record = stage.record

@@ -1,4 +1,4 @@
-"""Which frames the page holds, where an area has more than a browser likes."""
+"""Selection of frames to show if an area has more than a browser handles well."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from spn_data.report.data import FrameTable
 
 
 def thin_frames(frames: FrameTable, limit: int) -> tuple[FrameTable, dict[str, int]]:
-    """At most about `limit` frames, and how many of what kind are left out.
+    """Reduce the frames to about `limit`; return them and the number of omitted frames by kind.
 
-    Frames that failed, and chosen ones, all stay; candidates that were not chosen go first, then tracked
-    frames
-    with a pose, each thinned evenly in time.
+    Failed frames and chosen ones are all kept. Candidates that were not chosen are thinned first, then
+    tracked frames with a pose, each evenly in time.
     """
     keep = np.ones(len(frames), bool)
     left_out: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Whether an area is ready to train on, why, and what to do next; the rules stand in docs/report.md."""
+"""Verdict on an area: whether it is ready for training, why, and what to do next (see docs/report.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spn_data.split.groups import OPTIMISTIC, TRAIN, VALIDATION
 
 
 class Level(StrEnum):
-    """How much a finding weighs."""
+    """Severity of a finding."""
 
     GOOD = "good"
     CAUTION = "caution"
@@ -22,7 +22,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class VerdictReason:
-    """One reason; do : what to do about it, command : to type, both may be empty."""
+    """One reason for the verdict. do : remedy, command : what to type; both may be empty."""
 
     level: Level
     text: str
@@ -32,7 +32,17 @@ class VerdictReason:
 
 @dataclass(frozen=True)
 class AreaVerdict:
-    """level : that of the worst finding; findings : worst first."""
+    """Verdict on an area.
+
+    Attributes
+    ----------
+    level : Level
+        Severity of the worst finding.
+    headline : str
+        The verdict in one line.
+    findings : tuple of VerdictReason
+        All findings, worst first.
+    """
 
     level: Level
     headline: str
@@ -40,18 +50,18 @@ class AreaVerdict:
 
     @property
     def next_step(self) -> VerdictReason | None:
-        """The first finding that something can be done about."""
+        """First finding that has a remedy."""
         return next((f for f in self.findings if f.do or f.command), None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictLimits:
-    """Where a figure becomes a reservation, or a reason not to train."""
+    """Thresholds at which a figure becomes a reservation or a reason not to train."""
 
     good_map_share: float = 0.95  # of the chosen frames that have a pose
     min_map_share: float = 0.80
     max_error_px: float = 1.0  # mean reprojection error
-    max_held_out_ratio: float = 2.0  # of errors on fixes that the fit has not seen to its residuals
+    max_held_out_ratio: float = 2.0  # ratio of errors on held-out fixes to residuals of the fit
     max_heading_sigma_deg: float = 3.0
     max_scale_sigma: float = 0.03
     good_evaluation_share: float = 0.90  # of a sequence's frames that have a pose
@@ -61,7 +71,20 @@ class VerdictLimits:
 
 
 def verdict(data: ReportData, limits: VerdictLimits | None = None) -> AreaVerdict:
-    """By the rules of docs/report.md."""
+    """Judge an area by the rules of docs/report.md.
+
+    Parameters
+    ----------
+    data : ReportData
+        State of the area.
+    limits : VerdictLimits, optional
+        Thresholds; the documented ones by default.
+
+    Returns
+    -------
+    AreaVerdict
+        Verdict and findings, worst first.
+    """
     limits = limits or VerdictLimits()
     found = [
         *_stages(data),
@@ -90,7 +113,7 @@ def _stages(data: ReportData) -> Iterator[VerdictReason]:
             yield VerdictReason(
                 Level.STOP,
                 f"{stage.record.stage} is out of date: {stage.stale}.",
-                "Make this stage anew",
+                "Redo this stage",
                 f"{stage.command} --overwrite",
             )
 
@@ -100,31 +123,32 @@ def _map(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
         yield VerdictReason(
             Level.STOP,
             "There is no model.",
-            "Make the model",
+            "Reconstruct the model",
             "spn-data reconstruct VIDEO --fov DEGREES",
         )
         return
     counts = data.model_record.counts
     registered, frames = int(counts["registered"]), int(counts["frames"])
     share = registered / frames
-    text = f"The map holds {registered:,} of {frames:,} chosen frames ({share:.0%})"
+    text = f"The map contains {registered:,} of {frames:,} chosen frames ({share:.0%})"
     if share < limits.good_map_share:
         stop = share < limits.min_map_share
         yield VerdictReason(
             Level.STOP if stop else Level.CAUTION,
-            text + ": it is not complete.",
-            "See which passages are missing and why (below); fly them again and add them",
+            text + ": it is incomplete.",
+            "See below which parts are missing and why, fly them again and add the flight",
             "spn-data reconstruct VIDEO --add",
         )
     else:
         yield VerdictReason(Level.GOOD, text + ".")
     error = float(counts["mean_error_px"])
-    text = f"Its mean reprojection error is {error:.2f} px"
+    text = f"The mean reprojection error is {error:.2f} px"
     if error > limits.max_error_px:
         yield VerdictReason(
             Level.CAUTION,
-            f"{text}, more than {limits.max_error_px:g} px: motion blur, rolling shutter or stabilization.",
-            "Fly with a short exposure and electronic stabilization off",
+            f"{text}, more than {limits.max_error_px:g} px; likely causes are motion blur, rolling shutter "
+            "or electronic stabilization.",
+            "Fly with a short exposure time and electronic stabilization switched off",
         )
     else:
         yield VerdictReason(Level.GOOD, text + ".")
@@ -132,8 +156,8 @@ def _map(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     if rolling:
         yield VerdictReason(
             Level.CAUTION,
-            f"A rolling shutter shows in {', '.join(rolling)}: poses of fast passages are worse.",
-            "Fly slower, or with another camera",
+            f"Rolling shutter affects {', '.join(rolling)}: poses are less accurate in fast motion.",
+            "Fly slower, or use another camera",
         )
 
 
@@ -143,31 +167,31 @@ def _place(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     if data.geo is None:
         yield VerdictReason(
             Level.CAUTION,
-            "The map is not georegistered: lengths are units of the model, not metres, and north and up "
-            "are unknown. Errors of a trained model will have no metres either.",
-            "Give telemetry with the flight (.SRT, .gpx, .csv or EXIF)",
+            "The map is not georegistered: lengths are in model units, not metres, and north and up are "
+            "unknown. Errors of a trained network will not be in metres either.",
+            "Provide telemetry with the flight (.SRT, .gpx, .csv or EXIF)",
             "spn-data georegister",
         )
         return
     stated, summary, held_out = data.geo.uncertainty, data.geo.summary, data.geo.held_out_blocks
     yield VerdictReason(
         Level.GOOD,
-        f"The map is georegistered; as a whole it may lie {2 * stated.horizontal_m:.2f} m beside and "
-        f"{2 * stated.vertical_m:.2f} m above or below its true place (2 sigma).",
+        "The map is georegistered; uncertainty of the whole map: horizontal "
+        f"{2 * stated.horizontal_m:.2f} m, vertical {2 * stated.vertical_m:.2f} m (2 sigma).",
     )
     if stated.heading_deg > limits.max_heading_sigma_deg or stated.scale > limits.max_scale_sigma:
         yield VerdictReason(
             Level.CAUTION,
-            f"Its heading is known to {stated.heading_deg:.1f} deg and its scale to {stated.scale:.1%} only "
-            "(1 sigma).",
-            "Add a longer flight with a cross leg",
+            f"The orientation and scale of the map are uncertain: heading {stated.heading_deg:.1f} deg, "
+            f"scale {stated.scale:.1%} (1 sigma).",
+            "Add a longer flight with crossing legs",
             "spn-data reconstruct VIDEO --add",
         )
     if held_out.horizontal_rmse_m > limits.max_held_out_ratio * summary.horizontal_rmse_m:
         yield VerdictReason(
             Level.CAUTION,
-            f"GNSS fixes that the fit has not seen lie {held_out.horizontal_rmse_m:.2f} m away, those that "
-            f"it has seen {summary.horizontal_rmse_m:.2f} m (RMSE): too few data to trust the place.",
+            f"The horizontal RMSE is {held_out.horizontal_rmse_m:.2f} m for held-out GNSS fixes but "
+            f"{summary.horizontal_rmse_m:.2f} m for fitted ones: too few data for a reliable fit.",
             "Add a longer flight",
             "spn-data reconstruct VIDEO --add",
         )
@@ -185,15 +209,20 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReas
         if registered == 0:
             yield VerdictReason(
                 Level.STOP,
-                text + ". It is of another place, or the map lacks its views.",
+                text + ". It shows another place, or the map does not cover its views.",
                 "Map those views, or remove the sequence's folders in 4-eval and 4-tracked",
             )
         elif share < limits.good_evaluation_share:
-            few = "; a test on so few says little" if share < limits.min_evaluation_share else ""
+            few = (
+                "; a test on so few frames is hardly meaningful"
+                if share < limits.min_evaluation_share
+                else ""
+            )
             yield VerdictReason(
                 Level.CAUTION,
-                f"{text}{few}. Frames without a pose are the hard ones: tests look better than they are.",
-                "Fly again where coverage is low and add it to the map",
+                f"{text}{few}. Frames without a pose tend to be the difficult ones, so test results look "
+                "too good.",
+                "Fly again where coverage is low and add the flight to the map",
                 "spn-data reconstruct VIDEO --add",
             )
         else:
@@ -202,19 +231,19 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReas
 
 
 def _own_gnss(name: str, data: ReportData) -> Iterator[VerdictReason]:
-    """The sequence's own fixes, which its labels were made without."""
+    """Check the labels against the sequence's own GNSS fixes, which they do not use."""
     record = data.evaluation_records.get(name)
     gnss = record.counts.get("gnss") if record else None
     if not gnss or not gnss["contradicts"]:
         return
-    beside = f"{math.hypot(gnss['offset_e_m'], gnss['offset_n_m']):.1f} m beside"
+    offset = f"{math.hypot(gnss['offset_e_m'], gnss['offset_n_m']):.1f} m horizontally"
     if gnss["offset_u_m"] is not None:
-        beside += f" and {gnss['offset_u_m']:+.1f} m above"
+        offset += f" and {gnss['offset_u_m']:+.1f} m vertically"
     yield VerdictReason(
         Level.CAUTION,
-        f"The own GNSS of {name}, not used for its labels, lies {beside} them, more than it and the "
-        "map's place account for: the map, or a lens, may be wrong.",
-        "Compare flights and heights; see the residuals",
+        f"The GNSS of {name}, not used for its labels, deviates from them by {offset}, more than its "
+        "noise and the uncertainty of the map explain: the map or a lens may be wrong.",
+        "Compare flights and heights, and check the residuals",
     )
 
 
@@ -222,8 +251,8 @@ def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason
     if data.coverage is None and data.evaluation_sequences:
         yield VerdictReason(
             Level.CAUTION,
-            "How well mapping covers the evaluation sequences is not known.",
-            "Measure it",
+            "The coverage of the evaluation sequences by mapping frames is not known.",
+            "Measure the coverage",
             "spn-data coverage",
         )
     if data.coverage is not None:
@@ -249,9 +278,9 @@ def _strata(
         again = len(coverage.fly_again)
         yield VerdictReason(
             Level.CAUTION,
-            f"{share:.0%} of {what} are views that no mapping frame is near to: a network has to "
+            f"{share:.0%} of the views of {what} have no mapping frame nearby: a network has to "
             "extrapolate there.",
-            f"Fly the {_count(again, 'place')} listed below and add them" if again else "",
+            f"Fly the {_count(again, 'place')} listed below and add the flight" if again else "",
             "spn-data reconstruct VIDEO --add",
         )
     else:
@@ -262,7 +291,7 @@ def _strata(
 def _stale(coverage: CoverageFacts, what: str, command: str) -> Iterator[VerdictReason]:
     if coverage.stale:
         text = f"{what} is out of date: {coverage.stale}."
-        yield VerdictReason(Level.CAUTION, text, "Measure it again", command)
+        yield VerdictReason(Level.CAUTION, text, "Measure the coverage again", command)
 
 
 def _split(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
@@ -271,26 +300,26 @@ def _split(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     if data.split is None:
         yield VerdictReason(
             Level.STOP,
-            "Frames are not split into training, validation and test, and there is no dataset.h5.",
+            "The frames are not split into training, validation and test, so there is no dataset.h5 yet.",
             "Split the frames",
             "spn-data split",
         )
         return
     counts = data.split.counts()
     train = counts.get(TRAIN, 0)
-    text = f"{_count(train, 'frame')} to train on, {counts.get(VALIDATION, 0):,} to validate"
+    text = f"{_count(train, 'training frame')}, {_count(counts.get(VALIDATION, 0), 'validation frame')}"
     if train == 0:
         yield VerdictReason(
             Level.STOP,
-            "No frame is left to train on.",
-            "Hold out less",
+            "No training frames are left.",
+            "Hold out fewer frames",
             "spn-data split --overwrite",
         )
     elif train < limits.min_training_frames:
         yield VerdictReason(
             Level.CAUTION,
-            f"{text}: fewer than {limits.min_training_frames} for training.",
-            "Take all frames of the video",
+            f"{text}: fewer than {limits.min_training_frames} training frames.",
+            "Label all frames of the video",
             "spn-data register --all-frames",
         )
     else:
@@ -298,7 +327,7 @@ def _split(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     if data.split.optimistic:
         yield VerdictReason(
             Level.CAUTION,
-            "The test is of the same flight as training: optimistic.",
+            "Test and training frames are of the same flight, so test results are optimistic.",
             "Register a flight of another day as an evaluation sequence",
             "spn-data register VIDEO --name NAME",
         )
@@ -309,8 +338,8 @@ def _audit(data: ReportData) -> Iterator[VerdictReason]:
         if data.split is not None:
             yield VerdictReason(
                 Level.STOP,
-                "Whether test frames have leaked into training is not checked.",
-                "Check the split",
+                "The split has not been audited for test frames that leaked into training.",
+                "Audit the split",
                 "spn-data audit",
             )
         return
@@ -319,7 +348,7 @@ def _audit(data: ReportData) -> Iterator[VerdictReason]:
             yield VerdictReason(
                 Level.STOP,
                 f"The audit failed ({check.check}): {check.text}.",
-                "Split anew",
+                "Split again",
                 "spn-data split --overwrite",
             )
         elif check.verdict is audit.AuditVerdict.NOTICE and check.text != OPTIMISTIC:

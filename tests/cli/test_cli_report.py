@@ -79,7 +79,7 @@ def test_a_stale_stage_is_named_and_left_out(area):
     assert ran.exit_code == 0, ran.output
     assert "Not ready to train: 2 things to do first: see" in ran.output
     page = (area / "report.html").read_text("ascii")
-    assert "3-geo is out of date: 2-model was made anew since." in page
+    assert "3-geo is out of date: 2-model was redone since." in page
     assert given(area / "report.html")["units"] == "model"
 
 
@@ -89,7 +89,7 @@ def test_an_area_without_a_model_has_a_report(area):
     shutil.rmtree(area / "2-model")
     ran = run(area)
     assert ran.exit_code == 0, ran.output
-    assert "Next: Make the model: spn-data reconstruct" in ran.output
+    assert "Next: Reconstruct the model: spn-data reconstruct" in ran.output
     assert given(area / "report.html")["points"] is None
 
 

@@ -1,5 +1,5 @@
-// What the page was given: typed arrays, and the world as it is shown (z up, centred).
-const given = JSON.parse(document.getElementById("data").textContent);
+// Data of the page: typed arrays, and the transformation from the world to the view (z up, centred).
+const report = JSON.parse(document.getElementById("data").textContent);
 const KINDS = {f4: Float32Array, i2: Int16Array, i4: Int32Array, u1: Uint8Array};
 
 function unpack(packed) {
@@ -8,17 +8,17 @@ function unpack(packed) {
   return new KINDS[packed.kind](bytes.buffer);
 }
 
-// Columns of the frames: typed arrays; texts as functions of the row.
-const frames = {count: given.frames.count, name: i => given.frames.name[i]};
-for (const [column, value] of Object.entries(given.frames)) {
+// Columns of the frame table: typed arrays, or functions of the row for texts.
+const frames = {count: report.frames.count, name: i => report.frames.name[i]};
+for (const [column, value] of Object.entries(report.frames)) {
   if (value.base64 !== undefined) frames[column] = unpack(value);
   else if (value.texts) {
     const which = unpack(value.which);
     frames[column] = i => value.texts[which[i]];
   }
 }
-const unit = given.units === "m" ? "m" : "units";
-const turn = given.display.rotation, middle = given.display.center, radius = given.display.radius;
+const unit = report.units === "m" ? "m" : "units";
+const turn = report.display.rotation, middle = report.display.center, radius = report.display.radius;
 
 function rotated(x, y, z) {
   return [turn[0] * x + turn[1] * y + turn[2] * z, turn[3] * x + turn[4] * y + turn[5] * z,
@@ -39,7 +39,7 @@ function axesOf(i) {
   return rows.map(row => rotated(...row));
 }
 
-// The same for a camera of a heading and pitch (degrees), in an East-North-Up world.
+// The same for a camera with a heading and pitch in degrees, in an East-North-Up world.
 function axesOfAngles(heading, pitch) {
   const h = heading * Math.PI / 180, p = pitch * Math.PI / 180;
   const forward = [Math.sin(h) * Math.cos(p), Math.cos(h) * Math.cos(p), Math.sin(p)];
@@ -55,10 +55,10 @@ function roundDown(value) {
 }
 
 function element(tag, attributes = {}, ...children) {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  made.append(...children);
-  return made;
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  node.append(...children);
+  return node;
 }
 
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

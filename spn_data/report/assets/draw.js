@@ -1,5 +1,5 @@
-// Two ways to draw layers of points and lines: WebGL, and a plain canvas where there is none.
-// A layer: {lines, xyz (Float32Array or Int16Array), step, rgb (Uint8Array per vertex, or a CSS name), size}.
+// Two renderers for layers of points and lines: WebGL, and a 2D canvas as a fallback.
+// Layer: {lines, xyz (Float32Array or Int16Array), step, rgb (Uint8Array per vertex, or a CSS name), size}.
 
 const VERTEX = `attribute vec3 position; attribute vec3 color; uniform mat4 matrix; uniform float step, size;
 varying vec3 tint; void main() { gl_Position = matrix * vec4(position * step, 1.0); gl_PointSize = size; tint = color; }`;
@@ -62,7 +62,7 @@ function glDrawing(canvas) {
 
 function flatDrawing(canvas) {
   const context = canvas.getContext("2d");
-  const MOST = 20000;
+  const MAX_POINTS = 20000;
   const project = (m, x, y, z) => {
     const w = m[3] * x + m[7] * y + m[11] * z + m[15];
     return [(1 + (m[0] * x + m[4] * y + m[8] * z + m[12]) / w) * canvas.width / 2,
@@ -89,7 +89,7 @@ function flatDrawing(canvas) {
           context.stroke();
           continue;
         }
-        const every = Math.max(1, Math.ceil(n / MOST)), size = (layer.size || 2) * scale;
+        const every = Math.max(1, Math.ceil(n / MAX_POINTS)), size = (layer.size || 2) * scale;
         for (let k = 0; k < n; k += every) {
           const [x, y, w] = at(k);
           if (w <= 0) continue;

@@ -1,4 +1,4 @@
-// Joins the parts: a frame picked in one is shown in all.
+// Connects the parts: a frame picked in one is shown in all.
 const root = document.documentElement;
 root.classList.toggle("dark", matchMedia("(prefers-color-scheme: dark)").matches);
 
@@ -31,6 +31,6 @@ document.getElementById("theme").onclick = () => {
   parts.view.redraw();
   parts.timeline.draw();
 };
-window.spnReport = parts;  // for a look from the console
+window.spnReport = parts;  // for debugging in the console
 root.dataset.drawn = parts.view.kind;
 root.dataset.milliseconds = Math.round(performance.now());

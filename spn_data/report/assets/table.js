@@ -1,4 +1,4 @@
-// All frames, sorted and filtered; only the rows in sight are in the document.
+// Table of all frames, sorted and filtered; only visible rows are in the document.
 
 function makeTable(onPick) {
   const box = document.getElementById("table");
@@ -7,30 +7,30 @@ function makeTable(onPick) {
   const horizontal = i => Math.hypot(frames.gnss_m[3 * i], frames.gnss_m[3 * i + 1]);
   const number = (label, title, width, value, digits) => ({label, title, width, value, digits, number: true});
   const text = (label, title, width, value) => ({label, title, width, value});
-  const axes = given.units === "m" ? ["east", "north", "up"] : ["x", "y", "z"];
+  const axes = report.units === "m" ? ["east", "north", "up"] : ["x", "y", "z"];
   const columns = [
-    text("frame", "name of the image", 175, frames.name),
+    text("frame", "image name", 175, frames.name),
     text("sequence", "", 90, frames.sequence),
-    text("kind", "of the map, or of an evaluation sequence; tracked: not among the chosen frames", 130, kind),
-    number("time, s", "since the sequence's first frame", 85, i => frames.time_s[i], 2),
+    text("kind", "mapping or evaluation; tracked frames are not among the chosen ones", 130, kind),
+    number("time, s", "since the first frame of the sequence", 85, i => frames.time_s[i], 2),
     text("status", "", 85, frames.status),
-    ...axes.map((axis, k) => number(`${axis}, ${unit}`, "of the camera centre", 90, i => frames.center[3 * i + k], 3)),
-    number(`sigma, ${unit}`, "of the position, 1 sigma", 95, i => frames.sigma_m[i], 3),
-    number("sigma, deg", "of the rotation, 1 sigma", 110, i => frames.sigma_deg[i], 3),
-    number("inliers", "map points that the pose rests on", 85, i => frames.inliers[i] || NaN, 0),
-    number("error, px", "root mean square of reprojection errors", 100, i => frames.error_px[i], 2),
-    number("GNSS h, m", "horizontal distance of the GNSS fix", 110, horizontal, 2),
+    ...axes.map((axis, k) => number(`${axis}, ${unit}`, "camera centre", 90, i => frames.center[3 * i + k], 3)),
+    number(`sigma, ${unit}`, "position uncertainty, 1 sigma", 95, i => frames.sigma_m[i], 3),
+    number("sigma, deg", "rotation uncertainty, 1 sigma", 110, i => frames.sigma_deg[i], 3),
+    number("inliers", "map points that support the pose", 85, i => frames.inliers[i] || NaN, 0),
+    number("error, px", "RMS reprojection error", 100, i => frames.error_px[i], 2),
+    number("GNSS h, m", "horizontal distance between GNSS fix and pose", 110, horizontal, 2),
     number("GNSS v, m", "height of the GNSS fix above the pose", 110, i => frames.gnss_m[3 * i + 2], 2),
-    text("coverage", "stratum", 85, frames.stratum),
-    text("split", "group", 100, frames.group),
-    text("reason", "why it has no pose, or was not chosen", 260, frames.reason),
+    text("coverage", "coverage stratum", 85, frames.stratum),
+    text("split", "group of the split", 100, frames.group),
+    text("reason", "why the frame has no pose or was not chosen", 260, frames.reason),
   ].filter(column => rows.some(i => column.number ? Number.isFinite(column.value(i)) : column.value(i) !== ""));
 
   const search = element("input", {type: "search", placeholder: "Search names and reasons", "aria-label": "Search"});
   const choice = (label, values) => {
-    const made = element("select", {"aria-label": label}, element("option", {value: ""}, `${label}: all`));
-    for (const value of [...new Set(values)].sort()) made.append(element("option", {value}, value));
-    return made;
+    const select = element("select", {"aria-label": label}, element("option", {value: ""}, `${label}: all`));
+    for (const value of [...new Set(values)].sort()) select.append(element("option", {value}, value));
+    return select;
   };
   const bySequence = choice("sequence", rows.map(frames.sequence));
   const byStatus = choice("status", rows.map(frames.status));
@@ -48,7 +48,7 @@ function makeTable(onPick) {
   });
   frame.append(table);
   box.append(element("div", {class: "filters"}, search, bySequence, byStatus, byKind, count), frame);
-  if (rows.some(tried)) byStatus.prepend(element("option", {value: "tried"}, "status: a pose was looked for"));
+  if (rows.some(tried)) byStatus.prepend(element("option", {value: "tried"}, "status: pose attempted"));
   byStatus.value = rows.some(tried) ? "tried" : "";
 
   let order = -1, direction = 1, listed = rows, marked = -1;
@@ -69,7 +69,7 @@ function makeTable(onPick) {
       && (!words || frames.name(i).toLowerCase().includes(words) || frames.reason(i).toLowerCase().includes(words)));
     if (order >= 0) {
       const column = columns[order], value = column.value;
-      // What is not known goes to the end, whichever way the rest is sorted.
+      // Unknown values come last in both sort directions.
       listed.sort(column.number
         ? (a, b) => {
           const [p, q] = [value(a), value(b)], [np, nq] = [Number.isNaN(p), Number.isNaN(q)];

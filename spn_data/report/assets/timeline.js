@@ -1,5 +1,5 @@
-// One strip a sequence: a tick for every frame, by time. Chosen frames fill the height, tracked ones the
-// middle, candidates that were not chosen the lower edge.
+// One strip per sequence with a tick for every frame. Chosen frames fill the height, tracked ones the middle,
+// candidates that were not chosen the lower edge.
 
 function makeTimeline(onPick) {
   const box = document.getElementById("timeline");
@@ -26,7 +26,7 @@ function makeTimeline(onPick) {
     box.append(lane);
     lanes.push({canvas, mine, last: last || 1, lane});
     const x = i => 4 + frames.time_s[i] / (last || 1) * (canvas.clientWidth - 8);
-    // The nearest frame; one that was tried counts as nearer than a candidate that was not.
+    // Nearest frame; frames with an attempted pose are preferred to other candidates.
     const find = px => {
       let best = -1, least = 12;
       for (const i of mine) {

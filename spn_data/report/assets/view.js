@@ -1,6 +1,6 @@
-// The 3D view: layers of the map, and a camera that circles about a target.
+// The 3D view: layers of the map, and a camera that orbits a target.
 
-// Lines of one camera: its pyramid, with the image's upper edge doubled by a small mark.
+// Lines of one camera: its pyramid, with a small mark at the upper edge of the image.
 function frustum(out, center, axes, tangents, size) {
   const at = (x, y, z) => [0, 1, 2].map(k => center[k] + size * (axes[0][k] * x + axes[1][k] * y + axes[2][k] * z));
   const [tx, ty] = tangents;
@@ -10,7 +10,7 @@ function frustum(out, center, axes, tangents, size) {
   out.push(...corners[0], ...top, ...top, ...corners[1]);
 }
 
-// Thin lines through the frames of each sequence that have a pose, broken where one has none.
+// Thin lines through the frames of each sequence, interrupted at frames without a pose.
 function path(out, wanted) {
   let before = -1;
   for (let i = 0; i < frames.count; i++) {
@@ -25,7 +25,7 @@ const rows = Array.from({length: frames.count}, (_, i) => i);
 const posed = rows.filter(hasPose);
 const stills = posed.filter(i => !frames.tracked[i]);
 
-// Size of a camera's pyramid: somewhat less than the usual step between neighbours.
+// Size of a camera's pyramid: slightly less than the typical distance between neighbours.
 function usualSize() {
   const steps = [];
   for (let k = 1; k < stills.length; k++) {
@@ -44,14 +44,14 @@ function makeLayers(size) {
   const add = (label, color, layer) => {
     if (layer.xyz.length) made.push({label, color, on: true, ...layer});
   };
-  const tangents = i => given.fov[frames.camera(i)] || [0.6, 0.4];
+  const tangents = i => report.fov[frames.camera(i)] || [0.6, 0.4];
   const cameras = (label, color, wanted) => {
     const xyz = [];
     for (const i of stills) if (wanted(i)) frustum(xyz, centerOf(i), axesOf(i), tangents(i), size);
     add(label, color, {lines: true, xyz: new Float32Array(xyz), rgb: color});
   };
-  if (given.points) {
-    const points = given.points;
+  if (report.points) {
+    const points = report.points;
     add("points", null, {xyz: unpack(points.xyz), step: points.step, rgb: unpack(points.rgb), size: innerWidth < 600 ? 1.4 : 2});
   }
   cameras("mapping cameras", "--mapping", i => !frames.evaluation[i]);
@@ -81,7 +81,7 @@ function makeLayers(size) {
   }
   add("GNSS fixes", "--gnss", {lines: true, xyz: new Float32Array(fixes), rgb: "--gnss"});
   const again = [];
-  for (const [e, n, u, heading, pitch] of given.again) {
+  for (const [e, n, u, heading, pitch] of report.again) {
     const c = shown(e, n, u);
     frustum(again, c, axesOfAngles(heading, pitch), [0.6, 0.4], 1.6 * size);
     again.push(...c, c[0], c[1], floor);
@@ -89,23 +89,23 @@ function makeLayers(size) {
   add("fly again", "--again", {lines: true, xyz: new Float32Array(again), rgb: "--again"});
   const grid = gridLines();
   add(`grid, ${grid.spacing} ${unit}`, "--skipped", {lines: true, xyz: grid.xyz, rgb: "--line"});
-  if (given.units === "m") add("north", "--text", {lines: true, xyz: northLines(), rgb: "--text", });
+  if (report.units === "m") add("north", "--text", {lines: true, xyz: northLines(), rgb: "--text", });
   return made;
 }
 
 const tried = i => hasPose(i) || frames.status(i) === "failed";
 
-// Height of the ground: where few points lie below.
+// Height of the ground: a low percentile of the points.
 const floor = (() => {
-  if (!given.points || !given.points.shown) return posed.length ? Math.min(...stills.map(i => centerOf(i)[2])) : 0;
-  const xyz = unpack(given.points.xyz), z = [];
+  if (!report.points || !report.points.shown) return posed.length ? Math.min(...stills.map(i => centerOf(i)[2])) : 0;
+  const xyz = unpack(report.points.xyz), z = [];
   const every = 3 * Math.max(1, Math.floor(xyz.length / 3 / 5000));
-  for (let k = 2; k < xyz.length; k += every) z.push(xyz[k] * given.points.step);
+  for (let k = 2; k < xyz.length; k += every) z.push(xyz[k] * report.points.step);
   z.sort((a, b) => a - b);
   return z[Math.floor(0.03 * z.length)];
 })();
 
-const half = radius / 1.5;  // of the bulk of the map
+const half = radius / 1.5;  // half extent of the bulk of the map
 
 function gridLines() {
   const spacing = roundDown(half / 4), n = Math.ceil(half / spacing), out = [];
@@ -116,7 +116,7 @@ function gridLines() {
   return {spacing: Number(spacing.toPrecision(3)), xyz: new Float32Array(out)};
 }
 
-// An arrow beyond the grid's northern edge; the letter N is a label over its tip.
+// An arrow beyond the northern edge of the grid; the letter N is a label at its tip.
 const northTip = [0, half * 1.4, floor];
 
 function northLines() {
@@ -135,7 +135,7 @@ function makeView(onPick) {
   const canvas = document.getElementById("view");
   const drawing = glDrawing(canvas) || flatDrawing(canvas);
   if (drawing.kind === "2d")
-    document.getElementById("fallback").textContent = " This browser has no WebGL: drawn simply, with fewer points.";
+    document.getElementById("fallback").textContent = " This browser has no WebGL: simplified drawing with fewer points.";
   const FOV = 45 * Math.PI / 180;
   const home = () => ({yaw: 0.45, pitch: 0.6, target: [0, 0, floor / 2], distance: fit()});
   const eye = {};
@@ -181,7 +181,7 @@ function makeView(onPick) {
 
   function legend() {
     const box = document.getElementById("legend");
-    box.replaceChildren(element("summary", {}, "Shown"));
+    box.replaceChildren(element("summary", {}, "Layers"));
     for (const layer of layers) {
       const tick = element("input", {type: "checkbox"});
       tick.checked = layer.on;
@@ -194,8 +194,8 @@ function makeView(onPick) {
       made.onclick = () => { act(); redraw(); };
       return made;
     };
-    box.append(element("div", {}, button("Reset", "Back to the first view", () => reset()), " ",
-      button("Top", "From above, north up", () => reset(Math.PI / 2)), " ",
+    box.append(element("div", {}, button("Reset", "Reset the view", () => reset()), " ",
+      button("Top", "View from above, north up", () => reset(Math.PI / 2)), " ",
       button("\u2212", "Smaller cameras", () => resize(0.7)), " ", button("+", "Larger cameras", () => resize(1.4))));
   }
 
@@ -213,7 +213,7 @@ function makeView(onPick) {
     mark = null;
     if (i >= 0 && hasPose(i)) {
       const xyz = [];
-      frustum(xyz, centerOf(i), axesOf(i), given.fov[frames.camera(i)] || [0.6, 0.4], 2 * size);
+      frustum(xyz, centerOf(i), axesOf(i), report.fov[frames.camera(i)] || [0.6, 0.4], 2 * size);
       mark = {lines: true, xyz: new Float32Array(xyz), rgb: "--picked"};
       if (center) eye.target = centerOf(i);
     }
@@ -274,7 +274,7 @@ function makeView(onPick) {
   });
   canvas.addEventListener("contextmenu", event => event.preventDefault());
   canvas.addEventListener("wheel", event => {
-    if (document.activeElement !== canvas) return;  // else the page could not be scrolled past the view
+    if (document.activeElement !== canvas) return;  // otherwise the page could not be scrolled past the view
     event.preventDefault();
     zoom(Math.exp(event.deltaY * 0.001));
     redraw();
@@ -289,7 +289,7 @@ function makeView(onPick) {
   });
   new ResizeObserver(redraw).observe(canvas);
   reset();
-  document.getElementById("legend").open = canvas.clientWidth > 500;  // on a phone it would hide the map
+  document.getElementById("legend").open = canvas.clientWidth > 500;  // it would hide the map on a phone
   legend();
   draw();
   return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas};

@@ -14,7 +14,7 @@ from spn_data.report.data import CoverageFacts, FrameTable, ReportData, StageFac
 from spn_data.report.html import render
 from spn_data.report.pack import pack, script_json
 from spn_data.report.residual_map import residual_map, round_down
-from spn_data.report.scene import display_of, thin
+from spn_data.report.scene import display_of, thin_points
 from spn_data.report.thinning import thin_frames
 from spn_data.report.verdict import Level, VerdictLimits, verdict
 from spn_data.split import audit
@@ -79,31 +79,35 @@ def audited(verdict_: audit.AuditVerdict) -> tuple[audit.AuditFinding, ...]:
     return (audit.AuditFinding("guard gap", verdict_, "frames lie within 2 s", ("a is near b",)),)
 
 
-STALE = (StageFacts(record("3-geo"), "2-model was made anew since", "spn-data georegister"),)
+STALE = (StageFacts(record("3-geo"), "2-model was redone since", "spn-data georegister"),)
 LOW = CoverageFacts({"medium": {"high": 20, "medium": 5, "low": 15, "failed": 0}}, (), "")
 RULES = {
     "no model": (lambda d: replace(d, model_record=None), Level.STOP, "There is no model"),
     "stale": (lambda d: replace(d, stages=STALE), Level.STOP, "3-geo is out of date: 2-model was"),
     "map has holes": (lambda d: with_counts(d, registered=140), Level.CAUTION, "140 of 150"),
     "map is a ruin": (lambda d: with_counts(d, registered=118), Level.STOP, "118 of 150"),
-    "blur": (lambda d: with_counts(d, mean_error_px=1.2), Level.CAUTION, "1.20 px, more than 1 px"),
+    "blur": (
+        lambda d: with_counts(d, mean_error_px=1.2),
+        Level.CAUTION,
+        "1.20 px, more than 1 px; likely causes",
+    ),
     "rolling shutter": (
         lambda d: with_counts(d, shutter=[{"sequence": "flight1", "rolls": True}]),
         Level.CAUTION,
-        "rolling shutter shows in flight1",
+        "Rolling shutter affects flight1",
     ),
     "no metres": (lambda d: replace(d, geo=None, units="model"), Level.CAUTION, "not metres"),
-    "heading": (unsure_of_heading, Level.CAUTION, "heading is known to 3.5 deg"),
-    "few fixes": (worse_on_unseen_fixes, Level.CAUTION, "not seen lie 0.90 m away"),
+    "heading": (unsure_of_heading, Level.CAUTION, "uncertain: heading 3.5 deg"),
+    "few fixes": (worse_on_unseen_fixes, Level.CAUTION, "is 0.90 m for held-out GNSS fixes"),
     "evaluation fails": (
         lambda d: replace(d, frames=of_evaluation(40)),
         Level.STOP,
-        "0 of 40 frames have a pose (0%). It is of another place",
+        "0 of 40 frames have a pose (0%). It shows another place",
     ),
     "evaluation says little": (
         lambda d: replace(d, frames=of_evaluation(21)),
         Level.CAUTION,
-        "a test on so few says little",
+        "a test on so few frames is hardly meaningful",
     ),
     "evaluation has holes": (
         lambda d: replace(d, frames=of_evaluation(5)),
@@ -113,7 +117,7 @@ RULES = {
     "coverage unknown": (lambda d: replace(d, coverage=None), Level.CAUTION, "is not known"),
     "coverage stale": (
         lambda d: replace(
-            d, coverage=replace(d.coverage, stale="4-eval/medium was made anew since")
+            d, coverage=replace(d.coverage, stale="4-eval/medium was redone since")
         ),
         Level.CAUTION,
         "Coverage is out of date: 4-eval/medium",
@@ -121,12 +125,12 @@ RULES = {
     "coverage low": (
         lambda d: replace(d, coverage=LOW),
         Level.CAUTION,
-        "38% of sequence medium are views",
+        "38% of the views of sequence medium have no mapping frame nearby",
     ),
     "no split": (lambda d: replace(d, split=None, audit=None), Level.STOP, "are not split"),
-    "nothing to train on": (nothing_to_train_on, Level.STOP, "No frame is left"),
-    "optimistic": (optimistic, Level.CAUTION, "same flight as training: optimistic"),
-    "not audited": (lambda d: replace(d, audit=None), Level.STOP, "is not checked"),
+    "nothing to train on": (nothing_to_train_on, Level.STOP, "No training frames are left"),
+    "optimistic": (optimistic, Level.CAUTION, "so test results are optimistic"),
+    "not audited": (lambda d: replace(d, audit=None), Level.STOP, "has not been audited"),
     "audit failed": (
         lambda d: replace(d, audit=audited(audit.AuditVerdict.FAIL)),
         Level.STOP,
@@ -140,7 +144,7 @@ RULES = {
     "plan": (
         lambda d: replace(d, plan=CoverageFacts({"waypoints": {"high": 1, "low": 3}}, (), "")),
         Level.CAUTION,
-        "75% of the planned waypoints are views",
+        "75% of the views of the planned waypoints have no mapping frame nearby",
     ),
     "plan stale": (
         lambda d: replace(d, plan=CoverageFacts({"waypoints": {"high": 1}}, (), "", "x is gone")),
@@ -164,7 +168,7 @@ RULES = {
             },
         ),
         Level.CAUTION,
-        "own GNSS of medium, not used for its labels, lies 6.7 m beside and +0.5 m above them",
+        "GNSS of medium, not used for its labels, deviates from them by 6.7 m horizontally and +0.5 m",
     ),
 }
 
@@ -181,10 +185,10 @@ def test_each_rule_of_the_verdict(name):
 
 
 def test_few_training_frames_are_a_reservation():
-    """93 frames to train on are fewer than 100; 143 are not."""
+    """93 training frames are fewer than 100; 143 are not."""
     found = verdict(area(cameras=100))
     assert found.headline == "Ready to train, with 1 reservation"
-    assert "93 frames to train on" in found.findings[0].text
+    assert "93 training frames" in found.findings[0].text
     assert verdict(area(cameras=150)).level is Level.GOOD
 
 
@@ -357,7 +361,7 @@ def test_points_are_thinned_and_the_page_says_so():
     far[0] = [1e6, 0, 0]
     data = replace(data, points=replace(data.points, xyz=far))
     display = display_of(data.frames, data.points, has_up=True)
-    rows, left_out = thin(data.points, display, 1000)
+    rows, left_out = thin_points(data.points, display, 1000)
     assert (len(rows), left_out, 0 in rows) == (1000, 1, False)
     assert "1,000 of 4,000 points are shown" in render(data, max_points=1000)
 
@@ -420,8 +424,8 @@ def test_one_outlier_does_not_fill_the_map_of_residuals():
     residuals = frames.gnss_m.copy()
     residuals[7] = [500.0, 0, 0]
     usual, with_outlier = residual_map(frames), residual_map(replace(frames, gnss_m=residuals))
-    assert "are cut there" in with_outlier
-    assert "are cut there" not in usual
+    assert "are truncated" in with_outlier
+    assert "are truncated" not in usual
     times = re.findall(r"([\d.]+) times longer", usual + with_outlier)
     assert times[0] == times[1]
     assert 'class="outlier"' in with_outlier

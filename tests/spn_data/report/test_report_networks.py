@@ -89,14 +89,14 @@ def test_networks_stand_beside_what_needs_none(root):
 def test_a_short_training_is_called_short(root):
     """Forty images are no training to judge a kind of network by, and the page says so."""
     shown = page(root)
-    assert "A short training: first (40 images), second (40 images)." in shown
+    assert "Short training: first (40 images), second (40 images)." in shown
     table = shown[shown.index('class="trained"') : shown.index("</table>")]
     (first, _) = re.findall(r"<tr><td>(.*?)</td></tr>", table)
     titles = re.findall(r"<th>(.*?)</th>", table)
     told = dict(zip(titles, first.split("</td><td>"), strict=True))
-    assert told["trained for"] == told["kept after"] == "0.1 min"
+    assert told["training time"] == told["best after"] == "0.1 min"
     assert told["images seen"] == "40"
-    assert told["a pose takes"].endswith(" ms")
+    assert told["time per pose"].endswith(" ms")
 
 
 def test_figures_are_images_and_nothing_else(root):
@@ -116,12 +116,12 @@ def test_figures_are_images_and_nothing_else(root):
 def test_what_was_judged_on_other_frames_is_told(root):
     """After another split, or another training, the page does not pass old figures off as today's."""
     write_judged(root / "5-split" / "dataset.h5", {"train": 9, "medium": 4})
-    assert "earlier data set than the area holds now: first, second." in page(root)
+    assert "earlier dataset than the current one: first, second." in page(root)
     write_network(root / "runs/first/checkpoint.safetensors", root / "5-split/dataset.h5", seed=7)
     shown = page(root)
-    assert "first: trained since it was judged" in shown
-    assert "compared: trained since it was judged" in shown
-    assert "second: trained since it was judged" not in shown
+    assert "first: trained further since its evaluation" in shown
+    assert "compared: trained further since its evaluation" in shown
+    assert "second: trained further since its evaluation" not in shown
     assert "Figures of <b>second</b>" in shown
     assert "Figures of <b>first</b>" not in shown
 
@@ -217,7 +217,7 @@ def test_figures_that_are_none_of_ours_are_left_out(root):
     (folder / "page.svg").write_text("<html><svg viewBox='0 0 9 9'>")
     (folder / "large.svg").write_bytes(b'<svg viewBox="0 0 9 9">' + b" " * 3_000_001)
     shown = page(root)
-    assert "3 figures are left out: too large, or no figures." in shown
+    assert "3 figures are omitted: too large or not readable as SVG." in shown
     assert len(IMAGE.findall(shown)) == before
 
 
