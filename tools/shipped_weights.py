@@ -1,9 +1,9 @@
-"""Make the weights that the package ships: SqueezeNet 1.1's features as float16.
+"""Create the weights shipped with the package: the features of SqueezeNet 1.1 as float16.
 
     python tools/shipped_weights.py squeezenet1_1-imagenet.safetensors
 
-reads the whole network in torchvision's names, leaves its classifier out, rounds, and writes
-spn_model/pretrained/squeezenet1_1-features.safetensors. Prints the file's hash, which stands in
+reads the whole network with torchvision's names, drops its classifier, rounds, and writes
+spn_model/pretrained/squeezenet1_1-features.safetensors. It prints the hash of the file, which is recorded in
 spn_model/pretrained/weights.py. The same input gives the same bytes.
 """
 
@@ -23,7 +23,7 @@ ABOUT = "SqueezeNet 1.1 features, ImageNet, rounded to float16; "
 
 
 def shipped(source: Path) -> bytes:
-    """The file's content."""
+    """Return the content of the file to ship."""
     with safe_open(source, "pt") as file:
         names = [name for name in sorted(file.keys()) if name.startswith("features.")]
         tensors = {name: file.get_tensor(name).to(torch.float16) for name in names}
@@ -32,6 +32,7 @@ def shipped(source: Path) -> bytes:
 
 
 def main() -> None:
+    """Write the file and print its hash."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

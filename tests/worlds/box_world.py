@@ -1,4 +1,4 @@
-"""A painted hall seen from inside: exact images, depths and points, for networks that learn a scene."""
+"""Painted hall seen from inside, with exact images, depths and points, for networks that learn a scene."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, rotations_from_angles
 
 CAMERA = Camera("SIMPLE_PINHOLE", 320, 180, np.array([230.0, 160.0, 90.0]))
-SIZE_M = np.array([20.0, 16.0, 9.0])  # the hall reaches from 0 to here
+SIZE_M = np.array([20.0, 16.0, 9.0])  # the hall extends from 0 to here
 TEXELS_PER_M = 24.0
 
 
 def painting(face: int) -> np.ndarray:
-    """(H, W, 3) uint8: coloured blobs of all sizes, which nowhere repeat; one a face."""
+    """Paint a face (H, W, 3) uint8 with coloured blobs of all sizes that repeat nowhere."""
     u, v = (axis for axis in range(3) if axis != face // 2)
     shape = np.ceil(SIZE_M[[v, u]] * TEXELS_PER_M).astype(int) + 2
     rng = np.random.default_rng(face)
@@ -33,7 +33,7 @@ PAINTINGS = [painting(face) for face in range(6)]
 
 
 def seen_by(pose: Poses, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
-    """Image (H, W, 3) uint8, and the point (H, W, 3) that each pixel's middle shows."""
+    """Render the image (H, W, 3) uint8 of a pose, and the world point (H, W, 3) at each pixel centre."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     rays = np.column_stack([camera.unproject(pixels), np.ones(len(pixels))]) @ pose.rotations[0]
@@ -48,7 +48,7 @@ def seen_by(pose: Poses, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarra
         u, v = (k for k in range(3) if k != face // 2)
         at = (points[here][:, [u, v]] * TEXELS_PER_M).astype(np.float32)
         if len(at):
-            # cv2 takes maps of less than 32767 rows: as an image.
+            # cv2.remap is limited to maps with fewer than 32767 rows, so the list is folded to a square.
             side = int(np.ceil(np.sqrt(len(at))))
             maps = np.resize(at, (side, side, 2))
             image[here] = cv2.remap(paint, maps, None, cv2.INTER_LINEAR).reshape(-1, 3)[: len(at)]
@@ -57,13 +57,14 @@ def seen_by(pose: Poses, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarra
 
 
 def place(rng: np.random.Generator) -> Poses:
-    """Somewhere in the southern half, looking north and down."""
+    """Draw a pose in the southern half that looks north and down."""
     center = rng.uniform([5, 1, 3], [15, 4, 6])
     angles = rng.uniform([-25, -35, -5], [25, -15, 5])
     return Poses.from_rotations(center[None], rotations_from_angles(angles[None]))
 
 
 def frame(group: str, k: int, points: int) -> DatasetFrame:
+    """Render frame k of a group, with `points` observed points."""
     rng = np.random.default_rng([k, *group.encode()])
     pose = place(rng)
     image, shown = seen_by(pose)
@@ -84,7 +85,7 @@ def frame(group: str, k: int, points: int) -> DatasetFrame:
 
 
 def write_box(path: Path, *, train: int, validation: int = 0, points: int = 900) -> Path:
-    """A data set of the hall at a path, which is returned."""
+    """Write a dataset of the hall to a path, which is returned."""
     info = DatasetInfo(units="m", origin=None, up_is_known=True, camera=CAMERA)
     roles = {"train": Role.TRAIN, "validation": Role.VALIDATION}
     with DatasetWriter(path, info, roles) as writer:

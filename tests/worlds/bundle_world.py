@@ -1,4 +1,4 @@
-"""A network that knows four views of the painted hall by heart, as a bundle for the drone."""
+"""Network overfitted to four views of the painted hall, for bundles that run on a drone."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.training.precision import bfloat16_is_fast
 
 STEPS = 100
-# A lens with distortion that sees a little more than the data set's camera.
+# A lens with distortion and a slightly wider field of view than the dataset's camera.
 LENS = Camera("OPENCV", 640, 360, np.array([425.0, 428.0, 322.0, 178.0, -0.06, 0.02, 1e-3, -5e-4]))
-_AS_THEY_ARE = {
+_NO_AUGMENTATION = {
     **{"tilt_deg": 0, "roll_deg": 0, "zoom_min": 1, "zoom_max": 1},
     **{"size_min": 1, "size_max": 1, "ramp_share": 0, "look": False},
 }
 
 
 def learnt(dataset: Path) -> Checkpoint:
-    """A scene-coordinate network after 100 steps on the data set's training images, as they are."""
+    """Train a scene-coordinate network for 100 steps on the training images without augmentation."""
     with Dataset(dataset) as data:
         training, view = TrainingSet(data.groups["train"]), view_of(data)
     model = SceneCoordinatesModel.make({"shrink": 2}, seed=0)
     model.load_pretrained(model.weights_name)
     model.fit(training)
-    model.begin_stage(_AS_THEY_ARE, training)
+    model.begin_stage(_NO_AUGMENTATION, training)
     model.bfloat16 = bfloat16_is_fast("cpu")
     optimizer = torch.optim.AdamW([{**group, "lr": 0.0} for group in model.parameter_groups()])
     generator, rows = np.random.default_rng(0), np.arange(len(training))

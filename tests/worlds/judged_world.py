@@ -1,4 +1,4 @@
-"""The coloured field with evaluation flights, and checkpoints of small networks that were fitted to it."""
+"""Coloured field with evaluation flights, and checkpoints of small networks fitted to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROLES = {
 
 
 def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: Any) -> Path:
-    """A data set with two evaluation flights; medium's frames are of two strata. changes : of DatasetInfo."""
+    """Write a dataset with two evaluation flights, one with two strata. changes : to DatasetInfo."""
     info: DatasetInfo = replace(INFO, **changes)
     wanted = counts or {"train": 12, "validation": 3, "medium": 7, "low": 4}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: An
 
 
 def write_network(path: Path, dataset: Path, seed: int = 0, **options: Any) -> Checkpoint:
-    """A network of the kind tiny, whose targets are those of the data set and whose weights are drawn."""
+    """Write a network of kind tiny with random weights, scaled to the poses of the dataset."""
     model = make("tiny", options, seed=seed)
     with Dataset(dataset) as data:
         model.fit(TrainingSet(data.groups["train"]))

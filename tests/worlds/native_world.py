@@ -1,4 +1,4 @@
-"""COLMAP models made of exact cameras, poses, points and measurements."""
+"""COLMAP models built from exact cameras, poses, points and measurements."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def native_model(
     pixels: Sequence[np.ndarray],
     points: Iterable[tuple[np.ndarray, Iterable[tuple[int, int]]]],
 ) -> pycolmap.Reconstruction:
-    """A model of N images, whose ids count from one, all posed.
+    """Build a model of N images with poses; image ids count from one.
 
-    pixels : N arrays (K, 2); points : position (3,) and track of each, in pairs of the image's and the
-    measurement's row.
+    pixels : N arrays (K, 2). points : position (3,) and track of each point, as pairs of the rows of image
+    and measurement.
     """
     model = pycolmap.Reconstruction()
     for camera_id, camera in cameras.items():

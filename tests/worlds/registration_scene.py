@@ -1,4 +1,4 @@
-"""A flight along a facade whose window columns all look the same: exact poses, pixels and matches."""
+"""Flight along a facade whose window columns look identical, with exact poses, pixels and matches."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from spn_data.registration.tracks import find_tracks
 
 PITCH_M = 2.0  # between window columns
 COLUMNS = 12
-A_COLUMN = 30  # points of one
+A_COLUMN = 30  # points per column
 LENS = Camera("RADIAL", 320, 240, np.array([280.0, 160.0, 120.0, -0.05, 0.01]))
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """N frames. points : (P, 3), column by column; shows : N arrays (K,), the point of each feature."""
+    """N frames. points : (P, 3), column by column. shows : N arrays (K,), the point of each feature."""
 
     poses: Poses
     points: np.ndarray
@@ -29,7 +29,7 @@ class Flight:
 
     @property
     def pairs(self) -> dict[tuple[int, int], np.ndarray]:
-        """Right matches (K, 2) of each frame with the next three."""
+        """Correct matches (K, 2) of each frame with the next three."""
         n = len(self.shows)
         found = {}
         for i in range(n):
@@ -39,7 +39,7 @@ class Flight:
         return found
 
     def matched(self, columns_off: Mapping[int, int] | None = None) -> list[np.ndarray]:
-        """Matches of each frame with the map; frames named in `columns_off` see them so many columns on."""
+        """Match each frame with the map, shifted by whole columns for the frames in `columns_off`."""
         found = []
         for row, shows in enumerate(self.shows):
             point = shows + A_COLUMN * (columns_off or {}).get(row, 0)
@@ -48,12 +48,13 @@ class Flight:
         return found
 
     def sequence(self, putative: list[np.ndarray]) -> UnsolvedSequence:
+        """Return the flight as a sequence to register, with putative matches with the map."""
         tracks = find_tracks(self.pairs, [len(p) for p in self.pixels])
         return UnsolvedSequence(self.pixels, putative, tracks, self.points)
 
 
 def flight(frames: int = 8, *, noise_px: float = 0.3, seed: int = 5) -> Flight:
-    """One metre a frame along the facade, eight metres from it."""
+    """Simulate a flight of one metre per frame along the facade, eight metres from it."""
     rng = np.random.default_rng(seed)
     column = rng.uniform([0, 0, 0], [PITCH_M, 1.5, 6], (A_COLUMN, 3))
     points = np.concatenate([column + np.array([PITCH_M * c, 0, 0]) for c in range(COLUMNS)])

@@ -1,4 +1,4 @@
-"""A made-up area for the tests of the report: a circular flight over a field, another above it."""
+"""Made-up area for the tests of the report: a circular flight over a field, and another one above it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spn_data.storage.stage_record import StageRecord
 def flight(
     name: str, count: int, *, radius_m: float, height_m: float, failed: int = 0
 ) -> FrameTable:
-    """A circle flown looking inwards; the last `failed` frames have no pose."""
+    """Fly a circle looking inwards; the last `failed` frames have no pose."""
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
     centers = np.column_stack(
         [radius_m * np.cos(turn), radius_m * np.sin(turn), np.full(count, height_m)]
@@ -58,6 +58,7 @@ def flight(
 
 
 def record(stage: str, **counts: object) -> StageRecord:
+    """Return a plausible record of a stage."""
     return StageRecord(
         stage=stage,
         options={"seed": 0, "fit": {"heights": "auto"}},
@@ -72,7 +73,7 @@ def record(stage: str, **counts: object) -> StageRecord:
 
 
 def geo_fit(n: int) -> GeoFit:
-    """A georegistration of N frames with plausible figures."""
+    """Return a georegistration of N frames with plausible figures."""
     held_out = HeldOut(3, n, 0.5, 0.4, 0.6, 0.5)
     return GeoFit(
         world_from_model=Similarity.identity(),
@@ -93,7 +94,7 @@ def geo_fit(n: int) -> GeoFit:
 
 
 def points(count: int) -> MapPoints:
-    """A field with a wall along its northern edge."""
+    """Sample map points on a field with a wall along its northern edge."""
     rng = np.random.default_rng(0)
     xyz = rng.uniform([-40, -40, 0], [40, 40, 0.3], (count, 3))
     xyz[: count // 4, 1:] = rng.uniform([39, 0], [40, 12], (count // 4, 2))
@@ -106,7 +107,7 @@ def points(count: int) -> MapPoints:
 
 
 def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
-    """An area of which everything is there, and ready to train."""
+    """Return a complete area that is ready to train on."""
     mapping = flight("flight1", cameras, radius_m=30, height_m=10)
     test = flight("medium", 40, radius_m=25, height_m=14, failed=2)
     frames = FrameTable.concatenate([mapping, test])
@@ -151,6 +152,6 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
 
 
 def unpack(packed: dict[str, str]) -> np.ndarray:
-    """What `pack` was given, flattened and rounded to its kind; as the page's script reads it."""
+    """Invert `pack` like the page's script: the array, flattened and rounded to its kind."""
     kinds = {"f4": "<f4", "i2": "<i2", "i4": "<i4", "u1": "|u1"}
     return np.frombuffer(base64.b64decode(packed["base64"]), dtype=kinds[packed["kind"]])

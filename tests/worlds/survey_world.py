@@ -1,4 +1,4 @@
-"""Surveys that look down from one height, with exact truth, and bent as mapping leaves them."""
+"""Nadir surveys from one height, with exact truth, and with the doming that mapping leaves."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _CAMERA = Camera("RADIAL", 960, 540, np.array([660.0, 480.0, 270.0, -0.05, 0.015
 def survey(
     sag_m: float, wrong: int = 0, lines: int = 4
 ) -> tuple[pycolmap.Reconstruction, np.ndarray]:
-    """A model of 40 images a line that look down, its ends lifted by `sag_m`, and the true positions.
+    """Build a model of 40 nadir images per line with its ends lifted by `sag_m`, and the true positions.
 
-    wrong : of the measurements, anywhere in the image. The others deviate by 0.3 pixels.
+    wrong : number of measurements placed anywhere in the image. The others have 0.3 pixels of noise.
     """
     rng = np.random.default_rng(0)
     length, width = PER_LINE * STEP_M, lines * APART_M
@@ -61,7 +61,7 @@ def survey(
 
 
 def error_m(model: pycolmap.Reconstruction, centers: np.ndarray) -> float:
-    """Median over the images, after the best similarity."""
+    """Return the median position error of the images after alignment by the best similarity."""
     scene = scene_of(model)
     rows = [int(name[:3]) for name in scene.names]
     found = scene.poses.centers

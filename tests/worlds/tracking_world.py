@@ -1,4 +1,4 @@
-"""A small world of a ground and a wall, rendered along a flight, of which some frames are labelled."""
+"""Small world of a ground and a wall, rendered along a flight with some labelled frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TEXELS_PER_M = 24
 
 
 def path() -> Poses:
-    """10 fps past a wall 11 m away, 4 m above the ground, turning and nodding; not at constant velocity."""
+    """Fly past a wall 11 m away at 10 fps, 4 m above the ground, with varying velocity, heading and pitch."""
     t = np.arange(N) / 10
     centers = np.stack([-2 + 1.6 * t + 0.3 * t**2, 4 - 0.5 * t, 4 + 0.4 * np.sin(2 * t)], axis=1)
     angles = np.stack([-8 + 6 * t + 3 * t**2, -14 + 3 * np.sin(2 * t), np.sin(3 * t)], axis=1)
@@ -32,7 +32,7 @@ def path() -> Poses:
 
 
 def texture() -> np.ndarray:
-    """Blobs of several sizes, which do not repeat."""
+    """Paint blobs of several sizes that do not repeat."""
     rng = np.random.default_rng(5)
     image = np.zeros((1536, 1536), np.float32)
     for size in (1, 3, 9):
@@ -45,7 +45,7 @@ TEXTURE = texture()
 
 
 def surfaces(rays: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Where rays (K, 3) from a centre meet the ground (up 0) or the wall (north 15 m)."""
+    """Intersect rays (K, 3) from a centre with the ground (up 0) or the wall (north 15 m)."""
     with np.errstate(divide="ignore"):
         to_ground = np.where(rays[:, 2] < 0, -center[2] / rays[:, 2], np.inf)
         to_wall = np.where(rays[:, 1] > 0, (WALL_NORTH_M - center[1]) / rays[:, 1], np.inf)
@@ -53,15 +53,16 @@ def surfaces(rays: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def rays_of(pixels: np.ndarray, pose: Poses) -> np.ndarray:
+    """Return the viewing rays (K, 3) of pixels (K, 2) in the world frame."""
     xy = CAMERA.unproject(pixels)
     return np.column_stack([xy, np.ones(len(xy))]) @ pose.rotations[0]
 
 
 def render(pose: Poses) -> np.ndarray:
-    """Grey image (270, 480)."""
+    """Render the grey image (270, 480) of a pose."""
     x, y = np.meshgrid(np.arange(480) + 0.5, np.arange(270) + 0.5)
     hit = surfaces(rays_of(np.column_stack([x.ravel(), y.ravel()]), pose), pose.centers[0])
-    # The ground goes on behind the wall's foot, so that the texture has no seam there.
+    # The wall continues the texture of the ground, so that there is no seam at its foot.
     along = np.where(hit[:, 2] > 1e-9, WALL_NORTH_M + hit[:, 2], hit[:, 1])
     u, v = (hit[:, 0] + 30) * TEXELS_PER_M, along * TEXELS_PER_M
     maps = [m.reshape(270, 480).astype(np.float32) for m in (u, v)]
@@ -69,7 +70,7 @@ def render(pose: Poses) -> np.ndarray:
 
 
 def map_points(poses: Poses) -> MapPoints:
-    """What a grid of pixels of the labelled frames sees."""
+    """Return the world points seen at a grid of pixels of the labelled frames."""
     x, y = np.meshgrid(np.arange(12, 480, 24.0), np.arange(12, 270, 24.0))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     xyz = np.concatenate(
@@ -81,13 +82,14 @@ def map_points(poses: Poses) -> MapPoints:
 
 
 def visible(points: MapPoints, pose: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """(ids, pixels) of the points inside the image."""
+    """Return ids and pixels of the points inside the image."""
     pixels = CAMERA.project((points.xyz - pose.centers[0]) @ pose.rotations[0].T)
     inside = np.all((pixels > 12) & (pixels < [468, 258]), axis=1)
     return points.ids[inside], pixels[inside]
 
 
 def table(names: list[str], sources: list[str], video_frame: list[int]) -> Frames:
+    """Return a frame table of one sequence at 10 fps, without telemetry."""
     n = len(names)
     nan = np.full(n, np.nan)
     return Frames(
@@ -112,6 +114,7 @@ def table(names: list[str], sources: list[str], video_frame: list[int]) -> Frame
 
 
 def labels_of(frames: Frames, rows: tuple[int, ...], poses: Poses) -> Labels:
+    """Label some rows of a frame table with their exact poses."""
     n = len(rows)
     chosen = frames.select(np.array(rows))
     return Labels(
@@ -133,7 +136,7 @@ def labels_of(frames: Frames, rows: tuple[int, ...], poses: Poses) -> Labels:
 
 
 class World:
-    """A flight in two files, four of its frames labelled."""
+    """A flight in two video files with four labelled frames."""
 
     def __init__(self, folder: Path) -> None:
         self.poses = path()
@@ -159,15 +162,17 @@ class World:
 
     @property
     def sequence(self) -> SequenceToLabel:
+        """The flight as a sequence to be labelled by tracking."""
         return SequenceToLabel(self.frames, self.labelled, self.seen, {"f": CAMERA}, self.points)
 
     def anchor(self, k: int) -> Anchor:
+        """Return labelled frame k as an anchor."""
         ids, pixels = self.seen.of_frame(LABELLED.index(k))
         xyz = self.points.xyz[self.points.rows_of(ids)]
         return Anchor(k / 10, self.grays[k], self.poses[k : k + 1], ids, xyz, pixels)
 
     def segment(self, first: int, last: int) -> Segment:
-        """The frames between two labelled ones."""
+        """Return the segment of frames between two labelled ones."""
         rows = np.arange(first + 1, last)
         anchors = [self.anchor(first), self.anchor(last)]
         return Segment(rows, rows / 10, [self.grays[k] for k in rows], CAMERA, anchors)

@@ -1,4 +1,4 @@
-"""A coloured field seen from straight above, and a small network that tells where from the colours."""
+"""Coloured field seen from straight above, and a small network that locates images by their colours."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ONE_THREAD = TrainOptions(seed=5, threads=1, device="cpu", precision="float32", 
 
 
 def field_image() -> np.ndarray:
-    """(400, 400, 3) uint8: red grows eastwards, green northwards, blue blobs do not repeat."""
+    """Paint the field (400, 400, 3) uint8: red grows eastwards, green northwards; blue blobs never repeat."""
     y, x = np.mgrid[0:400, 0:400] / 400.0
     noise = np.random.default_rng(5).standard_normal((400, 400)).astype(np.float32)
     blobs = cv2.GaussianBlur(noise, (0, 0), 9)
@@ -48,7 +48,7 @@ def field_image() -> np.ndarray:
 
 
 def frame(group: str, k: int) -> DatasetFrame:
-    """Seen from a place of its own, north up in the image, with four points of the ground."""
+    """Render frame k of a group from a random position, north up in the image, with four ground points."""
     rng = np.random.default_rng([k, *group.encode()])
     east, north = rng.uniform(-36, 36, 2)
     yaw = rng.uniform(-0.2, 0.2)
@@ -77,7 +77,7 @@ def frame(group: str, k: int) -> DatasetFrame:
 
 
 def write_field(path: Path, train: int = 24, validation: int = 6) -> Path:
-    """A data set of the field at a path, which is returned."""
+    """Write a dataset of the field to a path, which is returned."""
     roles = {"train": Role.TRAIN, "validation": Role.VALIDATION}
     with DatasetWriter(path, INFO, roles) as writer:
         for group, count in (("train", train), ("validation", validation)):
@@ -87,7 +87,7 @@ def write_field(path: Path, train: int = 24, validation: int = 6) -> Path:
 
 
 class TinyNet(nn.Module):
-    """Images (B, 3, H, W) in 0..1 -> (B, 7): position in the scale of the training poses, quaternion."""
+    """Network from images (B, 3, H, W) in 0..1 to (B, 7): scaled position and quaternion."""
 
     center: Tensor
     scale: Tensor
@@ -109,7 +109,7 @@ class TinyNet(nn.Module):
 
 
 class TinyModel(PoseModel):
-    """A real regression, small enough for tests."""
+    """Pose regression small enough for tests."""
 
     kind: ClassVar[str] = "tiny"
     weights_name = ""
@@ -164,7 +164,7 @@ class TinyModel(PoseModel):
     ) -> Batch:
         gain = 1 + self._brightness * generator.standard_normal((len(rows), 1, 1, 1))
         images = np.stack([data.image(int(row)) for row in rows]) / 255 * gain
-        if progress >= self._sick_at:  # what a broken camera or overflow would make of it
+        if progress >= self._sick_at:  # simulates a broken camera or an overflow
             images = images * np.nan
         return {
             "images": torch.from_numpy(images.astype(np.float32)).permute(0, 3, 1, 2),
@@ -196,12 +196,12 @@ class TinyModel(PoseModel):
 
 
 def register_tiny() -> None:
-    """Let recipes and checkpoints of this process know the kind."""
+    """Register the kind for recipes and checkpoints of this process."""
     registry.KINDS["tiny"] = (__name__, "TinyModel")
 
 
 class Follower:
-    """Keeps the rows; wants a stop after some steps."""
+    """Follower of a training that keeps the log rows and requests a stop after some steps."""
 
     def __init__(self, stop_after: int = 10**9):
         self.rows: list[Mapping[str, Any]] = []
@@ -216,15 +216,18 @@ class Follower:
 
 
 def files(folder: Path) -> Files:
+    """Return the files of a training in a folder, which is created."""
     folder.mkdir(exist_ok=True)
     names = ("checkpoint.safetensors", "last.safetensors", "state.safetensors", "log.csv")
     return Files(*(folder / name for name in names))
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
+    """Return the weights of a checkpoint."""
     return load(path).model.network.state_dict()
 
 
 def log(folder: Path) -> list[dict[str, str]]:
+    """Read the rows of a training's log."""
     with (folder / "log.csv").open(newline="") as file:
         return list(csv.DictReader(file))
