@@ -1,12 +1,12 @@
-"""The only package that knows pycolmap: database, verification, mapping, model files.
+"""The only package that uses pycolmap: database, verification, mapping, bundle adjustment, model files.
 
-Import pycolmap from here: cv2 must load before it, else writing a PNG aborts the process.
+Import pycolmap from here: cv2 must be loaded before it, otherwise writing a PNG aborts the process.
 """
 
-import cv2  # noqa: F401  (loads first on purpose)
+import cv2  # noqa: F401  (must be loaded first)
 import pycolmap
 
-# COLMAP's own chatter goes to no terminal; child processes send their errors to a log file.
+# Keep COLMAP's log off the terminal; child processes write theirs to a log file.
 pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
 pycolmap.logging.alsologtostderr = False
 

@@ -1,7 +1,7 @@
-"""Bundle adjustment of a whole model: cameras from few long tracks first, then from all that is right.
+"""Bundle adjustment of a whole model: first cameras from few long tracks, then everything from all inliers.
 
-Many cheap iterations over a twelfth of the measurements take out what bends a large model; the dear ones over
-all of them start next to their end.
+Many cheap iterations over a twelfth of the measurements remove the doming of a large model, so that the
+expensive iterations over all measurements start close to the solution.
 """
 
 from __future__ import annotations
@@ -9,80 +9,108 @@ from __future__ import annotations
 from spn_data.colmap import pycolmap
 from spn_data.colmap.clean import drop_out_of_view, drop_outliers, residual_sigma_px
 
-_LONG_TRACKS = 100  # of each image, from which cameras are found first
-# Ceres begins at 1e4. Damped like that, what bends a model hardly changes in an iteration: a survey of 1,000
-# images takes nearly twice as many, and the cost may decrease so little that it passes for converged.
-_LONG_STEPS = 1e10  # radius of the trust region
-_DAMPED = 1e4  # for points alone: undamped, those that near rays meet in are thrown to infinity
-# COLMAP's limit is 1,000; beyond, it solves inexactly what a bent model needs exactly.
-_MOST_IMAGES_SOLVED_EXACTLY = 20_000
-_ITERATIONS = 300
-_TURNED_OVER = 0.05  # of the measurements, out of view
-# Deviations at which Cauchy's loss begins to bend: 95 % efficient for normal errors (Holland & Welsch
-# 1977, "Robust regression using iteratively reweighted least-squares").
+_LONG_TRACKS = 100  # per image, used to adjust the cameras first
+# Ceres starts with a radius of 1e4. With that damping, the doming of a model hardly changes per iteration: a
+# survey of 1,000 images takes nearly twice as many iterations, and the cost may decrease so slowly that the
+# adjustment appears converged.
+_LARGE_RADIUS = 1e10  # of the trust region
+_SMALL_RADIUS = (
+    1e4  # for points alone: undamped, points with nearly parallel rays diverge to infinity
+)
+# COLMAP's limit is 1,000; above it, COLMAP solves the normal equations iteratively, which is too inexact to
+# remove doming.
+_MAX_IMAGES_DIRECT_SOLVER = 20_000
+_MAX_ITERATIONS = 300
+_MAX_OUT_OF_VIEW = 0.05  # share of the measurements; with more, the step was too long
+# Scale of the Cauchy loss in standard deviations: 95 % efficient for normal errors (Holland & Welsch 1977,
+# "Robust regression using iteratively reweighted least-squares").
 _CAUCHY = 2.385
-_FIRST_SCALE_PX = 1.0  # of the loss, while the deviation of measurements is not known yet
-_MOVED_SCALE_PX = 20.0  # where points lie as before while the cameras have moved
-# Relative decreases of the cost at which an adjustment ends.
-_CONVERGED = 1e-6  # of long tracks
-_CLOSE = 1e-2  # of points alone, as far as it takes to tell wrong measurements
-_UNCHANGED = 3e-5  # of all
+_INITIAL_SCALE_PX = 1.0  # of the loss, before the standard deviation of the measurements is known
+_MOVED_SCALE_PX = 20.0  # of the loss, when the cameras have moved but the points have not yet
+# Relative decrease of the cost at which an adjustment stops.
+_CONVERGED = 1e-6  # cameras from long tracks
+_CONVERGED_POINTS = 1e-2  # points alone: good enough to detect outliers
+_CONVERGED_ALL = 3e-5  # all measurements
 
 
 def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, threads: int) -> int:
-    """Refine cameras, poses and points in place; how many measurements were found wrong and deleted."""
+    """Refine cameras, poses and points in place.
+
+    Parameters
+    ----------
+    native : pycolmap.Reconstruction
+    refine_principal_point : bool
+        Whether to estimate the principal points too.
+    threads : int
+        Number of solver threads.
+
+    Returns
+    -------
+    int
+        Number of measurements that were deleted as outliers.
+    """
     dropped = drop_out_of_view(native)
-    straighten(native, threads=threads, refine_principal_point=refine_principal_point)
+    adjust_long_tracks(native, threads=threads, refine_principal_point=refine_principal_point)
     dropped += drop_out_of_view(native) + drop_outliers(native)
-    # What is left of wrong matches shall not bend the model either.
-    options = _options(threads, _CAUCHY * residual_sigma_px(native), _UNCHANGED)
+    # Keep the remaining outliers from bending the model.
+    options = _options(threads, _CAUCHY * residual_sigma_px(native), _CONVERGED_ALL)
     options.refine_principal_point = refine_principal_point
     pycolmap.bundle_adjustment(native, options)
     return dropped
 
 
-def straighten(
+def adjust_long_tracks(
     native: pycolmap.Reconstruction,
     *,
     threads: int,
     refine_intrinsics: bool = True,
     refine_principal_point: bool = False,
-    decrease: float = _CONVERGED,
+    cost_tolerance: float = _CONVERGED,
 ) -> None:
-    """Refine cameras and poses in place by the longest tracks alone, and then points.
+    """Refine cameras and poses in place from the longest tracks only, then adjust the points.
 
-    decrease : of the cost, relative, at which cameras are as they shall be.
+    Parameters
+    ----------
+    native : pycolmap.Reconstruction
+    threads : int
+        Number of solver threads.
+    refine_intrinsics, refine_principal_point : bool
+        Which intrinsics to estimate: focal length and distortion, principal point.
+    cost_tolerance : float
+        Relative decrease of the cost at which the adjustment of the cameras stops.
     """
-    for radius in (_LONG_STEPS, _DAMPED):
+    for radius in (_LARGE_RADIUS, _SMALL_RADIUS):
         few = _with_long_tracks(native)
-        options = _options(threads, _FIRST_SCALE_PX, decrease)
+        options = _options(threads, _INITIAL_SCALE_PX, cost_tolerance)
         options.ceres.solver_options.initial_trust_region_radius = radius
         options.refine_focal_length = options.refine_extra_params = refine_intrinsics
         options.refine_principal_point = refine_principal_point
         pycolmap.bundle_adjustment(few, options)
-        # What lies behind a camera costs nothing: a step too long may end with all of it there.
-        if drop_out_of_view(few) < _TURNED_OVER * few.compute_num_observations():
-            _take_cameras(native, few)
+        # Points behind a camera do not contribute to the cost: too long a step may move all of them there.
+        if drop_out_of_view(few) < _MAX_OUT_OF_VIEW * few.compute_num_observations():
+            _copy_cameras(few, native)
             break
     del few
     _adjust_points(native, threads)
 
 
-def _options(threads: int, scale_px: float, decrease: float) -> pycolmap.BundleAdjustmentOptions:
+def _options(
+    threads: int, scale_px: float, cost_tolerance: float
+) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = scale_px
-    options.ceres.max_num_images_direct_sparse_cpu_solver = _MOST_IMAGES_SOLVED_EXACTLY
+    options.ceres.max_num_images_direct_sparse_cpu_solver = _MAX_IMAGES_DIRECT_SOLVER
     solver = options.ceres.solver_options
     solver.num_threads = threads
-    solver.max_num_iterations = _ITERATIONS
-    solver.function_tolerance = decrease
-    solver.initial_trust_region_radius = _LONG_STEPS
+    solver.max_num_iterations = _MAX_ITERATIONS
+    solver.function_tolerance = cost_tolerance
+    solver.initial_trust_region_radius = _LARGE_RADIUS
     return options
 
 
 def _with_long_tracks(native: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A copy with the longest tracks alone: as many as give each image a hundred, where it has them."""
+    """Copy a model with its longest tracks only: enough for 100 per image, if it has that many."""
     tracks = {
         point_id: [element.image_id for element in point.track.elements]
         for point_id, point in native.points3D.items()
@@ -99,16 +127,16 @@ def _with_long_tracks(native: pycolmap.Reconstruction) -> pycolmap.Reconstructio
     return few
 
 
-def _take_cameras(native: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> None:
-    for camera_id, camera in other.cameras.items():
-        native.cameras[camera_id].params = camera.params
-    for frame_id in other.reg_frame_ids():
-        native.frames[frame_id].rig_from_world = other.frames[frame_id].rig_from_world
+def _copy_cameras(source: pycolmap.Reconstruction, target: pycolmap.Reconstruction) -> None:
+    for camera_id, camera in source.cameras.items():
+        target.cameras[camera_id].params = camera.params
+    for frame_id in source.reg_frame_ids():
+        target.frames[frame_id].rig_from_world = source.frames[frame_id].rig_from_world
 
 
 def _adjust_points(native: pycolmap.Reconstruction, threads: int) -> None:
-    options = _options(threads, _MOVED_SCALE_PX, _CLOSE)
+    options = _options(threads, _MOVED_SCALE_PX, _CONVERGED_POINTS)
     options.refine_focal_length = options.refine_extra_params = False
     options.refine_rig_from_world = False
-    options.ceres.solver_options.initial_trust_region_radius = _DAMPED
+    options.ceres.solver_options.initial_trust_region_radius = _SMALL_RADIUS
     pycolmap.bundle_adjustment(native, options)

@@ -1,4 +1,4 @@
-"""Wrong measurements of a model, found in its geometry; they are few and decide much."""
+"""Detection and removal of outlier measurements by the geometry of a model."""
 
 from __future__ import annotations
 
@@ -9,29 +9,38 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import from_native_camera, registered_images
 
-_BEYOND_RIM = 1.2  # of the image's farthest corner, from where a point can't be in view
+_VIEW_MARGIN = (
+    1.2  # times the distance of the farthest image corner; beyond it a point is out of view
+)
 _OUTLIER = 5.0  # standard deviations of a residual
-_MEDIAN_LENGTH = 1.1774  # of a residual whose two components have a deviation of one
-_TELLING_IMAGES = 50  # whose residuals tell the deviation of all
-_MIN_ANGLE_DEG = 1.5  # at which a point's rays meet; COLMAP's own limit
+_RAYLEIGH_MEDIAN = (
+    1.1774  # median length of a residual whose components have a standard deviation of one
+)
+_SAMPLED_IMAGES = 50  # used to estimate the standard deviation of the residuals
+_MIN_ANGLE_DEG = 1.5  # triangulation angle of a point; COLMAP's own limit
 
 
 def drop_out_of_view(native: pycolmap.Reconstruction) -> int:
-    """Delete measurements of points far beyond the image's rim or behind the camera; how many there were.
+    """Delete measurements of points far outside the field of view or behind the camera.
 
-    A polynomial distortion folds far outside the image: rays at 80 degrees may land in its middle. One wrong
-    match that does so has such leverage that it alone decides the distortion of the lens.
+    A polynomial distortion folds back far outside the image: rays at 80 degrees may project into its middle.
+    A single wrong match of this kind has enough leverage to determine the distortion of the lens on its own.
+
+    Returns
+    -------
+    int
+        Number of deleted measurements.
     """
     dropped = 0
     for image in registered_images(native):
         camera = from_native_camera(native.cameras[image.camera_id])
         w, h = camera.width, camera.height
         corners = camera.unproject(np.array([[0, 0], [w, 0], [0, h], [w, h]]))
-        rim = _BEYOND_RIM * float(np.linalg.norm(corners, axis=1).max())
+        max_reach = _VIEW_MARGIN * float(np.linalg.norm(corners, axis=1).max())
         seen, in_camera, _ = _measured(native, image)
         reach = np.linalg.norm(in_camera[:, :2], axis=1)
-        for k in np.flatnonzero(reach > rim * in_camera[:, 2]).tolist():
-            # A point goes with the second last of its measurements.
+        for k in np.flatnonzero(reach > max_reach * in_camera[:, 2]).tolist():
+            # COLMAP deletes a point together with its second last measurement.
             if image.points2D[seen[k]].has_point3D():
                 native.delete_observation(image.image_id, seen[k])
                 dropped += 1
@@ -39,27 +48,35 @@ def drop_out_of_view(native: pycolmap.Reconstruction) -> int:
 
 
 def drop_outliers(native: pycolmap.Reconstruction) -> int:
-    """Delete measurements five deviations beside their point, and points without depth; how many there were.
+    """Delete measurements with residuals above five standard deviations, and points without depth.
 
-    Least squares bends a model to where wrong matches want it: a hundredth of the tracks of a good flight
-    carry most of its error. The deviation is told by the median, which they do not move.
+    Least squares distorts a model to fit wrong matches: 1 % of the tracks of a good flight cause most of its
+    error. The standard deviation is computed from the median residual, which outliers do not affect.
+
+    Returns
+    -------
+    int
+        Number of deleted measurements.
     """
     return _filter(native, _OUTLIER * residual_sigma_px(native))
 
 
 def residual_sigma_px(native: pycolmap.Reconstruction) -> float:
-    """Deviation of a residual's component, as its median tells it, in at most 50 images."""
+    """Return the standard deviation of one residual component in pixels.
+
+    It is computed robustly from the median residual length in at most 50 images.
+    """
     lengths = []
     images = registered_images(native)
-    for image in images[:: math.ceil(len(images) / _TELLING_IMAGES)]:
+    for image in images[:: math.ceil(len(images) / _SAMPLED_IMAGES)]:
         camera = from_native_camera(native.cameras[image.camera_id])
         _, in_camera, pixels = _measured(native, image)
         lengths.append(np.linalg.norm(camera.project(in_camera) - pixels, axis=1))
-    return float(np.nanmedian(np.concatenate(lengths))) / _MEDIAN_LENGTH
+    return float(np.nanmedian(np.concatenate(lengths))) / _RAYLEIGH_MEDIAN
 
 
 def drop_without_depth(native: pycolmap.Reconstruction) -> int:
-    """Delete points whose rays meet at less than 1.5 degrees; how many measurements they had."""
+    """Delete points with triangulation angles below 1.5 degrees; return their number of measurements."""
     return _filter(native, 1e9)
 
 
@@ -71,8 +88,11 @@ def _filter(native: pycolmap.Reconstruction, max_error_px: float) -> int:
 def _measured(
     native: pycolmap.Reconstruction, image: pycolmap.Image
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Features (K) of an image that are points, these points in the camera frame (K, 3), pixels (K, 2)."""
-    # Each look at these attributes makes an object anew.
+    """Return the triangulated features of an image.
+
+    These are the feature indices (K), their points in the camera frame (K, 3) and their pixels (K, 2).
+    """
+    # Each access to these attributes creates a new Python object.
     points_2d, points_3d = image.points2D, native.points3D
     seen = list(image.get_observation_point2D_idxs())
     observed = [points_2d[k] for k in seen]

@@ -1,6 +1,6 @@
-"""COLMAP's database: cameras and images up front, then features and verified pairs as they come.
+"""COLMAP's database: cameras and images first, then features and verified pairs in any order.
 
-Each write is committed at once, so that a killed run keeps all that it had.
+Each write is committed at once, so that a killed run loses nothing it has written.
 """
 
 from __future__ import annotations
@@ -23,14 +23,28 @@ from spn_data.matching.features import Features
 
 @dataclass(frozen=True)
 class DatabaseImage:
-    """An image row: its COLMAP name, and the key of its camera."""
+    """Row of an image.
+
+    Attributes
+    ----------
+    name : str
+        COLMAP's image name: the path relative to the image folder.
+    camera : str
+        Key of the image's camera.
+    """
 
     name: str
     camera: str
 
 
 class MapDatabase:
-    """An open COLMAP database whose image ids are fixed by the order of the images given first."""
+    """Open COLMAP database whose image ids follow the order in which the images were added.
+
+    Attributes
+    ----------
+    ids : dict of str to int
+        COLMAP's image id by image name.
+    """
 
     def __init__(self, native: pycolmap.Database, path: Path):
         self._native = native
@@ -40,14 +54,32 @@ class MapDatabase:
     @classmethod
     @contextmanager
     def open(cls, path: Path) -> Iterator[Self]:
-        """Open or create."""
-        _check_room(path, 0)
+        """Open a database, or create it.
+
+        Parameters
+        ----------
+        path : Path
+            Database file.
+
+        Yields
+        ------
+        MapDatabase
+            Closed when the context exits.
+
+        Raises
+        ------
+        FormatError
+            If the file is not a COLMAP database or is damaged.
+        StageError
+            If the disk is full.
+        """
+        _check_disk_space(path, 0)
         try:
             native = pycolmap.Database.open(path)
             opened = cls(native, path)
         except (RuntimeError, ValueError) as error:
             raise FormatError(
-                f"{path}: damaged, or not a COLMAP database; remove it, and it is made anew"
+                f"{path}: not a COLMAP database, or damaged; delete it and run the command again"
             ) from error
         try:
             yield opened
@@ -59,7 +91,15 @@ class MapDatabase:
         images: Sequence[DatabaseImage],
         cameras: dict[str, tuple[Camera, bool]],
     ) -> None:
-        """Insert the images that are not there yet, one camera a key: (start intrinsics, focal known)."""
+        """Insert the images that the database does not contain yet.
+
+        Parameters
+        ----------
+        images : sequence of DatabaseImage
+        cameras : dict of str to (Camera, bool)
+            Initial intrinsics by camera key, and whether the focal length is known. One camera is inserted
+            per key.
+        """
         camera_ids = {
             image.camera: self._native.read_image_with_name(image.name).camera_id
             for image in images
@@ -96,22 +136,39 @@ class MapDatabase:
         return image_id
 
     def has_features(self, name: str) -> bool:
-        # Descriptors are written last.
+        """Return whether features of an image are stored."""
+        # Descriptors are written after the keypoints.
         return bool(self._native.exists_descriptors(self.ids[name]))
 
     def write_features(self, name: str, features: Features) -> None:
+        """Store the features of an image.
+
+        Parameters
+        ----------
+        name : str
+            Image name.
+        features : Features
+
+        Raises
+        ------
+        ValueError
+            If the image already has features.
+        StageError
+            If the disk is full.
+        """
         image_id = self.ids[name]
         if self._native.exists_keypoints(image_id):
-            raise ValueError(f"{name} has features already")
+            raise ValueError(f"{name} already has features")
         descriptors = pycolmap.FeatureDescriptors(
             type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
         )
-        _check_room(self._path, features.keypoints.nbytes + features.descriptors.nbytes)
+        _check_disk_space(self._path, features.keypoints.nbytes + features.descriptors.nbytes)
         with pycolmap.DatabaseTransaction(self._native):
             self._native.write_keypoints(image_id, features.keypoints)
             self._native.write_descriptors(image_id, descriptors)
 
     def read_features(self, name: str) -> Features:
+        """Read the keypoints and descriptors of an image."""
         image_id = self.ids[name]
         return Features(
             self.read_keypoints(name),
@@ -119,18 +176,32 @@ class MapDatabase:
         )
 
     def read_keypoints(self, name: str) -> np.ndarray:
-        """(K, 4) as in Features."""
+        """Read the keypoints of an image, without descriptors."""
         keypoints = np.asarray(self._native.read_keypoints(self.ids[name]), np.float32)
         return keypoints if keypoints.size else np.zeros((0, 4), np.float32)
 
     def num_keypoints(self, name: str) -> int:
+        """Return the number of keypoints of an image."""
         return int(self._native.num_keypoints_for_image(self.ids[name]))
 
     def has_pair(self, pair: tuple[int, int]) -> bool:
+        """Return whether a pair of image ids has been matched, verified or not."""
         return bool(self._native.exists_two_view_geometry(*pair))
 
     def write_pair(self, pair: VerifiedPair) -> None:
-        """Putative matches and verified geometry; a pair that failed has a row too, so it is not redone."""
+        """Store putative matches and the verified two-view geometry of a pair.
+
+        A pair that failed verification gets a row too, so that it is not matched again.
+
+        Parameters
+        ----------
+        pair : VerifiedPair
+
+        Raises
+        ------
+        StageError
+            If the disk is full.
+        """
         geometry = pycolmap.TwoViewGeometry(
             config=pycolmap.TwoViewGeometryConfiguration(pair.config),
             E=pair.e,
@@ -138,13 +209,24 @@ class MapDatabase:
             H=pair.h,
             inlier_matches=pair.inliers,
         )
-        _check_room(self._path, pair.matches.nbytes + pair.inliers.nbytes)
+        _check_disk_space(self._path, pair.matches.nbytes + pair.inliers.nbytes)
         with pycolmap.DatabaseTransaction(self._native):
             self._native.write_matches(*pair.image_ids, pair.matches)
             self._native.write_two_view_geometry(*pair.image_ids, geometry)
 
     def read_inliers(self, first: str, second: str) -> np.ndarray:
-        """Verified matches (K, 2) int64 of feature indices of two images; none where the pair has none."""
+        """Read the verified matches of two images.
+
+        Parameters
+        ----------
+        first, second : str
+            Image names.
+
+        Returns
+        -------
+        ndarray, shape (K, 2), int64
+            Feature indices in the first and second image; empty if the pair has no verified matches.
+        """
         pair = (self.ids[first], self.ids[second])
         if not self._native.exists_two_view_geometry(*pair):
             return np.zeros((0, 2), np.int64)
@@ -152,12 +234,24 @@ class MapDatabase:
         return np.asarray(matches, dtype=np.int64).reshape(-1, 2)
 
     def write_thinned(self, target: Path, features: int) -> None:
-        """A database with the telling `features` of each image alone, and the verified matches among them.
+        """Write a database that keeps only the features of each image with most verified matches.
 
-        Those tell that most pairs match. What repeats, as windows do, matches in one wrong pair or another,
-        so that wrong pairs lose more than right ones; images that match little keep all. Images and cameras
-        are the same, features are numbered anew in the same order; a file that lies at `target` is replaced.
-        Raises StageError where the disk is full.
+        These features suffice to connect most pairs. Repetitive structure such as windows matches in only one
+        wrong pair or another, so wrong pairs lose more matches than right ones. Images with few matches keep
+        all of them.
+
+        Parameters
+        ----------
+        target : Path
+            File to write; an existing file is replaced. Images and cameras are the same as in this database;
+            features are renumbered in the same order.
+        features : int
+            Number of features to keep per image.
+
+        Raises
+        ------
+        StageError
+            If the disk is full.
         """
         source = self._native
         pairs = [(self.ids[a], self.ids[b], n) for (a, b), n in self.verified_pairs().items()]
@@ -169,7 +263,7 @@ class MapDatabase:
             matches = source.read_two_view_geometry(first, second).inlier_matches
             matched[first][matches[:, 0]] += 1
             matched[second][matches[:, 1]] += 1
-        kept = {  # the stronger of equal ones
+        kept = {  # of features with equally many matches, the stronger ones
             image_id: np.sort(np.argsort(-count, kind="stable")[:features])
             for image_id, count in matched.items()
         }
@@ -189,25 +283,35 @@ class MapDatabase:
                 thin.write_two_view_geometry(first, second, geometry)
 
     def write_without(self, target: Path, names: Sequence[str]) -> None:
-        """A copy in which these images have no features and no pairs.
+        """Write a copy in which some images have no features and no pairs.
 
-        A file that lies at `target` is replaced. Raises StageError where the disk is full.
+        Parameters
+        ----------
+        target : Path
+            File to write; an existing file is replaced.
+        names : sequence of str
+            Images to clear.
+
+        Raises
+        ------
+        StageError
+            If the disk is full.
         """
-        source, bare = self._native, {self.ids[name] for name in names}
-        with self._write_images(target, self._path.stat().st_size) as made:
-            for image_id in set(self.ids.values()) - bare:
-                made.write_keypoints(image_id, source.read_keypoints(image_id))
-                made.write_descriptors(image_id, source.read_descriptors(image_id))
+        source, cleared = self._native, {self.ids[name] for name in names}
+        with self._write_images(target, self._path.stat().st_size) as copy:
+            for image_id in set(self.ids.values()) - cleared:
+                copy.write_keypoints(image_id, source.read_keypoints(image_id))
+                copy.write_descriptors(image_id, source.read_descriptors(image_id))
             for pair_id in source.read_num_matches()[0]:
                 pair = pycolmap.pair_id_to_image_pair(pair_id)
-                if bare.isdisjoint(pair):
-                    made.write_matches(*pair, source.read_matches(*pair))
-                    made.write_two_view_geometry(*pair, source.read_two_view_geometry(*pair))
+                if cleared.isdisjoint(pair):
+                    copy.write_matches(*pair, source.read_matches(*pair))
+                    copy.write_two_view_geometry(*pair, source.read_two_view_geometry(*pair))
 
     @contextmanager
     def _write_images(self, target: Path, size: int) -> Iterator[pycolmap.Database]:
-        """A new database of about `size` bytes with the same cameras and images, for the rest of it."""
-        _check_room(target, size)
+        """Create a database with the same cameras and images, to which about `size` bytes are added."""
+        _check_disk_space(target, size)
         part = target.with_name(target.name + ".part")
         part.unlink(missing_ok=True)
         with (
@@ -222,11 +326,11 @@ class MapDatabase:
         part.replace(target)
 
     def num_pairs(self) -> int:
-        """Pairs tried, verified or not."""
+        """Return the number of pairs that were matched, verified or not."""
         return int(self._native.num_matched_image_pairs())
 
     def verified_pairs(self) -> dict[tuple[str, str], int]:
-        """Number of inlier matches of each verified pair of names."""
+        """Return the number of inlier matches of each verified pair of image names."""
         names = {image_id: name for name, image_id in self.ids.items()}
         counts: dict[tuple[str, str], int] = {}
         for pair_id, inliers in zip(
@@ -238,14 +342,17 @@ class MapDatabase:
         return counts
 
 
-_ROOM_BYTES = 2_000_000  # for indices, and for the journal's way into the database
+_RESERVE_BYTES = 2_000_000  # for indices, and for merging the journal into the database
 
 
-def _check_room(path: Path, size: int) -> None:
-    """Raises StageError on a full disk: COLMAP would abort the process when a transaction fails."""
+def _check_disk_space(path: Path, size: int) -> None:
+    """Raise StageError if the disk is full.
+
+    COLMAP would abort the process when a transaction fails.
+    """
     free = shutil.disk_usage(path.parent).free
-    if free < 2 * size + _ROOM_BYTES:
+    if free < 2 * size + _RESERVE_BYTES:
         raise StageError(
-            f"{path}: the disk is full ({free / 1e6:.1f} MB free). What is done is kept: make room, and "
-            "the same command goes on"
+            f"{path}: the disk is full ({free / 1e6:.1f} MB free). Finished work is kept: free some space "
+            "and run the same command again to continue"
         )

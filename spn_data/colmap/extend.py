@@ -1,4 +1,4 @@
-"""A copy of a model with more images, which have poses and see points of it."""
+"""Copy of a model with additional images that have poses and observe its points."""
 
 from __future__ import annotations
 
@@ -23,11 +23,32 @@ def write_extended(
     *,
     text: bool = False,
 ) -> None:
-    """The model in `source`, and each frame of `labels` as one image more, in COLMAP's binary or text format.
+    """Write a copy of a model with each labelled frame as an additional image.
 
-    labels : registered frames that the model does not hold; cameras : by their keys. Images, cameras and
-    positions of points in `source` stay as they are; a point's track gains the observations in `seen`.
-    Raises StageError where the disk is full.
+    Images, cameras and point positions of `source` do not change; the observations in `seen` are appended to
+    the tracks of its points.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of the model.
+    target : Path
+        Folder to write.
+    labels : Labels
+        Registered frames that are not in the model.
+    seen : LabelObservations
+        Map points that these frames observe.
+    cameras : dict of str to Camera
+        Cameras of the frames by key.
+    text : bool
+        Write COLMAP's text format instead of the binary one.
+
+    Raises
+    ------
+    FormatError
+        If `source` is not a complete model.
+    StageError
+        If the disk is full.
     """
     native = load_native(source)
     camera_ids = {}
@@ -38,7 +59,7 @@ def write_extended(
             native_camera(cameras[key], camera_id=camera_id, focal_is_known=True)
         )
     quats_xyzw, translations = labels.poses.to_cam_from_world()
-    # A trivial frame has its image's id, which must not be that of another frame either.
+    # A trivial frame gets its image's id, so the id must not be used by another frame either.
     first = max([*native.images, *native.frames], default=0) + 1
     for row, name in enumerate(labels.names.tolist()):
         image_id = first + row
@@ -58,13 +79,13 @@ def write_extended(
         return
     target.mkdir(parents=True, exist_ok=True)
     native.write_text(str(target))
-    # COLMAP does not notice a disk that is full.
+    # COLMAP does not report write errors on a full disk.
     try:
-        found = pycolmap.Reconstruction()
-        found.read_text(str(target))
-        whole = found.num_points3D() == native.num_points3D()
-        whole = whole and found.num_reg_images() == native.num_reg_images()
+        written = pycolmap.Reconstruction()
+        written.read_text(str(target))
+        complete = written.num_points3D() == native.num_points3D()
+        complete = complete and written.num_reg_images() == native.num_reg_images()
     except (RuntimeError, ValueError, IndexError):
-        whole = False
-    if not whole:
-        raise StageError(f"{target}: cannot be written whole; is the disk full?")
+        complete = False
+    if not complete:
+        raise StageError(f"{target}: could not be written completely; is the disk full?")

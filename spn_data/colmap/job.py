@@ -1,4 +1,4 @@
-"""What one run of COLMAP's mapper is given."""
+"""Parameters of one run of COLMAP's mapper."""
 
 from __future__ import annotations
 
@@ -7,16 +7,42 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class MappingJob:
-    """One run of COLMAP's mapper over a database."""
+    """Parameters of one run of COLMAP's mapper over a database.
+
+    Attributes
+    ----------
+    database : str
+        Database file.
+    images : str
+        Image folder.
+    output : str
+        Existing folder, in which sub-models are written to model-0, model-1, ...
+    snapshots : str
+        Existing folder for snapshots.
+    engine : str
+        "incremental" or "global".
+    threads : int
+        Number of threads; -1 for all cores.
+    seed : int
+        Random seed.
+    snapshot_every : int
+        Number of registered images between snapshots.
+    min_model_size : int
+        Sub-models with fewer images are dropped.
+    hold_intrinsics : bool
+        Keep intrinsics fixed and leave their refinement to the final bundle adjustment.
+    start_from : str
+        Folder of a model to continue from; empty to start from scratch.
+    """
 
     database: str
-    images: str  # folder
-    output: str  # an existing folder; sub-models are written to model-0, model-1, ... in it
-    snapshots: str  # an existing folder
-    engine: str = "incremental"  # or "global"
+    images: str
+    output: str
+    snapshots: str
+    engine: str = "incremental"
     threads: int = -1
     seed: int = 0
-    snapshot_every: int = 20  # registered images
-    min_model_size: int = 10  # images, below which a sub-model is dropped
-    hold_intrinsics: bool = False  # leave their refinement to the last bundle adjustment
-    start_from: str = ""  # folder of a model to go on from
+    snapshot_every: int = 20
+    min_model_size: int = 10
+    hold_intrinsics: bool = False
+    start_from: str = ""

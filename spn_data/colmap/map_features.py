@@ -1,4 +1,7 @@
-"""Descriptors in a COLMAP database that must not change: COLMAP itself writes when it only opens one."""
+"""Read-only access to the descriptors in a COLMAP database that must not change.
+
+COLMAP itself writes to a database when it only opens it.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,12 @@ import numpy as np
 
 from spn_data.errors import FormatError
 
-_BYTES = 128  # of a descriptor
+_DESCRIPTOR_BYTES = 128
 _MAX_ROWS = 1_000_000
 
 
 class MapFeatures:
-    """Descriptors by image name, read through SQLite as an immutable file."""
+    """Descriptors by image name, read through SQLite from an immutable file."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection):
         self._path = path
@@ -27,7 +30,23 @@ class MapFeatures:
     @classmethod
     @contextmanager
     def open(cls, path: Path) -> Iterator[Self]:
-        """Raises FormatError where there is no such database."""
+        """Open a database for reading.
+
+        Parameters
+        ----------
+        path : Path
+            Database file.
+
+        Yields
+        ------
+        MapFeatures
+            Closed when the context exits.
+
+        Raises
+        ------
+        FormatError
+            If the database cannot be opened.
+        """
         try:
             uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
             connection = sqlite3.connect(uri, uri=True)
@@ -39,7 +58,23 @@ class MapFeatures:
             connection.close()
 
     def descriptors(self, name: str) -> np.ndarray:
-        """(K, 128) uint8, in the order of the image's features in the model."""
+        """Read the descriptors of an image.
+
+        Parameters
+        ----------
+        name : str
+            Image name.
+
+        Returns
+        -------
+        ndarray, shape (K, 128), uint8
+            In the order of the image's features in the model.
+
+        Raises
+        ------
+        FormatError
+            If the image has no descriptors, or they are damaged or unreadable.
+        """
         query = (
             "SELECT d.rows, d.cols, d.data FROM descriptors d JOIN images i USING (image_id) "
             "WHERE i.name = ?"
@@ -49,8 +84,12 @@ class MapFeatures:
         except sqlite3.Error as error:
             raise FormatError(f"{self._path}: cannot be read ({error})") from error
         if row is None:
-            raise FormatError(f"{self._path}: holds no features of {name}")
+            raise FormatError(f"{self._path}: contains no features of {name}")
         rows, columns, data = row
-        if columns != _BYTES or not 0 <= rows <= _MAX_ROWS or len(data or b"") != rows * columns:
+        if (
+            columns != _DESCRIPTOR_BYTES
+            or not 0 <= rows <= _MAX_ROWS
+            or len(data or b"") != rows * columns
+        ):
             raise FormatError(f"{self._path}: the descriptors of {name} are damaged")
-        return np.frombuffer(data or b"", np.uint8).reshape(-1, _BYTES)
+        return np.frombuffer(data or b"", np.uint8).reshape(-1, _DESCRIPTOR_BYTES)

@@ -1,4 +1,4 @@
-"""Pose of one image from points whose place in the map is known."""
+"""Resection: pose of one image from 2D-3D correspondences with the map."""
 
 from __future__ import annotations
 
@@ -15,9 +15,16 @@ from spn_data.geometry.pose import Poses
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """What agrees best with M correspondences.
+    """Result of a resection from M correspondences.
 
-    pose : (1) in the map's frame; inliers : (M,) bool; camera : with the focal length that was estimated.
+    Attributes
+    ----------
+    pose : Poses
+        One pose, in the map's frame.
+    inliers : ndarray, shape (M,), bool
+        Correspondences that agree with the pose.
+    camera : Camera
+        Intrinsics; includes the focal length if it was estimated.
     """
 
     pose: Poses
@@ -34,9 +41,27 @@ def resect(
     find_focal: bool = False,
     seed: int = 0,
 ) -> Resection | None:
-    """LO-RANSAC over pixels (M, 2) and points (M, 3), then least squares on the inliers; None without any.
+    """Estimate a camera pose by LO-RANSAC, refined by least squares on the inliers.
 
-    find_focal : also estimates the focal length, from four points a sample.
+    Parameters
+    ----------
+    pixels : ndarray, shape (M, 2)
+        Measured image points.
+    points : ndarray, shape (M, 3)
+        Corresponding points in the map's frame.
+    camera : Camera
+        Intrinsics.
+    max_error_px : float
+        Maximum reprojection error of an inlier.
+    find_focal : bool
+        Estimate the focal length too, from samples of four points.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    Resection or None
+        None with fewer than four correspondences or if no finite pose is found.
     """
     if len(pixels) < 4:
         return None
@@ -45,13 +70,13 @@ def resect(
     estimation.ransac.max_error = max_error_px
     estimation.ransac.random_seed = seed
     refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=find_focal)
-    found = pycolmap.estimate_and_refine_absolute_pose(
+    estimate = pycolmap.estimate_and_refine_absolute_pose(
         pixels, points, native, estimation, refinement
     )
-    if found is None:
+    if estimate is None:
         return None
-    rigid = found["cam_from_world"]
+    rigid = estimate["cam_from_world"]
     pose = Poses.from_cam_from_world(rigid.rotation.quat[None], rigid.translation[None])
     if not (np.isfinite(pose.centers).all() and np.isfinite(native.params).all()):
         return None
-    return Resection(pose, np.asarray(found["inlier_mask"], bool), from_native_camera(native))
+    return Resection(pose, np.asarray(estimate["inlier_mask"], bool), from_native_camera(native))

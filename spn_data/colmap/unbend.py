@@ -1,8 +1,9 @@
-"""A large bend of a model taken out by the positions of its flight.
+"""Correction of the doming of a model by the positions of its flight.
 
-Images say nearly nothing of how a survey bends as a whole, and bundle adjustment straightens one in hundreds
-of small steps: a long step, which turns each camera by its share, moves the far end where nothing fits. A
-thousand positions, each a metre or two off, tell a smooth bend to decimetres, and adjustment does the rest.
+Images hardly constrain the large-scale bending of a survey, and bundle adjustment removes it only in hundreds
+of small steps: a long step, which rotates each camera by its share, moves the far end so far that nothing
+fits any more. A thousand positions, each a metre or two off, determine a smooth bend to decimetres, and
+bundle adjustment does the rest.
 """
 
 from __future__ import annotations
@@ -17,21 +18,30 @@ from spn_data.colmap.model import registered_images
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Similarity
 
-_FEWEST = 1000  # positions; smaller models are adjusted as well without
-_LEAST_M = 3.0  # median displacement, below which the positions' slow errors may look like a bend
-_LEAST_RATIO = 2.0  # of it to what positions deviate from the bent surface
-_LEAST_WIDTH = 5.0  # of the surface, in these deviations: a straight line says nothing across
-_WRONG = 4.0  # medians, from which a position is left out
-_ROUNDS = 5  # of leaving out
+_MIN_POSITIONS = 1000  # bundle adjustment alone suffices for smaller models
+_MIN_BEND_M = (
+    3.0  # median displacement; below it, slow errors of the positions may look like doming
+)
+_MIN_BEND_RATIO = 2.0  # median displacement divided by the median residual of the positions
+_MIN_WIDTH = 5.0  # of the surface, in median residuals: a straight line does not determine the bend across it
+_OUTLIER = 4.0  # median residuals; positions beyond are ignored
+_ROUNDS = 5  # of outlier rejection
 
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """A smooth displacement of a surface, and of what lies above and below it.
+    """Smooth displacement of a surface and of the points above and below it.
 
-    origin : (3,) of the surface; axes : (3, 3) rows, the last one its normal; extents : (2,) standard
-    deviations along the first two, which their coordinates count in; terms : (10, 3) of the displacement
-    along the axes, cubic in the two coordinates.
+    Attributes
+    ----------
+    origin : ndarray, shape (3,)
+        Origin of the surface.
+    axes : ndarray, shape (3, 3)
+        Axes of the surface as rows; the last one is its normal.
+    extents : ndarray, shape (2,)
+        Standard deviations along the first two axes; surface coordinates are in these units.
+    terms : ndarray, shape (10, 3)
+        Coefficients of the displacement along the axes, a cubic polynomial in the two surface coordinates.
     """
 
     origin: np.ndarray
@@ -41,22 +51,25 @@ class Bend:
 
     @classmethod
     def fit(cls, centers: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Bend:
-        """What brings centres (N, 3) to targets (N, 3), whose surface it is; weights (N,) are zero or one."""
+        """Fit the displacement from centres (N, 3) to targets (N, 3) by least squares.
+
+        The surface is fitted to the targets. Weights (N,) are zero or one.
+        """
         used = weights > 0
         origin = targets[used].mean(axis=0)
         _, singular, axes = np.linalg.svd(targets[used] - origin, full_matrices=False)
         extents = singular[:2] / np.sqrt(used.sum())
-        plain = cls(origin, axes, extents, np.zeros((10, 3)))
-        basis, _ = plain._basis(plain._inside(centers[used]))
-        wanted = (targets - centers)[used] @ axes.T
-        return cls(origin, axes, extents, np.linalg.lstsq(basis, wanted, rcond=None)[0])
+        undeformed = cls(origin, axes, extents, np.zeros((10, 3)))
+        basis, _ = undeformed._basis(undeformed._to_surface(centers[used]))
+        displacements = (targets - centers)[used] @ axes.T
+        return cls(origin, axes, extents, np.linalg.lstsq(basis, displacements, rcond=None)[0])
 
-    def _inside(self, points: np.ndarray) -> np.ndarray:
+    def _to_surface(self, points: np.ndarray) -> np.ndarray:
         return np.asarray((points - self.origin) @ self.axes.T)
 
-    def _basis(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 10), and its derivatives (N, 2, 10) along the surface."""
-        x, y = (inside[:, :2] / self.extents).T
+    def _basis(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the polynomial basis (N, 10) and its derivatives (N, 2, 10) along the surface."""
+        x, y = (local[:, :2] / self.extents).T
         one, none = np.ones_like(x), np.zeros_like(x)
         values = [one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
         by_x = [none, one, none, 2 * x, y, none, 3 * x * x, 2 * x * y, y * y, none]
@@ -65,27 +78,37 @@ class Bend:
         return np.stack(values, axis=1), derivatives / self.extents[:, None]
 
     def apply(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 3) where they belong, and how they turn (N, 3, 3): what is above stays above."""
-        inside = self._inside(points)
-        basis, derivatives = self._basis(inside)
+        """Return the displaced points (N, 3) and the rotations (N, 3, 3) of the surface there.
+
+        Points above the surface stay above it.
+        """
+        local = self._to_surface(points)
+        basis, derivatives = self._basis(local)
         along = np.eye(3)[:2] + derivatives @ self.terms  # (N, 2, 3) tangents
         frame = np.concatenate([along, np.cross(along[:, 0], along[:, 1])[:, None]], axis=1)
         u, _, vt = np.linalg.svd(frame)
         turned = np.swapaxes(u @ vt, 1, 2)  # (N, 3, 3), nearest rotation
-        on_surface = inside * [1, 1, 0] + basis @ self.terms
-        moved = on_surface + turned[:, :, 2] * inside[:, 2:]
+        on_surface = local * [1, 1, 0] + basis @ self.terms
+        moved = on_surface + turned[:, :, 2] * local[:, 2:]
         return moved @ self.axes + self.origin, self.axes.T @ turned @ self.axes
 
 
 def unbend(native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[float]]) -> float:
-    """Straighten a model in place, where it is bent by more than its positions deviate.
+    """Remove the bend of a model in place if it is larger than the noise of its positions.
 
-    Returns the median displacement of its images in metres, 0 where it was left as it is.
+    Parameters
+    ----------
+    native : pycolmap.Reconstruction
+    positions : mapping of str to sequence of float
+        Positions by image name, in metres in a Cartesian frame.
 
-    positions : by image name, in metres in a Cartesian frame.
+    Returns
+    -------
+    float
+        Median displacement of the images in metres; 0 if the model was not changed.
     """
     images = [image for image in registered_images(native) if image.name in positions]
-    if len(images) < _FEWEST:
+    if len(images) < _MIN_POSITIONS:
         return 0.0
     centers = np.array([image.projection_center() for image in images])
     measured = np.array([positions[image.name] for image in images])
@@ -96,13 +119,14 @@ def unbend(native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[flo
             targets = model_from_world.apply(measured)
             bend = Bend.fit(centers, targets, used)
             straight, _ = bend.apply(centers)
-            off = np.linalg.norm(targets - straight, axis=1)
-            used = (off < _WRONG * np.median(off)).astype(np.float64)
-    except GeometryError:  # all on one line
+            residuals = np.linalg.norm(targets - straight, axis=1)
+            used = (residuals < _OUTLIER * np.median(residuals)).astype(np.float64)
+    except GeometryError:  # collinear positions
         return 0.0
     moved = float(np.median(np.linalg.norm(straight - centers, axis=1)))
-    least = max(_LEAST_RATIO * float(np.median(off)), _LEAST_M * model_from_world.scale)
-    if moved < least or bend.extents[1] < _LEAST_WIDTH * np.median(off):
+    residual = float(np.median(residuals))
+    min_bend = max(_MIN_BEND_RATIO * residual, _MIN_BEND_M * model_from_world.scale)
+    if moved < min_bend or bend.extents[1] < _MIN_WIDTH * residual:
         return 0.0
     _move(native, bend)
     return moved / model_from_world.scale

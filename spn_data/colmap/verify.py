@@ -13,15 +13,25 @@ from spn_data.matching.features import Features
 from spn_data.matching.guided import match_guided
 from spn_data.matching.putative import MatchOptions, PutativeMatcher
 
-_ITERATIONS = 1000  # of its estimation, at most
+_MAX_ITERATIONS = 1000  # of the fundamental matrix estimation
 
 
 @dataclass(frozen=True, eq=False)
 class VerifiedPair:
-    """Matches of two images and what verification made of them.
+    """Putative matches of two images and the result of their verification.
 
-    matches : (M, 2) uint32 putative; inliers : (K, 2) uint32, empty where the pair is not verified.
-    config : COLMAP's TwoViewGeometryConfiguration; e, f, h : (3, 3) or None.
+    Attributes
+    ----------
+    image_ids : (int, int)
+        COLMAP's image ids.
+    matches : ndarray, shape (M, 2), uint32
+        Putative matches: feature indices in both images.
+    inliers : ndarray, shape (K, 2), uint32
+        Verified matches; empty if the pair failed verification.
+    config : int
+        COLMAP's TwoViewGeometryConfiguration.
+    e, f, h : ndarray, shape (3, 3), or None
+        Essential matrix, fundamental matrix and homography.
     """
 
     image_ids: tuple[int, int]
@@ -35,7 +45,17 @@ class VerifiedPair:
 
 @dataclass(frozen=True, eq=False)
 class ImageForMatching:
-    """What matching one image takes."""
+    """Everything needed to match one image.
+
+    Attributes
+    ----------
+    features : Features
+        Keypoints and descriptors.
+    camera : Camera
+        Intrinsics.
+    focal_is_known : bool
+        If false, the image is excluded from calibrated verification.
+    """
 
     features: Features
     camera: Camera
@@ -43,7 +63,7 @@ class ImageForMatching:
 
 
 def native_camera(camera: Camera, *, camera_id: int = 1, focal_is_known: bool) -> pycolmap.Camera:
-    """COLMAP's object; an unknown focal length is left out of calibrated verification."""
+    """Convert a camera to COLMAP's; calibrated verification ignores it if its focal length is unknown."""
     return pycolmap.Camera(
         camera_id=camera_id,
         model=camera.model,
@@ -59,16 +79,32 @@ def match_pairs(
     pairs: list[tuple[int, int]],
     options: MatchOptions,
 ) -> list[VerifiedPair]:
-    """Match and verify pairs of image ids. Pure: the same input gives the same output anywhere."""
+    """Match and verify pairs of images.
+
+    A pure function: the same input gives the same output on any machine.
+
+    Parameters
+    ----------
+    images : dict of int to ImageForMatching
+        Images by COLMAP's image id.
+    pairs : list of (int, int)
+        Pairs of image ids.
+    options : MatchOptions
+
+    Returns
+    -------
+    list of VerifiedPair
+        In the order of `pairs`.
+    """
     return [_match_pair(pair, images[pair[0]], images[pair[1]], options) for pair in pairs]
 
 
 def _match_pair(
     pair: tuple[int, int], a: ImageForMatching, b: ImageForMatching, options: MatchOptions
 ) -> VerifiedPair:
-    matches, fitting = _putative(a.features, b.features, options)
+    matches, candidates = _putative(a.features, b.features, options)
     none = np.zeros((0, 2), np.uint32)
-    if len(fitting) < options.min_inliers:
+    if len(candidates) < options.min_inliers:
         config = pycolmap.TwoViewGeometryConfiguration.DEGENERATE
         return VerifiedPair(pair, matches, none, int(config), None, None, None)
     geometry = pycolmap.estimate_two_view_geometry(
@@ -76,8 +112,8 @@ def _match_pair(
         a.features.keypoints[:, :2].astype(np.float64),
         native_camera(b.camera, focal_is_known=b.focal_is_known),
         b.features.keypoints[:, :2].astype(np.float64),
-        fitting,
-        verification_options(options, len(fitting)),
+        candidates,
+        verification_options(options, len(candidates)),
     )
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
     if len(inliers) < options.min_inliers:
@@ -88,11 +124,13 @@ def _match_pair(
 
 
 def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Matches (M, 2) of two images, and those (K, 2) that are worth verifying: none where so few fit together
-    that the images show different things.
+    """Match two images; return putative matches (M, 2) and the candidates (K, 2) for verification.
 
-    The strongest features tell first, for a sixteenth of the cost, then twice as many, and so on: most pairs
-    end here. Of those that surely overlap the other features are compared along epipolar lines alone.
+    There are no candidates if so few matches fit one epipolar geometry that the images show different things.
+
+    The strongest features are compared first, at a sixteenth of the cost, then twice as many, and so on; most
+    pairs are rejected early. For pairs that certainly overlap, the other features are compared along epipolar
+    lines only.
     """
     matcher = PutativeMatcher(a.descriptors, b.descriptors)
     fundamental, n = None, options.strongest
@@ -102,11 +140,11 @@ def _putative(a: Features, b: Features, options: MatchOptions) -> tuple[np.ndarr
         n *= 2
         if len(first) < options.telling_matches:
             continue
-        found, fits = _epipolar_geometry(a, b, first, options)
+        estimate, fits = _epipolar_geometry(a, b, first, options)
         if _share(fits) < options.least_share:
             return first, first[:0]
         if _share(fits) >= options.guided_share:
-            fundamental = found
+            fundamental = estimate
             break
     if fundamental is None:
         matcher.extend(max(len(a), len(b)))
@@ -127,9 +165,10 @@ def _share(fits: np.ndarray) -> float:
 def _epipolar_geometry(
     a: Features, b: Features, matches: np.ndarray, options: MatchOptions
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """F (3, 3), x_b' F x_a = 0, and which matches (M, 2) fit it, (M,); None and all where none can tell.
+    """Estimate the fundamental matrix F (3, 3), x_b' F x_a = 0, and an inlier mask (M,) of the matches.
 
-    MAGSAC++ (Barath et al. 2020) as OpenCV has it: a hundred times faster on hopeless pairs than COLMAP's.
+    With too few matches to decide, return None and all matches as inliers. OpenCV's MAGSAC++ (Barath et al.
+    2020) is a hundred times faster on hopeless pairs than COLMAP's estimator.
     """
     if len(matches) < options.telling_matches:
         return None, np.ones(len(matches), bool)
@@ -140,10 +179,10 @@ def _epipolar_geometry(
             cv2.USAC_MAGSAC,
             options.max_error_px,
             0.999,
-            _ITERATIONS,
+            _MAX_ITERATIONS,
         )
     except cv2.error:
-        # OpenCV 5.0.0 asserts where its local optimisation ends without a model: COLMAP's shall tell.
+        # OpenCV 5.0.0 raises if its local optimisation ends without a model: leave the decision to COLMAP.
         return None, np.ones(len(matches), bool)
     if fundamental is None or fundamental.shape != (3, 3):
         return None, np.zeros(len(matches), bool)
@@ -151,15 +190,15 @@ def _epipolar_geometry(
 
 
 def verification_options(options: MatchOptions, matches: int) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's, for so many matches."""
+    """Return COLMAP's options to verify a number of matches."""
     native = pycolmap.TwoViewGeometryOptions()
     native.min_num_inliers = options.min_inliers
-    # On-screen display and propellers are masked; a static flat border is no watermark in drone video.
+    # On-screen display and propellers are masked; a static flat border in drone video is not a watermark.
     native.detect_watermark = False
     native.ransac.max_error = options.max_error_px
-    native.ransac.min_num_trials = 30  # what does not fit is gone before
-    # With fewer inliers a pair is not verified: no samples are drawn to find them.
-    least = options.min_inliers / matches
-    native.ransac.min_inlier_ratio = max(native.ransac.min_inlier_ratio, least)
+    native.ransac.min_num_trials = 30  # most outliers have been removed before
+    # A pair with fewer inliers is not verified, so no samples are needed to find them.
+    min_ratio = options.min_inliers / matches
+    native.ransac.min_inlier_ratio = max(native.ransac.min_inlier_ratio, min_ratio)
     native.ransac.random_seed = options.seed
     return native

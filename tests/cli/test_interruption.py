@@ -183,7 +183,7 @@ def test_a_model_that_a_full_disk_cut_short_is_an_error(
     command = [sys.executable, "-c", script, str(finished_area / MODEL), str(tmp_path / "out")]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 1
-    assert "cannot be written whole; is the disk full?" in result.stderr
+    assert "could not be written completely; is the disk full?" in result.stderr
 
 
 @pytest.mark.slow

@@ -48,15 +48,15 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Events:
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes at which models are adjusted, where 20 images are a large survey."""
-    monkeypatch.setattr(incremental, "_SOLVED_EXACTLY", 20)
+    monkeypatch.setattr(incremental, "_MAX_IMAGES_COLMAP", 20)
     sizes = []
-    straighten: Callable[..., None] = incremental.straighten
+    adjust_long_tracks: Callable[..., None] = incremental.adjust_long_tracks
 
     def adjust(model: pycolmap.Reconstruction, **how: object) -> None:
         sizes.append(model.num_reg_images())
-        straighten(model, **how)
+        adjust_long_tracks(model, **how)
 
-    monkeypatch.setattr(incremental, "straighten", adjust)
+    monkeypatch.setattr(incremental, "adjust_long_tracks", adjust)
     return sizes
 
 
@@ -102,7 +102,7 @@ def test_up_to_a_thousand_images_colmap_adjusts_by_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path, truth = database
-    monkeypatch.setattr(incremental, "straighten", lambda *_, **__: pytest.fail("not its own"))
+    monkeypatch.setattr(incremental, "adjust_long_tracks", lambda *_, **__: pytest.fail("not its own"))
     models = incremental.map_incrementally(job(path, tmp_path))
     assert told[-1] == {"registered": _IMAGES}
     assert position_error(models[0], truth) < 0.002

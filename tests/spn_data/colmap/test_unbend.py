@@ -16,7 +16,7 @@ _LINES = 12  # 480 images
 @pytest.fixture(autouse=True)
 def _enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand images would take a minute."""
-    monkeypatch.setattr(module, "_FEWEST", 400)
+    monkeypatch.setattr(module, "_MIN_POSITIONS", 400)
 
 
 def fixes(centers: np.ndarray, sigma_m: float = 0.8) -> dict[str, list[float]]:
@@ -72,7 +72,7 @@ def test_a_model_is_left_as_it_is_where(
     sag_m: float, lines: int, given: int, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if lines == 1:
-        monkeypatch.setattr(module, "_FEWEST", 30)
+        monkeypatch.setattr(module, "_MIN_POSITIONS", 30)
     model, centers = survey(sag_m, lines=lines)
     before = geometry(model)
     positions = dict(list(fixes(centers).items())[:given])
