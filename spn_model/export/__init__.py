@@ -1,0 +1,1 @@
+"""Deployment bundles: ONNX export, post-training quantization, parity checks, model card, benchmark."""

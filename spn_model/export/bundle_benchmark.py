@@ -1,4 +1,4 @@
-"""What a bundle costs on this machine: latency, file size, memory of the program on board."""
+"""Benchmark of a bundle on this machine: latency, file size, and memory of the onboard program."""
 
 from __future__ import annotations
 
@@ -20,27 +20,49 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.json_files import write_json
 from spn_model.evaluation.validation import spread_rows
-from spn_model.export.bundle_checks import judged_groups
+from spn_model.export.bundle_checks import evaluation_groups
 from spn_model.onboard.bundle import GRAPHS, read_bundle
 
 _SIZE = (1280, 720)
-_DISTORTION = (-0.05, 0.01)  # a mild barrel, as of small drones
-_WIDER = 1.08  # than the network's view, which the lens so fills
+_DISTORTION = (-0.05, 0.01)  # mild barrel distortion, typical of small drones
+_FIELD_OF_VIEW_FACTOR = (
+    1.08  # field of view relative to the network's, so that the lens fills the view
+)
 _TIMEOUT_S = 3600
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """What is timed."""
+    """What is timed.
+
+    Attributes
+    ----------
+    poses : int
+        Number of poses to time.
+    threads : int
+        Threads of the network.
+    frames : int
+        Number of data set images used in turn, if no frames are given.
+    """
 
     poses: int = 100
     threads: int = 1
-    frames: int = 8  # of the data set, in turn, where none are given
+    frames: int = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BundleCost:
-    """Of one graph. bytes : of its file; found : as `spn_model.onboard.benchmark` prints it."""
+    """Cost of one graph of a bundle.
+
+    Attributes
+    ----------
+    precision : str
+        FLOAT32 or INT8.
+    bytes : int
+        Size of the graph file.
+    found : dict
+        Measurements, as printed by `spn_model.onboard.benchmark`.
+    """
 
     precision: str
     bytes: int
@@ -50,10 +72,30 @@ class BundleCost:
 def benchmark(
     folder: Path, frames: Sequence[Path], camera: Path, options: BenchmarkOptions | None = None
 ) -> tuple[BundleCost, ...]:
-    """Of each graph of a bundle, on frames of a flying camera, whose file is given.
+    """Time each graph of a bundle in a process of its own.
 
-    Raises InputError or FormatError where the bundle cannot be used, StageError with what the process said
-    where it failed.
+    Parameters
+    ----------
+    folder : Path
+        Bundle.
+    frames : sequence of Path
+        Images of the flying camera.
+    camera : Path
+        Camera file of the flying camera.
+    options : BenchmarkOptions, optional
+        What is timed.
+
+    Returns
+    -------
+    tuple of BundleCost
+        One for each graph of the bundle.
+
+    Raises
+    ------
+    InputError, FormatError
+        If the bundle cannot be used.
+    StageError
+        If the process fails; the message holds its last line.
     """
     options = options or BenchmarkOptions()
     bundle = read_bundle(folder)
@@ -61,35 +103,60 @@ def benchmark(
         BundleCost(
             precision=precision,
             bytes=bundle.graphs[precision].bytes,
-            found=_timed(folder, precision, frames, camera, options),
+            found=_run_benchmark(folder, precision, frames, camera, options),
         )
         for precision in GRAPHS
         if precision in bundle.graphs
     )
 
 
-def flown_frames(folder: Path, dataset: Path, scratch: Path, count: int) -> tuple[list[Path], Path]:
-    """Frames and camera file, written into `scratch`: images of a data set through a lens of 1280 x 720.
+def render_flight_frames(
+    folder: Path, dataset: Path, scratch: Path, count: int
+) -> tuple[list[Path], Path]:
+    """Render frames of a flying camera of 1280 x 720 px from images of a data set.
 
-    Evenly spread over the evaluation sequences, so that their poses are as hard to find as in flight.
-    Raises InputError where the data set holds no images.
+    The frames are evenly spread over the evaluation sequences, so that their poses are as hard to find as in
+    flight.
+
+    Parameters
+    ----------
+    folder : Path
+        Bundle.
+    dataset : Path
+        Data set.
+    scratch : Path
+        Folder for the frames and the camera file.
+    count : int
+        Number of frames.
+
+    Returns
+    -------
+    frames : list of Path
+        PNG files.
+    camera : Path
+        Camera file.
+
+    Raises
+    ------
+    InputError
+        If the data set has no images.
     """
     view = read_bundle(folder).camera
     camera = Camera.from_horizontal_fov(
-        *_SIZE, min(view.horizontal_fov_deg * _WIDER, 160), _DISTORTION
+        *_SIZE, min(view.horizontal_fov_deg * _FIELD_OF_VIEW_FACTOR, 160), _DISTORTION
     )
     rays = camera.unproject(
         np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in _SIZE)), -1).reshape(-1, 2)
     )
     with Dataset(dataset) as data:
-        groups = [group for group in judged_groups(data) if group.image_size is not None]
+        groups = [group for group in evaluation_groups(data) if group.image_size is not None]
         chosen = [
             (group, int(row))
             for group in groups
             for row in spread_rows(len(group), -(-count // len(groups)))
         ]
         if not chosen:
-            raise InputError("holds no images to time poses of", path=dataset)
+            raise InputError("has no images to benchmark with", path=dataset)
         paths = []
         for k, (group, row) in enumerate(chosen[:count]):
             image = cv2.cvtColor(group.image(row), cv2.COLOR_RGB2BGR)
@@ -103,7 +170,7 @@ def flown_frames(folder: Path, dataset: Path, scratch: Path, count: int) -> tupl
     return paths, scratch / "camera.json"
 
 
-def _timed(
+def _run_benchmark(
     folder: Path, precision: str, frames: Sequence[Path], camera: Path, options: BenchmarkOptions
 ) -> dict[str, Any]:
     root = str(Path(__file__).resolve().parents[2])
@@ -111,7 +178,7 @@ def _timed(
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH", "")))),
-        # NumPy's own threads would be counted as ours.
+        # Otherwise NumPy's own threads would be counted as well.
         **{f"{library}_NUM_THREADS": threads for library in ("OMP", "OPENBLAS", "MKL")},
     }
     command = [sys.executable, "-P", "-m", "spn_model.onboard.benchmark", str(folder)]
@@ -122,6 +189,6 @@ def _timed(
         command, capture_output=True, text=True, env=environment, timeout=_TIMEOUT_S, check=False
     )
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-        raise StageError(f"the program on board failed: {last.removeprefix('Error: ')}")
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise StageError(f"the onboard program failed: {last.removeprefix('Error: ')}")
     return dict(json.loads(done.stdout))

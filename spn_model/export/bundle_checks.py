@@ -1,4 +1,4 @@
-"""What a bundle loses against the network that it was made of: parity, and errors in 8 bits."""
+"""Checks of a bundle against its network: parity with PyTorch, and errors after quantization."""
 
 from __future__ import annotations
 
@@ -19,32 +19,46 @@ from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, INT8
 from spn_model.onboard.localizer import Localizer
 
-_LEAST_POSES = 8  # with fewer of them outputs alone are compared
+_MIN_POSES = 8  # with fewer poses only the outputs are compared
 
 
 @dataclass(frozen=True, kw_only=True)
 class BundleOptions:
-    """What goes into a bundle, and how it is checked."""
+    """What goes into a bundle, and how it is checked.
 
-    int8: bool = True  # the 8-bit graph as well
-    calibration_images: int = 64  # training images that the ranges of 8-bit activations come from
-    parity_images: int = 16  # on which onnxruntime is compared with PyTorch
-    loss_images: int = 500  # of each evaluation sequence, on which both graphs are judged, at most
-    output_tolerance: float = (
-        1e-4  # largest difference of an output, as a share of its largest value
-    )
-    # difference that a quarter of the poses stay below, in their own standard deviations
+    Attributes
+    ----------
+    int8 : bool
+        Whether the bundle also holds an 8-bit graph.
+    calibration_images : int
+        Training images that determine the ranges of 8-bit activations.
+    parity_images : int
+        Images on which onnxruntime is compared with PyTorch.
+    loss_images : int
+        Maximum number of images per evaluation sequence on which the errors of both graphs are measured.
+    output_tolerance : float
+        Largest allowed difference of an output, as a share of its largest value.
+    pose_tolerance : float
+        Difference that at least a quarter of the poses stay below, in their own standard deviations.
+    """
+
+    int8: bool = True
+    calibration_images: int = 64
+    parity_images: int = 16
+    loss_images: int = 500
+    output_tolerance: float = 1e-4
     pose_tolerance: float = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parity:
-    """PyTorch against onnxruntime on real images.
+    """Differences between PyTorch and onnxruntime on real images.
 
-    output : largest difference, as a share of an output's largest value. Medians over images that both have
-    a pose of: position in the world's unit, rotation_deg, sigmas (the larger of both, by the pose's own
-    standard deviations). largest_sigmas, and disagree, the images of which only one has a pose: where a
-    network is unsure, RANSAC may take rounding for a reason to choose otherwise.
+    output : largest difference, as a share of an output's largest value. Medians over the images for which
+    both have a pose: position in the world's unit, rotation_deg, and sigmas (the larger of both, in the
+    pose's own standard deviations). largest_sigmas : maximum of the latter. disagree : number of images for
+    which only one of the two has a pose. If a network is unsure, rounding may make RANSAC choose another
+    pose.
     """
 
     images: int
@@ -58,7 +72,7 @@ class Parity:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupErrors:
-    """Medians of one graph over images of a group; one without a pose is infinitely wrong."""
+    """Median errors of one graph on a group; an image without a pose counts as an infinite error."""
 
     group: str
     precision: str
@@ -68,8 +82,11 @@ class GroupErrors:
     rotation_deg: float
 
 
-def judged_groups(data: Dataset) -> list[DatasetGroup]:
-    """Test groups with frames; without one, the validation groups."""
+def evaluation_groups(data: Dataset) -> list[DatasetGroup]:
+    """Return the non-empty groups to evaluate on: test groups, otherwise validation groups.
+
+    A data set with neither is evaluated on its training groups.
+    """
     for role in (Role.TEST, Role.VALIDATION, Role.TRAIN):
         if found := [group for group in data.of_role(role) if len(group)]:
             return found
@@ -84,48 +101,53 @@ def compare_with_pytorch(
     options: BundleOptions,
     progress: Progress,
 ) -> Parity:
-    """Compare, or raise GeometryError."""
+    """Measure the parity of the float32 graph with PyTorch.
+
+    Raises GeometryError if outputs or poses differ by more than the tolerances.
+    """
     localizer = Localizer(folder)
-    groups = judged_groups(data)
+    groups = evaluation_groups(data)
     each = max(1, options.parity_images // len(groups))
     chosen = [(group, int(row)) for group in groups for row in spread_rows(len(group), each)]
-    output, disagree, apart = 0.0, 0, []
+    output, disagree, pose_differences = 0.0, 0, []
     for done, (group, row) in enumerate(chosen):
         progress("parity", done, len(chosen))
         image, matrix = group.image(row), group.intrinsics[row]
-        sized = deployed.sized(image)
+        sized = deployed.graph_input(image)
         outputs = localizer.run(sized)
         for found, wanted in zip(outputs, reference(deployed, sized), strict=True):
             size = max(float(np.abs(wanted).max()), 1e-6)
             output = max(output, float(np.abs(found - wanted).max()) / size)
-        # Its own poses come to be by another path than the bundle's.
-        own = checkpoint.model.estimate(image[None], matrix[None])
-        told = localizer.decode(outputs, _scaled(matrix, deployed, image))
-        disagree += bool(told.reason) != bool(own.reasons[0])
-        if not told.reason and not own.reasons[0]:
-            position, rotation_deg = (float(v[0]) for v in pose_errors(told.poses, own.poses))
-            variance = np.diag(own.covariance[0])
+        # The network decodes its own outputs, independently of the bundle's decoder.
+        torch_pose = checkpoint.model.estimate(image[None], matrix[None])
+        located = localizer.decode(outputs, _scaled(matrix, deployed, image))
+        disagree += bool(located.reason) != bool(torch_pose.reasons[0])
+        if not located.reason and not torch_pose.reasons[0]:
+            position, rotation_deg = (
+                float(v[0]) for v in pose_errors(located.poses, torch_pose.poses)
+            )
+            variance = np.diag(torch_pose.covariance[0])
             stated_m, stated = np.sqrt([variance[:3].sum(), variance[3:].sum()])
             sigmas = max(position / stated_m, math.radians(rotation_deg) / stated)
-            apart.append((position, rotation_deg, sigmas))
+            pose_differences.append((position, rotation_deg, sigmas))
     progress("parity", len(chosen), len(chosen))
-    # A network that finds no pose at all has none that could differ.
-    differences = np.array(apart or [(0.0, 0.0, 0.0)])
+    # A network without any pose has no differences.
+    differences = np.array(pose_differences or [(0.0, 0.0, 0.0)])
     position, rotation_deg, sigmas = (float(v) for v in np.median(differences, axis=0))
     if not output <= options.output_tolerance:
         raise GeometryError(
-            f"the exported graph computes something else than the network: an output differs by "
-            f"{output:.1e} of its largest value, {options.output_tolerance:.0e} is allowed"
+            f"the exported graph does not match the network: an output differs by "
+            f"{output:.1e} of its largest value (tolerance {options.output_tolerance:.0e})"
         )
-    # A graph that computes or is decoded otherwise moves every pose; rounding moves those of which RANSAC is
-    # unsure, and of a hardly trained network these are many.
-    alike = float(np.quantile(differences[:, 2], 0.25))
-    is_known = len(apart) >= min(_LEAST_POSES, len(chosen))
-    if (is_known and not alike <= options.pose_tolerance) or disagree > len(chosen) / 2:
+    # A wrong graph or decoder moves every pose. Rounding moves only poses for which RANSAC is unsure; a
+    # barely trained network has many of these.
+    lower_quartile = float(np.quantile(differences[:, 2], 0.25))
+    is_known = len(pose_differences) >= min(_MIN_POSES, len(chosen))
+    if (is_known and not lower_quartile <= options.pose_tolerance) or disagree > len(chosen) / 2:
         raise GeometryError(
-            f"the bundle gives other poses than the network: three quarters of them differ by more than "
-            f"{alike:.1e} of their standard deviations, and "
-            f"{disagree} of {len(chosen)} images have a pose by one of the two alone"
+            f"the bundle's poses differ from the network's: three quarters of them by more than "
+            f"{lower_quartile:.1e} standard deviations (tolerance {options.pose_tolerance:g}), and "
+            f"{disagree} of {len(chosen)} images have a pose from only one of the two"
         )
     return Parity(
         images=len(chosen),
@@ -139,7 +161,7 @@ def compare_with_pytorch(
 
 
 def _scaled(matrix: np.ndarray, deployed: Deployment, image: np.ndarray) -> np.ndarray:
-    """K of the data set's image as the graph takes it."""
+    """Scale the camera matrix of a data set image to the input size of the graph."""
     shrunk = np.diag([deployed.size[0] / image.shape[1], deployed.size[1] / image.shape[0], 1.0])
     scaled: np.ndarray = shrunk @ matrix
     return scaled
@@ -148,10 +170,11 @@ def _scaled(matrix: np.ndarray, deployed: Deployment, image: np.ndarray) -> np.n
 def measure_errors(
     folder: Path, deployed: Deployment, data: Dataset, options: BundleOptions, progress: Progress
 ) -> tuple[GroupErrors, ...]:
+    """Measure the median errors of each graph on each evaluation group."""
     found = []
     precisions = [FLOAT32, INT8] if options.int8 else [FLOAT32]
     localizers = {p: Localizer(folder, int8=p == INT8) for p in precisions}
-    for group in judged_groups(data):
+    for group in evaluation_groups(data):
         rows = spread_rows(len(group), options.loss_images)
         for precision, localizer in localizers.items():
             poses = Poses.unknown(len(rows))
@@ -159,7 +182,7 @@ def measure_errors(
                 progress(f"{group.name} {precision}", k, len(rows))
                 image = group.image(int(row))
                 matrix = _scaled(group.intrinsics[row], deployed, image)
-                located = localizer.decode(localizer.run(deployed.sized(image)), matrix)
+                located = localizer.decode(localizer.run(deployed.graph_input(image)), matrix)
                 poses.centers[k] = located.poses.centers[0]
                 poses.quats_wxyz[k] = located.poses.quats_wxyz[0]
             error, error_deg = pose_errors(poses, group.poses[rows])

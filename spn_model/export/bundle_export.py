@@ -1,4 +1,4 @@
-"""A trained network as a bundle for the drone: graphs, what makes poses of them, what they are worth."""
+"""Export of a trained network as a bundle for the drone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from spn_model.onboard.bundle import (
     VERSION,
     read_bundle,
     sha256_of,
-    verified,
+    verified_path,
 )
 
 
@@ -58,17 +58,45 @@ def export(
     metrics: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> ExportedBundle:
-    """Write a bundle of a trained network; the folder appears whole, or not at all.
+    """Write a bundle of a trained network; the folder is replaced atomically.
 
-    dataset : that it was trained on, or another of its world: 8 bits are calibrated on its training images
-    and errors measured on its evaluation sequences. facts : of the run, plain values, for the card; metrics :
-    of the run's evaluation, as metrics.json has it, None where there is none.
-    Raises StageError where the folder exists and may not be replaced, or the disk does not take it;
-    InputError where data set and network do not belong together; GeometryError where the graph gives
-    other poses than PyTorch.
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Trained network.
+    dataset : Path
+        The data set of the training, or another one of the same world. Its training images calibrate the
+        8-bit graph, its evaluation sequences measure the errors.
+    folder : Path
+        Target folder.
+    facts : mapping
+        Plain values of the run, for the model card.
+    progress : Progress
+        Receives the step, items done, and items in total.
+    options : BundleOptions, optional
+        Content and checks of the bundle.
+    world_names : sequence of str
+        Names of the fingerprints that identify the world of a data set.
+    metrics : mapping, optional
+        Evaluation of the run, as in metrics.json; None if there is none.
+    overwrite : bool
+        Whether a bundle in the folder may be replaced.
+
+    Returns
+    -------
+    ExportedBundle
+
+    Raises
+    ------
+    StageError
+        If the folder may not be replaced, or the disk does not accept the files.
+    InputError
+        If data set and network do not belong together.
+    GeometryError
+        If the graph gives other poses than PyTorch.
     """
     options = options or BundleOptions()
-    _check_free(folder, overwrite)
+    _check_replaceable(folder, overwrite)
     partial = folder.with_name(f".{folder.name}.partial")
     with Dataset(dataset) as data:
         check_world(
@@ -79,8 +107,8 @@ def export(
             content_fingerprint(dataset),
         )
         deployed = deployment(checkpoint.model, checkpoint.view.size)
-        camera = _camera(checkpoint, data).scaled(*deployed.size)
-        view = replace(checkpoint.view, camera=_camera(checkpoint, data))
+        camera = _input_camera(checkpoint, data).scaled(*deployed.size)
+        view = replace(checkpoint.view, camera=_input_camera(checkpoint, data))
         try:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
@@ -93,7 +121,7 @@ def export(
                 "view": view.to_json(),
                 "input": camera_to_json(camera),
                 "decoding": deployed.decoding.to_json(),
-                "graphs": _graphs(partial),
+                "graphs": _graph_entries(partial),
                 "run": dict(facts),
             }
             write_json(partial / DOCUMENT, document)
@@ -102,7 +130,7 @@ def export(
             made = ExportedBundle(
                 folder=folder,
                 units=view.units,
-                bytes={name: entry["bytes"] for name, entry in _graphs(partial).items()},
+                bytes={name: entry["bytes"] for name, entry in _graph_entries(partial).items()},
                 parity=parity,
                 errors=errors,
             )
@@ -122,52 +150,66 @@ def export(
     return made
 
 
-def is_made_of(folder: Path, facts: Mapping[str, Any], options: BundleOptions) -> bool:
-    """Whether a whole bundle stands there that another export would make again."""
+def is_up_to_date(folder: Path, facts: Mapping[str, Any], options: BundleOptions) -> bool:
+    """Return whether a folder holds a complete bundle that another export would reproduce.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the bundle.
+    facts : mapping
+        Facts of the run that the bundle has to state.
+    options : BundleOptions
+        Options that the bundle has to be made with.
+
+    Returns
+    -------
+    bool
+    """
     try:
         bundle = read_bundle(folder)
         document = bundle.document
         measured, run = document["measured"], document["run"]
         same = all(run[name] == value for name, value in facts.items())
         for graph in bundle.graphs.values():
-            verified(graph)
+            verified_path(graph)
         return bool(same and measured["options"] == asdict(options))
     except (SpnError, KeyError, TypeError):
         return False
 
 
-def _check_free(folder: Path, overwrite: bool) -> None:
-    """Raises StageError where something stands that may not be replaced: only a bundle ever is."""
+def _check_replaceable(folder: Path, overwrite: bool) -> None:
+    """Raise StageError if the folder holds something that may not be replaced; only bundles ever are."""
     if not folder.exists():
         return
     if not overwrite:
-        raise StageError(f"{folder} stands already; --overwrite makes it anew")
+        raise StageError(f"{folder} already exists; use --overwrite to replace it")
     ours = {DOCUMENT, CARD, *GRAPHS.values()}
     foreign = (
         [] if not folder.is_dir() else [p.name for p in folder.iterdir() if p.name not in ours]
     )
     if foreign or not (folder / DOCUMENT).is_file():
         raise StageError(
-            f"{folder} holds something else than a bundle, and is left as it is; name another folder"
+            f"{folder} holds something other than a bundle and was left unchanged; choose another folder"
         )
 
 
-def _camera(checkpoint: Checkpoint, data: Dataset) -> Camera:
-    """The network's own; for one that takes any camera and was trained on several, their median pinhole."""
+def _input_camera(checkpoint: Checkpoint, data: Dataset) -> Camera:
+    """Return the network's camera, or the median pinhole of its training images if each had its own."""
     view = checkpoint.view
     if view.camera is not None:
         return view.camera
     if not checkpoint.model.any_camera:
         raise InputError(
-            "the network was trained on images of several cameras, and its kind knows one: on board there "
-            "would be none to render into. Train it on a data set with a common camera",
+            "the network was trained on images of several cameras, but its kind supports only one, so there "
+            "is no camera to render into on board; train it on a data set with a common camera",
             path=data.path,
         )
-    matrices = _training(data).intrinsics
+    matrices = _training_group(data).intrinsics
     known = matrices[np.isfinite(matrices).all(axis=(1, 2))]
     if not len(known):
         raise InputError(
-            "the cameras of its training images are not known: on board there would be none to render into",
+            "the cameras of its training images are unknown, so there is no camera to render into on board",
             path=data.path,
         )
     middle = np.median(known, axis=0)
@@ -175,11 +217,11 @@ def _camera(checkpoint: Checkpoint, data: Dataset) -> Camera:
     return Camera("PINHOLE", *view.size, params)
 
 
-def _training(data: Dataset) -> DatasetGroup:
+def _training_group(data: Dataset) -> DatasetGroup:
     for group in data.of_role(Role.TRAIN):
         if len(group):
             return group
-    raise InputError("holds no training images to calibrate 8 bits on", path=data.path)
+    raise InputError("has no training images to calibrate the 8-bit graph with", path=data.path)
 
 
 def _write_graphs(
@@ -189,19 +231,19 @@ def _write_graphs(
     write_graph(folder / GRAPHS[FLOAT32], deployed)
     progress("float32", 1, 1)
     if options.int8:
-        training = _training(data)
+        training = _training_group(data)
         rows = spread_rows(len(training), options.calibration_images)
 
         def images() -> Any:
             for done, row in enumerate(rows):
                 progress("int8", done, len(rows))
-                yield deployed.sized(training.image(int(row)))
+                yield deployed.graph_input(training.image(int(row)))
 
         quantize(folder / GRAPHS[FLOAT32], folder / GRAPHS[INT8], images())
         progress("int8", len(rows), len(rows))
 
 
-def _graphs(folder: Path) -> dict[str, dict[str, Any]]:
+def _graph_entries(folder: Path) -> dict[str, dict[str, Any]]:
     paths = {p: folder / name for p, name in GRAPHS.items() if (folder / name).is_file()}
     return {
         precision: {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}

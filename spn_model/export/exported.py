@@ -1,4 +1,4 @@
-"""What an export wrote, and what it measured."""
+"""Result of an export."""
 
 from __future__ import annotations
 
@@ -11,7 +11,23 @@ from spn_model.export.bundle_checks import GroupErrors, Parity
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportedBundle:
-    """What was written, and what was found. bytes : by precision; errors : float32, then int8, of a group."""
+    """What an export wrote and measured.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the bundle.
+    units : str
+        "m" or "model", of all lengths.
+    bytes : mapping of str to int
+        Sizes of the graph files by precision.
+    parity : Parity
+        Differences from PyTorch.
+    errors : tuple of GroupErrors
+        By group, float32 before int8.
+    notes : tuple of str
+        One sentence each.
+    """
 
     folder: Path
     units: str

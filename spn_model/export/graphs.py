@@ -1,4 +1,4 @@
-"""A member's network as an ONNX graph: bytes of an image in, what makes a pose out."""
+"""Export of a pose model to an ONNX graph: uint8 image in, inputs of the pose decoding out."""
 
 from __future__ import annotations
 
@@ -25,25 +25,26 @@ _OPSET = 17  # read by onnxruntime from 1.12 on
 
 @dataclass(frozen=True, eq=False)
 class Deployment:
-    """How a member becomes a graph.
+    """A pose model prepared for export.
 
-    network : images (1, 3, h, w) as ImageNet's -> outputs in the order of decoding.outputs; decoding : what
-    makes poses of them on board; size : (width, height) of the graph's input.
+    network : maps images (1, 3, h, w), normalised as for ImageNet, to outputs in the order of
+    decoding.outputs; decoding : converts the outputs to a pose on board; size : (width, height) of the
+    graph's input.
     """
 
     network: nn.Module
     decoding: Decoding
     size: tuple[int, int]
 
-    def sized(self, image: np.ndarray) -> np.ndarray:
-        """(1, h, w, 3): a data set's image as the graph takes it."""
+    def graph_input(self, image: np.ndarray) -> np.ndarray:
+        """Resize a data set image to the input of the graph, (1, h, w, 3)."""
         return np.ascontiguousarray(resized(image, self.size[0]))[None]
 
 
 def deployment(model: PoseModel, size: tuple[int, int]) -> Deployment:
-    """For images of size (width, height), as the data set has them.
+    """Prepare a pose model for images of a size (width, height), as in the data set.
 
-    Raises InputError for a kind of network that has no graph.
+    Raises InputError for a kind of network that cannot be exported.
     """
     if isinstance(model, SceneCoordinatesModel):
         cells = CellDecoding(
@@ -60,14 +61,14 @@ def deployment(model: PoseModel, size: tuple[int, int]) -> Deployment:
 
 
 def write_graph(path: Path, deployed: Deployment) -> None:
-    """Write the float32 graph: uint8 RGB (1, h, w, 3) in, outputs as `deployed.decoding` names them."""
+    """Write the float32 graph: uint8 RGB (1, h, w, 3) in, outputs as named by `deployed.decoding`."""
     width, height = deployed.size
-    graph = _FromBytes(copy.deepcopy(deployed.network).float().cpu()).eval()
+    graph = _NormalisedInput(copy.deepcopy(deployed.network).float().cpu()).eval()
     example = torch.zeros((1, height, width, 3), dtype=torch.uint8)
-    _fix_pooling(graph, example)
+    _replace_adaptive_pooling(graph, example)
     with warnings.catch_warnings(), torch.no_grad():
-        # The exporter by tracing is called old; that by torch.export needs three packages more. What it
-        # says of constants that it does not fold, onnxruntime folds.
+        # The tracing exporter is deprecated, but the one based on torch.export needs three more packages. Its
+        # warnings concern constants that are not folded; onnxruntime folds them.
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.simplefilter("ignore", UserWarning)
         torch.onnx.export(
@@ -83,15 +84,15 @@ def write_graph(path: Path, deployed: Deployment) -> None:
 
 @torch.inference_mode()
 def reference(deployed: Deployment, image: np.ndarray) -> list[np.ndarray]:
-    """What PyTorch itself makes of an image (1, h, w, 3) uint8."""
+    """Return the outputs of PyTorch for an image (1, h, w, 3) uint8."""
     device = next(deployed.network.parameters()).device
-    graph = _FromBytes(deployed.network).to(device).eval()
+    graph = _NormalisedInput(deployed.network).to(device).eval()
     outputs: Sequence[Tensor] = graph(torch.from_numpy(image).to(device))
     return [output.cpu().numpy() for output in outputs]
 
 
-class _FromBytes(nn.Module):
-    """Images (1, h, w, 3) uint8 for a network that takes (1, 3, h, w), normalised as ImageNet's."""
+class _NormalisedInput(nn.Module):
+    """Converts images (1, h, w, 3) uint8 to (1, 3, h, w) normalised as for ImageNet, and runs a network."""
 
     mean: Tensor
     std: Tensor
@@ -109,23 +110,29 @@ class _FromBytes(nn.Module):
         return tuple(outputs)
 
 
-class _CellMeans(nn.Module):
-    """AdaptiveAvgPool2d for one size of maps, as two products: ONNX has no pooling into uneven cells."""
+class _FixedAdaptivePool(nn.Module):
+    """AdaptiveAvgPool2d for maps of a fixed size, as two matrix products.
+
+    ONNX has no pooling into cells of different sizes.
+    """
 
     across: Tensor
     down: Tensor
 
     def __init__(self, maps: tuple[int, int], cells: tuple[int, int]):
         super().__init__()
-        self.register_buffer("down", _shares(maps[0], cells[0]))
-        self.register_buffer("across", _shares(maps[1], cells[1]).T.contiguous())
+        self.register_buffer("down", _pooling_matrix(maps[0], cells[0]))
+        self.register_buffer("across", _pooling_matrix(maps[1], cells[1]).T.contiguous())
 
     def forward(self, maps: Tensor) -> Tensor:
         return self.down @ maps @ self.across
 
 
-def _shares(pixels: int, cells: int) -> Tensor:
-    """(cells, pixels): each row the mean over pixels floor(k n / m) to ceil((k + 1) n / m), as torch's."""
+def _pooling_matrix(pixels: int, cells: int) -> Tensor:
+    """Return the pooling matrix (cells, pixels) of one axis.
+
+    Each row averages pixels floor(k n / m) to ceil((k + 1) n / m), as torch does.
+    """
     shares = torch.zeros(cells, pixels)
     for k in range(cells):
         first, last = k * pixels // cells, -(-(k + 1) * pixels // cells)
@@ -133,8 +140,8 @@ def _shares(pixels: int, cells: int) -> Tensor:
     return shares
 
 
-def _fix_pooling(graph: nn.Module, example: Tensor) -> None:
-    """Put `_CellMeans` in the place of each adaptive pooling that the example runs through."""
+def _replace_adaptive_pooling(graph: nn.Module, example: Tensor) -> None:
+    """Replace each adaptive pooling that the example passes through by `_FixedAdaptivePool`."""
     sizes: dict[nn.Module, tuple[int, int]] = {}
 
     def note(module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
@@ -152,5 +159,7 @@ def _fix_pooling(graph: nn.Module, example: Tensor) -> None:
                 cells = module(torch.zeros(1, 1, *sizes[module])).shape[2:]
             parent, _, child = name.rpartition(".")
             setattr(
-                graph.get_submodule(parent), child, _CellMeans(sizes[module], (cells[0], cells[1]))
+                graph.get_submodule(parent),
+                child,
+                _FixedAdaptivePool(sizes[module], (cells[0], cells[1])),
             )

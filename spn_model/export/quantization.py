@@ -1,4 +1,4 @@
-"""A float32 graph in 8 bits: weights by channel, activations by what training images make of them."""
+"""Post-training static quantization to 8 bits: per-channel weights, activation ranges from images."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from onnxruntime.quantization import (
 )
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
-# What computes in 8 bits; all else would only be wrapped into conversions.
-_LEARNT = ("Conv", "Gemm")
-_OPERATORS = [*_LEARNT, "MaxPool", "Relu", "LeakyRelu", "Concat"]
+# Operators that run in 8 bits; others would only be wrapped into conversions.
+_WEIGHTED = ("Conv", "Gemm")
+_OPERATORS = [*_WEIGHTED, "MaxPool", "Relu", "LeakyRelu", "Concat"]
 
 
 class _Images(CalibrationDataReader):  # type: ignore[misc]
@@ -32,17 +32,17 @@ class _Images(CalibrationDataReader):  # type: ignore[misc]
 
 
 def quantize(graph: Path, quantized: Path, images: Iterable[np.ndarray]) -> int:
-    """Write the 8-bit form of a float32 graph; the number of learnt operators that stay in float32.
+    """Write the 8-bit form of a float32 graph; return the number of weighted operators that stay in float32.
 
-    images : (1, h, w, 3) uint8, for the ranges of activations; each is used once. The last learnt operators
-    before the outputs stay as they are: what they lose, poses lose.
+    images : (1, h, w, 3) uint8, calibrate the ranges of activations; each is used once. The last weighted
+    operators before the outputs stay in float32, because their rounding would directly affect the poses.
     """
     with tempfile.TemporaryDirectory(dir=quantized.parent, prefix=".int8-") as folder:
         prepared = Path(folder) / "prepared.onnx"
-        # Shapes are fixed: onnx infers them, without symbols.
+        # Shapes are static, so symbolic shape inference is not needed.
         quant_pre_process(str(graph), str(prepared), skip_symbolic_shape=True)
         model = onnx.load(str(prepared))
-        kept = _last(model.graph)
+        kept = _output_layers(model.graph)
         quantize_static(
             str(prepared),
             str(quantized),
@@ -58,16 +58,16 @@ def quantize(graph: Path, quantized: Path, images: Iterable[np.ndarray]) -> int:
     return len(kept)
 
 
-def _last(graph: onnx.GraphProto) -> list[str]:
-    """Names of the learnt operators on whose outputs no other one depends."""
+def _output_layers(graph: onnx.GraphProto) -> list[str]:
+    """Return the names of weighted operators on whose outputs no other weighted operator depends."""
     makers = {output: node for node in graph.node for output in node.output}
-    used: set[str] = set()  # operators that another learnt one depends on
+    used: set[str] = set()  # operators that another weighted one depends on
     for node in graph.node:
-        if node.op_type in _LEARNT:
-            open_inputs = list(node.input)
-            while open_inputs:
-                maker = makers.get(open_inputs.pop())
+        if node.op_type in _WEIGHTED:
+            pending = list(node.input)
+            while pending:
+                maker = makers.get(pending.pop())
                 if maker is not None and maker.name not in used:
                     used.add(maker.name)
-                    open_inputs += maker.input
-    return [n.name for n in graph.node if n.op_type in _LEARNT and n.name not in used]
+                    pending += maker.input
+    return [n.name for n in graph.node if n.op_type in _WEIGHTED and n.name not in used]

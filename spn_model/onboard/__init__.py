@@ -1,0 +1,1 @@
+"""Onboard localization with a bundle: NumPy, OpenCV and onnxruntime only, without torch."""

@@ -1,6 +1,6 @@
-"""`python -m spn_model.onboard.benchmark BUNDLE FRAME... --camera FILE`: what a pose costs here, as JSON.
+"""Time the pose estimation of a bundle on this machine and print the result as JSON.
 
-A process of its own, for its memory to be that of the program on board.
+It runs in a process of its own, so that its memory is that of the onboard program.
 """
 
 from __future__ import annotations
@@ -30,19 +30,26 @@ _T = TypeVar("_T")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code: 0, or 1 with one line that says why bundle, camera or a frame cannot be used."""
+    """Run `python -m spn_model.onboard.benchmark BUNDLE FRAME... --camera FILE` and return its exit code.
+
+    The code is 1, with a one-line message, if bundle, camera or a frame cannot be used, and 0 otherwise.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m spn_model.onboard.benchmark", description=__doc__.partition("\n")[0]
     )
-    parser.add_argument("bundle", type=Path, help="folder that `spn-model export` made")
+    parser.add_argument("bundle", type=Path, help="bundle folder from `spn-model export`")
     parser.add_argument("frames", type=Path, nargs="+", help="images of the flying camera")
-    parser.add_argument("--camera", type=Path, required=True, help="the flying camera as JSON")
-    parser.add_argument("--int8", action="store_true", help="the network in 8 bits")
-    parser.add_argument("--threads", type=int, default=1, help="of the network (default 1)")
-    parser.add_argument("--poses", type=int, default=100, help="how many to time (default 100)")
+    parser.add_argument("--camera", type=Path, required=True, help="camera file (JSON)")
+    parser.add_argument("--int8", action="store_true", help="use the 8-bit graph")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="threads of the network and of OpenCV (default 1)"
+    )
+    parser.add_argument(
+        "--poses", type=int, default=100, help="number of poses to time (default 100)"
+    )
     given = parser.parse_args(arguments)
     if not (1 <= given.threads <= 256 and 1 <= given.poses <= 1_000_000):
-        parser.error("--threads lies from 1 to 256, --poses from 1 to 1000000")
+        parser.error("--threads must be between 1 and 256, --poses between 1 and 1000000")
     try:
         cv2.setNumThreads(given.threads)
         camera = read_camera(given.camera)
@@ -59,12 +66,12 @@ def main(arguments: list[str] | None = None) -> int:
 def measure(
     localizer: Localizer, images: Sequence[np.ndarray], camera: Camera, poses: int
 ) -> dict[str, Any]:
-    """Milliseconds of each step, of the clock and of the processor, p50 and p95 over `poses` poses of the
-    images (BGR) in turn.
+    """Time each step of `poses` poses of the images (BGR), used in turn.
 
-    `bare` is onnxruntime called on the same tensor, right before or right after our own call of it, by turns;
-    `overhead` the ratio of the medians of the processor's time. `located` : share of the poses that were
-    found. `memory_mb` : greatest of this process so far, None where the system does not tell.
+    Returns milliseconds of wall clock and CPU time, p50 and p95, by step. `bare` is onnxruntime called on the
+    same tensor, alternately right before and right after the localizer's own call; `overhead` is the ratio of
+    their median CPU times. `located` : share of frames with a pose. `memory_mb` : peak memory of this process
+    so far, None if the system does not report it.
     """
     session, names = localizer.session, localizer.bundle.decoding.outputs
     clocks = {"milliseconds": time.perf_counter, "cpu_milliseconds": time.process_time}
@@ -92,25 +99,25 @@ def measure(
             timed("bare", bare)
         found = timed("decoding", partial(localizer.decode, outputs))
         located += k >= 0 and not found.reason
-    told: dict[str, Any] = {}
+    quantiles: dict[str, Any] = {}
     for clock, by_name in steps.items():
         total = np.sum([by_name[name] for name in _STEPS], axis=0)
-        told[clock] = {
+        quantiles[clock] = {
             name: {"p50": float(np.median(values)), "p95": float(np.percentile(values, 95))}
             for name, values in {**by_name, "total": total}.items()
         }
     cpu = steps["cpu_milliseconds"]
     return {
-        **told,
+        **quantiles,
         "overhead": float(np.median(cpu["graph"]) / np.median(cpu["bare"])),
         "poses": poses,
         "located": located / poses,
         "frame": [images[0].shape[1], images[0].shape[0]],
-        "memory_mb": _greatest_memory_mb(),
+        "memory_mb": _peak_memory_mb(),
     }
 
 
-def _greatest_memory_mb() -> float | None:
+def _peak_memory_mb() -> float | None:
     status = Path("/proc/self/status")
     if not status.is_file():
         return None

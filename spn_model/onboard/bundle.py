@@ -1,6 +1,6 @@
-"""A bundle: a folder that holds a network for the drone and all that makes poses of its output; no torch.
+"""Bundle: a folder with an exported network and everything needed to convert its outputs to poses; no torch.
 
-The format is told in docs/export.md, for programs in other languages too.
+docs/export.md specifies the format, also for programs in other languages.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FLOAT32, INT8 = "float32", "int8"
 GRAPHS = {FLOAT32: "model.onnx", INT8: "model-int8.onnx"}
 INPUT = "image"  # of a graph: (1, h, w, 3) uint8 RGB
 CONVENTIONS = (
-    "World: East, North, Up in metres about the origin where units is 'm' and origin is not null. A pose is "
+    "World: East, North, Up in metres about the origin if units is 'm' and origin is not null. A pose is "
     "the camera centre in the world and a unit quaternion, scalar first, w >= 0, that turns world axes into "
     "camera axes (x right, y down, z forward): x_cam = R(q) (x_world - center). Covariance: 6x6 over "
     "(centre; rotation vector v in the camera frame, radians), R_true = exp(v) R, relative to the map. "
@@ -36,18 +36,30 @@ CONVENTIONS = (
     "parameters in COLMAP's order."
 )
 _MAX_DOCUMENT_BYTES = 1_000_000
-# What values of other kinds than those written raise where they are used.
+# Raised when values of a damaged bundle.json are used.
 _DAMAGE = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
 _MAX_SIDE_PX = 8192
-_MAX_GRAPH_BYTES = 2 * 10**9  # no ONNX file is larger
-# Of decoding's options: what costs time or memory; a pose needs three points, and a fourth to choose.
+_MAX_GRAPH_BYTES = 2 * 10**9  # ONNX files cannot be larger
+# Bounds of decoding options that cost time or memory. P3P needs three points and a fourth to disambiguate.
 _LIMITS = {"cells": (4, 100_000), "ransac_iterations": (1, 100_000), "min_inliers": (4, 100_000)}
 _SIZES = (0, 1e9)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellDecoding:
-    """Of outputs `coordinates` (1, 3, h, w) in the world and `log_scale` (1, 1, h, w): `decoding.decode`."""
+    """Decoding of scene coordinates by PnP, see `decoding.decode`.
+
+    The outputs are `coordinates` (1, 3, h, w) in the world and `log_scale` (1, 1, h, w).
+
+    Attributes
+    ----------
+    first_px : float
+        Centre of the first cell along both axes, in pixels.
+    stride_px : float
+        Distance between cells, in pixels.
+    options : DecodingOptions
+        Options of the decoding.
+    """
 
     kind = "scene-coordinates"
     outputs = ("coordinates", "log_scale")
@@ -56,12 +68,12 @@ class CellDecoding:
     options: DecodingOptions = field(default_factory=DecodingOptions)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values for JSON."""
         return {"kind": self.kind, **asdict(self)}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> CellDecoding:
-        """Raises KeyError, TypeError or ValueError where it is not what `to_json` gives."""
+        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid."""
         given = value["options"]
         options: dict[str, Any] = {}
         for own in fields(DecodingOptions):
@@ -77,23 +89,31 @@ class CellDecoding:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseDecoding:
-    """Of outputs `offset` (1, 3) from the centre in the world's unit, `quaternion` (1, 4) of any length, and
-    `log_std` (1, 6), logarithms of standard deviations along the axes of the covariance; center : (3,)."""
+    """Decoding of a directly regressed pose.
+
+    The outputs are `offset` (1, 3) from the centre in the world's unit, `quaternion` (1, 4) of any length,
+    and `log_std` (1, 6), logarithms of standard deviations along the axes of the covariance.
+
+    Attributes
+    ----------
+    center : ndarray, shape (3,)
+        Point in the world that offsets refer to.
+    """
 
     kind = "regression"
     outputs = ("offset", "quaternion", "log_std")
     center: np.ndarray
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values for JSON."""
         return {"kind": self.kind, "center": [float(v) for v in self.center]}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> PoseDecoding:
-        """Raises KeyError, TypeError or ValueError where it is not what `to_json` gives."""
+        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid."""
         center = value["center"]
         if not isinstance(center, list) or len(center) != 3:
-            raise ValueError(f"a centre of {center!r}")
+            raise ValueError(f"its centre is {center!r}")
         return cls(center=np.array([_number(v, -1e9, 1e9) for v in center]))
 
 
@@ -105,7 +125,7 @@ _DECODINGS: dict[str, type[CellDecoding] | type[PoseDecoding]] = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GraphFile:
-    """An ONNX file of a bundle."""
+    """ONNX file of a bundle."""
 
     path: Path
     bytes: int
@@ -114,9 +134,23 @@ class GraphFile:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bundle:
-    """What bundle.json says. view : of the images that the network was trained on, whose camera is known;
-    camera : the pinhole of the graph's input, the view's or a smaller one; graphs : by precision; document :
-    all of the file, with facts for people."""
+    """Content of bundle.json.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the bundle.
+    view : View
+        View that the network was trained on; its camera is known.
+    camera : Camera
+        Pinhole of the graph's input: that of the view, or a smaller one.
+    decoding : Decoding
+        How outputs are converted to a pose.
+    graphs : mapping of str to GraphFile
+        By precision.
+    document : mapping
+        The whole file, including facts for people.
+    """
 
     folder: Path
     view: View
@@ -127,10 +161,28 @@ class Bundle:
 
 
 def read_bundle(folder: Path) -> Bundle:
-    """Raises InputError where there is no bundle, FormatError where it is damaged or of a newer version."""
+    """Read the description of a bundle.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the bundle.
+
+    Returns
+    -------
+    Bundle
+        Its graph files are not checked yet, see `verified_path`.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a bundle.
+    FormatError
+        If bundle.json is damaged or of another version.
+    """
     path = folder / DOCUMENT
     if not path.is_file():
-        raise InputError(f"is no bundle: it holds no {DOCUMENT}", path=folder)
+        raise InputError(f"is not a bundle: it has no {DOCUMENT}", path=folder)
     try:
         if path.stat().st_size > _MAX_DOCUMENT_BYTES:
             raise ValueError(f"it is larger than {_MAX_DOCUMENT_BYTES // 1_000_000} MB")
@@ -139,16 +191,16 @@ def read_bundle(folder: Path) -> Bundle:
             raise ValueError(f"its format is not {FORMAT}")
         version = int(document["version"])
     except (*_DAMAGE, OSError, RecursionError) as error:
-        raise FormatError(f"{path}: is no description of a bundle ({error})") from error
+        raise FormatError(f"{path}: is not a valid bundle description ({error})") from error
     if version != VERSION:
         raise FormatError(
-            f"{path}: is of format {version}, this program reads {VERSION}; export the run anew, or update "
-            "the program"
+            f"{path}: has format {version}, but this program reads {VERSION}; export the run again, or "
+            "update the program"
         )
     try:
         camera = camera_from_json(document["input"])
         if camera.opencv_distortion.any() or max(camera.width, camera.height) > _MAX_SIDE_PX:
-            raise ValueError("its input is no pinhole, or too large")
+            raise ValueError("its input is not a pinhole, or too large")
         return Bundle(
             folder=folder,
             view=View.from_json(document["view"]),
@@ -161,38 +213,50 @@ def read_bundle(folder: Path) -> Bundle:
         raise FormatError(f"{path}: is damaged ({error!r})") from error
 
 
-def verified(graph: GraphFile) -> Path:
-    """The path of a graph whose content is the one that bundle.json was written for.
+def verified_path(graph: GraphFile) -> Path:
+    """Return the path of a graph after checking it against bundle.json.
 
-    Raises FormatError where it is missing, a link, or of another size or hash.
+    Parameters
+    ----------
+    graph : GraphFile
+        Entry of `Bundle.graphs`.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    FormatError
+        If the file is missing, is a link, or has another size or hash.
     """
     path = graph.path
     if path.is_symlink() or not path.is_file():
-        raise FormatError(f"{path}: is no file of the bundle; copy the whole folder")
+        raise FormatError(f"{path}: is not a regular file; copy the whole bundle folder again")
     size = path.stat().st_size
     if size != graph.bytes:
         raise FormatError(
-            f"{path}: has {size} bytes, the bundle was made with {graph.bytes}; copy it again"
+            f"{path}: has {size} bytes, but {DOCUMENT} says {graph.bytes}; copy it again"
         )
     if sha256_of(path) != graph.sha256:
-        raise FormatError(f"{path}: is not the file that the bundle was made with; copy it again")
+        raise FormatError(f"{path}: its SHA-256 differs from {DOCUMENT}; copy it again")
     return path
 
 
 def sha256_of(path: Path) -> str:
-    """Hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with path.open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def _decoding(value: Mapping[str, Any]) -> Decoding:
     if value["kind"] not in _DECODINGS:
-        raise ValueError(f"its decoding {value['kind']!r} is none of {', '.join(_DECODINGS)}")
+        raise ValueError(f"its decoding {value['kind']!r} is not one of {', '.join(_DECODINGS)}")
     return _DECODINGS[value["kind"]].from_json(value)
 
 
 def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> GraphFile:
-    # A name in the file is compared, never used as a path.
+    # The name in the file is only compared, never used as a path.
     if GRAPHS.get(precision) != entry["file"]:
         raise ValueError(f"its {precision} graph is {entry['file']!r}")
     digest = str(entry["sha256"])
@@ -205,7 +269,7 @@ def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> GraphFile:
 
 def _number(value: Any, low: float, high: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is no number")
+        raise TypeError(f"{value!r} is not a number")
     if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{value!r} lies outside {low} to {high}")
+        raise ValueError(f"{value!r} is outside {low} to {high}")
     return float(value)

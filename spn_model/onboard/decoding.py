@@ -1,4 +1,4 @@
-"""The pose of a camera from scene coordinates: NumPy and OpenCV alone, as on board."""
+"""Camera pose from scene coordinates by P3P, RANSAC and robust refinement, with NumPy and OpenCV only."""
 
 from __future__ import annotations
 
@@ -10,33 +10,62 @@ import numpy as np
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, rotations_from_vectors
 
-# Of the robust weight in each step, in units of its last: a start some pixels off finds its way.
-_REACH = (4.0, 2.0, *[1.0] * 10)
+# Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
+# few pixels still converges.
+_ROBUST_SCALES = (4.0, 2.0, *[1.0] * 10)
 _CONVERGED_PX = 1e-3
-_LEAST_SLOPE = 0.2  # where cells contradict each other, the covariance grows at most by its square
+_MIN_SLOPE = 0.2  # bounds the growth of the covariance (1 / slope^2) if cells contradict each other
 
 
 @dataclass(frozen=True, kw_only=True)
 class DecodingOptions:
-    """How a pose is found among cells of which many are wrong."""
+    """Options of pose estimation from scene coordinates, of which many may be wrong.
 
-    cells: int = 700  # the surest ones, which are used
-    ransac_px: float = 10.0  # distance beyond which a cell disagrees with a first pose
-    ransac_iterations: int = 200  # at most
+    Attributes
+    ----------
+    cells : int
+        Number of cells to use, those with the smallest scale.
+    ransac_px : float
+        Inlier threshold of RANSAC: reprojection error in pixels.
+    ransac_iterations : int
+        Maximum number of RANSAC iterations.
+    min_inliers : int
+        Minimum number of inliers.
+    floor_px : float
+        Standard deviation of a perfect cell in pixels.
+    robust : float
+        Residual, in standard deviations, at which the weight of a cell drops to a quarter.
+    cells_per_observation : float
+        Number of cells that carry as much information as one independent observation, because the errors of
+        neighbouring cells are correlated.
+    largest_scale : float
+        Maximum scale of a cell in the world's unit; cells above it are not used. 0 disables the limit.
+    """
+
+    cells: int = 700
+    ransac_px: float = 10.0
+    ransac_iterations: int = 200
     min_inliers: int = 12
-    floor_px: float = 1.0  # standard deviation of a perfect cell
-    robust: float = 3.0  # residual, in standard deviations, at which a cell counts a quarter
-    # Errors of neighbouring cells are alike: as many of them tell as much as one by itself.
+    floor_px: float = 1.0
+    robust: float = 3.0
     cells_per_observation: float = 16.0
-    largest_scale: float = (
-        0.0  # in the world's unit; a cell that is less sure is not used; 0: any is
-    )
+    largest_scale: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """poses : (1,); covariance : (6, 6) over the centre (metres) and a rotation vector in the camera frame
-    (radians), R_true = exp(v) @ R; inliers : cells of those used that agree with it; used : cells tried.
+    """Pose estimated from scene coordinates.
+
+    Attributes
+    ----------
+    poses : Poses
+        One pose.
+    covariance : ndarray, shape (6, 6)
+        Over the centre (metres) and a rotation vector in the camera frame (radians), R_true = exp(v) @ R.
+    inliers : int
+        Cells that agree with the pose.
+    used : int
+        Cells that were used.
     """
 
     poses: Poses
@@ -54,59 +83,89 @@ def decode(
     stride_px: float,
     options: DecodingOptions | None = None,
 ) -> PoseEstimate:
-    """From coordinates (3, h, w) and log scales (h, w) of cells, seen by a pinhole of K (3, 3).
+    """Estimate a camera pose from scene coordinates.
 
-    The centre of the first cell lies at (first_px, first_px), the next ones stride_px on, in COLMAP's
-    pixels, as K is. P3P in RANSAC on the surest cells, then least squares over all of them, each weighted
-    by its own certainty and by its residual (Geman and McClure 1987). Raises GeometryError where too few
-    cells agree on any pose.
+    P3P in RANSAC on the cells with the smallest scale, then iteratively reweighted least squares over all of
+    them. The weight of a cell depends on its own scale and on its residual (Geman-McClure).
+
+    Parameters
+    ----------
+    coordinates : ndarray, shape (3, h, w)
+        Point in the world for each cell.
+    log_scale : ndarray, shape (h, w)
+        Logarithm of the scale of its isotropic Laplace error, in the world's unit.
+    matrix : ndarray, shape (3, 3)
+        Camera matrix K of the pinhole.
+    first_px : float
+        Centre of the first cell along both axes, in COLMAP's pixels, as K.
+    stride_px : float
+        Distance between cells in pixels.
+    options : DecodingOptions, optional
+        Options of the estimation.
+
+    Returns
+    -------
+    PoseEstimate
+
+    Raises
+    ------
+    GeometryError
+        If too few cells agree on any pose.
+
+    Notes ----- The covariance is the sandwich estimator of the last step (Huber 1967): it uses the scatter of
+    the residuals rather than the scales of the cells, times `cells_per_observation`.
+
+    References
+    ----------
+    Geman, McClure 1987, "Statistical methods for tomographic image reconstruction".
     """
     options = options or DecodingOptions()
     columns = log_scale.shape[1]
-    surest = np.argsort(log_scale, axis=None)[: options.cells]
-    xyz = coordinates.reshape(3, -1).T[surest].astype(np.float64)
-    # Along each axis, an isotropic Laplace distribution in three dimensions varies by twice its scale.
-    sigma_m = 2 * np.exp(log_scale.ravel()[surest].astype(np.float64))
-    at = np.stack([surest % columns, surest // columns], axis=1) * stride_px + first_px
+    selected = np.argsort(log_scale, axis=None)[: options.cells]
+    xyz = coordinates.reshape(3, -1).T[selected].astype(np.float64)
+    # An isotropic 3D Laplace distribution has a standard deviation of twice its scale along each axis.
+    sigma_m = 2 * np.exp(log_scale.ravel()[selected].astype(np.float64))
+    at = np.stack([selected % columns, selected // columns], axis=1) * stride_px + first_px
     finite = np.isfinite(xyz).all(axis=1) & np.isfinite(sigma_m)
     if options.largest_scale:
         finite &= sigma_m <= 2 * options.largest_scale
     xyz, sigma_m, at = xyz[finite], sigma_m[finite], at[finite]
     if len(xyz) < options.min_inliers:
-        raise GeometryError(
-            f"{len(xyz)} cells are sure of what they show, need {options.min_inliers}"
-        )
+        raise GeometryError(f"only {len(xyz)} cells are confident, need {options.min_inliers}")
     center, rotation = _first_pose(xyz, at, matrix, options)
     focal_px = np.sqrt(matrix[0, 0] * matrix[1, 1])
-    for reach in options.robust * np.array(_REACH):
+    for width in options.robust * np.array(_ROBUST_SCALES):
         in_camera = (xyz - center) @ rotation.T
         ahead = in_camera[:, 2] > 0
         x = in_camera[ahead]
         if len(x) < options.min_inliers:
-            raise GeometryError(f"{len(x)} cells lie before the camera, need {options.min_inliers}")
-        residuals, by_pose = _linearised(x, at[ahead], matrix, rotation)
+            raise GeometryError(
+                f"only {len(x)} cells are in front of the camera, need {options.min_inliers}"
+            )
+        residuals, jacobian = _residuals_and_jacobian(x, at[ahead], matrix, rotation)
         sigma_px = np.hypot(options.floor_px, focal_px * sigma_m[ahead] / x[:, 2])
-        far = (residuals**2).sum(axis=1) / (sigma_px * reach) ** 2
-        weights = (1 + far) ** -2 / sigma_px**2
-        gradients = np.einsum("nij,ni->nj", by_pose, residuals) * weights[:, None]
+        normalised_sq = (residuals**2).sum(axis=1) / (sigma_px * width) ** 2
+        weights = (1 + normalised_sq) ** -2 / sigma_px**2
+        gradients = np.einsum("nij,ni->nj", jacobian, residuals) * weights[:, None]
         try:
-            inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, by_pose, by_pose))
+            inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, jacobian, jacobian))
         except np.linalg.LinAlgError as error:
             raise GeometryError("the scene coordinates do not determine a pose") from error
         step = -inverse @ gradients.sum(axis=0)
         center = center + step[:3]
         rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
-        if reach == options.robust and np.abs(by_pose @ step).mean() < _CONVERGED_PX:
+        if width == options.robust and np.abs(jacobian @ step).mean() < _CONVERGED_PX:
             break
-    inliers = int(np.count_nonzero(far < 1))
+    inliers = int(np.count_nonzero(normalised_sq < 1))
     if inliers < options.min_inliers or not np.isfinite(center).all():
         raise GeometryError(
             f"{inliers} of {len(xyz)} cells agree on a pose, need {options.min_inliers}"
         )
-    # Huber 1967's sandwich: by what the cells scatter, not by what they say of themselves. The slope of a
-    # cell's pull is less than its weight, for the weight falls as it moves away.
-    slope = ((1 + far) ** -3 * (1 - far) / sigma_px**2).sum() / weights.sum()
-    covariance = inverse @ (gradients.T @ gradients) @ inverse / max(slope, _LEAST_SLOPE) ** 2
+    # Sandwich covariance (Huber 1967): from the scatter of the residuals, not from the stated scales. The
+    # slope of the influence function is smaller than the weight, because the weight decreases with the
+    # residual.
+    slope = ((1 + normalised_sq) ** -3 * (1 - normalised_sq) / sigma_px**2).sum() / weights.sum()
+    covariance = inverse @ (gradients.T @ gradients) @ inverse / max(slope, _MIN_SLOPE) ** 2
     covariance = (covariance + covariance.T) / 2 * options.cells_per_observation
     return PoseEstimate(
         Poses.from_rotations(center[None], rotation[None]), covariance, inliers, len(xyz)
@@ -116,9 +175,9 @@ def decode(
 def _first_pose(
     xyz: np.ndarray, at: np.ndarray, matrix: np.ndarray, options: DecodingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and rotation on which most cells agree."""
+    """Return centre and rotation of the pose with most inliers (P3P, RANSAC)."""
     middle = np.median(xyz, axis=0)
-    # The same camera and pixels, both shifted by half a pixel: cv2 does not see which origin they have.
+    # K and pixels share the origin of pixels, so OpenCV needs no half-pixel shift.
     found, turn, move, inliers = cv2.solvePnPRansac(
         xyz - middle,
         at,
@@ -138,15 +197,20 @@ def _first_pose(
     return middle - rotation.T @ move.ravel(), rotation
 
 
-def _linearised(
+def _residuals_and_jacobian(
     x: np.ndarray, at: np.ndarray, matrix: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, 2), projected minus seen, of points x (N, 3) in the camera; change by the pose (N, 2, 6).
+    """Return reprojection residuals (N, 2) of points x (N, 3) in the camera, and their Jacobian (N, 2, 6).
 
-    A turn exp(v) moves a point x by v x x; a move of the centre, by -R of it.
+    The residual is projected minus observed. A rotation by exp(v) moves a point x by v x x, and a shift d of
+    the centre moves it by -R d.
     """
     projected = x @ matrix.T
     pixels = projected[:, :2] / projected[:, 2:]
-    by_point = (matrix[None, :2] - pixels[:, :, None] * matrix[None, 2:]) / projected[:, 2:, None]
-    by_pose = np.concatenate([-by_point @ rotation, np.cross(x[:, None, :], by_point)], axis=2)
-    return pixels - at, by_pose
+    point_jacobian = (matrix[None, :2] - pixels[:, :, None] * matrix[None, 2:]) / projected[
+        :, 2:, None
+    ]
+    jacobian = np.concatenate(
+        [-point_jacobian @ rotation, np.cross(x[:, None, :], point_jacobian)], axis=2
+    )
+    return pixels - at, jacobian

@@ -1,4 +1,4 @@
-"""Located images as lines of text: CSV with a header, or JSON lines."""
+"""Localized images as lines of text: CSV with a header, or JSON lines."""
 
 from __future__ import annotations
 
@@ -21,20 +21,27 @@ COLUMNS = (
 
 
 def geographic(located: Located, origin: GeoOrigin | None) -> np.ndarray:
-    """(3,) latitude and longitude in degrees, height in metres as the origin's; NaN where unknown."""
+    """Return latitude and longitude in degrees and height in metres, (3,); NaN where unknown.
+
+    The height refers to the same surface as the height of the origin.
+    """
     if origin is None or located.reason:
         return np.full(3, np.nan)
     return origin.wgs84_from_enu(located.poses.centers)[0]
 
 
 def csv_header() -> str:
+    """Return the header line with the names of `COLUMNS`."""
     return ",".join(COLUMNS)
 
 
 def csv_line(
     source: str, frame: int, time_s: float, located: Located, origin: GeoOrigin | None
 ) -> str:
-    """Cells as COLUMNS names them, empty where unknown; the covariance by its upper triangle."""
+    """Return one CSV line with the cells of `COLUMNS`, empty where unknown.
+
+    The covariance is given by its upper triangle.
+    """
     values = [
         *located.poses.centers[0],
         *located.poses.quats_wxyz[0],
@@ -54,7 +61,7 @@ def csv_line(
 def json_line(
     source: str, frame: int, time_s: float, located: Located, origin: GeoOrigin | None
 ) -> str:
-    """One object; null where unknown."""
+    """Return one JSON object; unknown values are null."""
     lat_deg, lon_deg, alt_m = geographic(located, origin)
     return json.dumps(
         {

@@ -1,4 +1,4 @@
-"""Poses of a flying camera's images by a bundle: NumPy, OpenCV and onnxruntime alone."""
+"""Localization of camera images with a bundle: NumPy, OpenCV and onnxruntime only."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ from spn_model.onboard.bundle import (
     CellDecoding,
     PoseDecoding,
     read_bundle,
-    verified,
+    verified_path,
 )
 from spn_model.onboard.decoding import decode
 
-# From 1280 to 480 px 2 x 2 samples a pixel then suffice, which are taken four times as fast as 3 x 3;
-# images of simulated flights differ from those of the data set by 0.7 grey levels in the mean.
+# Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
+# Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
 SAMPLE_STEP_PX = 1.5
-_SHAPE_TOLERANCE = 0.005  # of the aspect, between a camera file and the images
-_FATAL = 4  # what goes wrong is raised: onnxruntime prints it as well, in colour
+_SHAPE_TOLERANCE = 0.005  # relative, between the aspect ratios of camera file and images
+_FATAL = 4  # log level: errors are raised, and onnxruntime need not print them as well
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Of one image: poses (1), NaN where none was found; covariance (6, 6) over the centre in the world's
-    unit and a rotation vector v in the camera frame, R_true = exp(v) R; reason : empty where there is a pose.
+    """Pose of one image. poses : one pose, NaN if none was found; reason : why not, empty if there is a pose.
+
+    covariance : (6, 6) over the centre in the world's unit and a rotation vector v in the camera frame,
+    R_true = exp(v) R.
     """
 
     poses: Poses
@@ -43,15 +45,40 @@ class Located:
     reason: str = ""
 
     @classmethod
-    def nowhere(cls, reason: str) -> Located:
+    def failed(cls, reason: str) -> Located:
+        """Return a result without a pose."""
         return cls(Poses.unknown(1), np.full((6, 6), np.nan), reason)
 
 
 class Localizer:
-    """A bundle in memory, at one precision. One thread may use it at a time.
+    """A bundle loaded into memory at one precision, for use by one thread at a time.
 
-    The steps of `localize` are its methods `view`, `run` and `decode`. Raises InputError or FormatError where
-    the bundle cannot be used, and InputError for int8 where it holds no such graph.
+    `localize` consists of the steps `view`, `run` and `decode`.
+
+    Parameters
+    ----------
+    folder : Path
+        Bundle.
+    int8 : bool
+        Use the 8-bit graph instead of the float32 graph.
+    threads : int
+        Threads of onnxruntime.
+
+    Attributes
+    ----------
+    bundle : Bundle
+        Description of the bundle.
+    camera : Camera
+        Pinhole of the graph's input.
+    session : onnxruntime.InferenceSession
+        The loaded graph.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a bundle, or has no graph of this precision.
+    FormatError
+        If the bundle is damaged.
     """
 
     def __init__(self, folder: Path, *, int8: bool = False, threads: int = 1):
@@ -59,8 +86,8 @@ class Localizer:
         self.camera = self.bundle.camera
         precision = INT8 if int8 else FLOAT32
         if precision not in self.bundle.graphs:
-            raise InputError(f"holds no {precision} graph", path=folder)
-        path = verified(self.bundle.graphs[precision])
+            raise InputError(f"has no {precision} graph", path=folder)
+        path = verified_path(self.bundle.graphs[precision])
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = _FATAL
@@ -68,35 +95,64 @@ class Localizer:
             self.session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # onnxruntime has a type for each status, none in common
+        except (
+            Exception
+        ) as error:  # onnxruntime has one type per status, without a common base class
             raise FormatError(f"{path}: onnxruntime cannot load it ({error})") from error
         self._check_graph(path)
         self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
 
     def localize(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> Located:
-        """Of a flying camera's image (H, W, 3) uint8: BGR as OpenCV reads it, or RGB.
+        """Estimate the pose of an image.
 
-        camera : of that image, with its distortion; where it is of another size and the same shape it is
-        scaled. Raises InputError where it is of another shape, or does not see what the network knows.
+        Parameters
+        ----------
+        image : ndarray, shape (H, W, 3)
+            Image of the flying camera, uint8, BGR as OpenCV reads it or RGB.
+        camera : Camera
+            Its camera with distortion; scaled if its size differs but its aspect ratio is the same.
+        rgb : bool
+            Whether the image is RGB.
+
+        Returns
+        -------
+        Located
+
+        Raises
+        ------
+        InputError
+            If the aspect ratios of image and camera differ, or the camera sees nothing of the network's view.
         """
         return self.decode(self.run(self.view(image, camera, rgb=rgb)))
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
-        """(1, h, w, 3) uint8 RGB: what the network's own camera would have seen there; black beside it."""
+        """Render an image into the network's own camera, (1, h, w, 3) uint8 RGB.
+
+        Pixels outside the image are black. Parameters and errors as for `localize`; raises ValueError for
+        another type or shape of image.
+        """
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"an image of {image.shape}, {image.dtype}")
+            raise ValueError(
+                f"expected an image (H, W, 3) of uint8, got {image.shape} of {image.dtype}"
+            )
         seen = self.renderer(camera, image.shape[1], image.shape[0]).render(image)
         return (seen if rgb else cv2.cvtColor(seen, cv2.COLOR_BGR2RGB))[None]
 
     def run(self, images: np.ndarray) -> list[np.ndarray]:
-        """Outputs of the network, as the bundle's decoding names them, of an image (1, h, w, 3) uint8 RGB."""
+        """Run the network on an image (1, h, w, 3) uint8 RGB.
+
+        Returns the outputs in the order of the bundle's decoding.
+        """
         found: list[np.ndarray] = self.session.run(self.bundle.decoding.outputs, {INPUT: images})
         return found
 
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
-        """The pose that outputs tell; matrix : K (3, 3) of the image, where not the bundle's camera's."""
+        """Convert outputs of the network to a pose.
+
+        matrix : camera matrix K (3, 3) of the image, if it is not that of the bundle's camera.
+        """
         if isinstance(self.bundle.decoding, PoseDecoding):
-            return _read_out(self.bundle.decoding, *outputs)
+            return _decode_regression(self.bundle.decoding, *outputs)
         by = self.bundle.decoding
         coordinates, log_scale = outputs
         try:
@@ -109,19 +165,20 @@ class Localizer:
                 options=by.options,
             )
         except GeometryError as error:
-            return Located.nowhere(str(error))
+            return Located.failed(str(error))
         return Located(found.poses, found.covariance)
 
     def renderer(self, camera: Camera, width: int, height: int) -> PinholeRenderer:
-        """From images of that size into the network's camera; made at first use, then kept.
+        """Return the cached renderer from images of this size into the network's camera.
 
-        Its `valid` tells which pixels of the view the camera sees. Raises InputError as `localize` does.
+        Its `valid` mask gives the pixels of the view that the camera sees. Raises InputError as `localize`
+        does.
         """
         key = (camera.model, camera.width, camera.height, camera.params.tobytes(), width, height)
         if key not in self._renderers:
             if abs(width * camera.height / (height * camera.width) - 1) > _SHAPE_TOLERANCE:
                 raise InputError(
-                    f"the image is {width}x{height}, the camera is of {camera.width}x{camera.height}: "
+                    f"the image is {width}x{height}, but the camera is {camera.width}x{camera.height}; "
                     "give the camera of these images"
                 )
             made = PinholeRenderer(
@@ -129,8 +186,8 @@ class Localizer:
             )
             if not made.valid.any():
                 raise InputError(
-                    "the camera sees nothing of the view that the network was trained on: is it another "
-                    "camera's file?"
+                    "the camera sees nothing of the view that the network was trained on; check that the "
+                    "camera file belongs to these images"
                 )
             self._renderers[key] = made
         return self._renderers[key]
@@ -139,7 +196,7 @@ class Localizer:
         inputs = [(i.name, i.type, i.shape) for i in self.session.get_inputs()]
         shape = [1, self.camera.height, self.camera.width, 3]
         if inputs != [(INPUT, "tensor(uint8)", shape)]:
-            raise FormatError(f"{path}: is no graph of this bundle: its input is {inputs}")
+            raise FormatError(f"{path}: does not match the bundle: its input is {inputs}")
         shapes = {o.name: o.shape for o in self.session.get_outputs() if o.type == "tensor(float)"}
         decoding = self.bundle.decoding
         expected: dict[str, list[int]] = {"offset": [1, 3], "quaternion": [1, 4], "log_std": [1, 6]}
@@ -149,22 +206,22 @@ class Localizer:
                 for side in (self.camera.width, self.camera.height)
             )
             found = shapes.get("log_scale", [])
-            # As many cells as lie in the image, or the last ones less.
+            # All cells whose centre is in the image, or without the last row or column.
             if len(found) == 4 and all(isinstance(n, int) for n in found):
                 rows, columns = min(rows, found[2]), min(columns, found[3])
             expected = {"coordinates": [1, 3, rows, columns], "log_scale": [1, 1, rows, columns]}
         wrong = {name: shapes.get(name) for name in decoding.outputs}
         if wrong != {name: expected[name] for name in decoding.outputs}:
-            raise FormatError(f"{path}: is no graph of this bundle: its outputs are {shapes}")
+            raise FormatError(f"{path}: does not match the bundle: its outputs are {shapes}")
 
 
-def _read_out(
+def _decode_regression(
     decoding: PoseDecoding, offset: np.ndarray, quaternion: np.ndarray, log_std: np.ndarray
 ) -> Located:
-    """A pose regressor's answer."""
+    """Convert the outputs of a pose regressor to a pose."""
     x, q = offset[0].astype(np.float64), quaternion[0].astype(np.float64)
     length = np.linalg.norm(q)
     if not (np.isfinite(x).all() and np.isfinite(length) and length > 1e-6):
-        return Located.nowhere("the network's answer is no pose")
+        return Located.failed("the network's output is not a valid pose")
     covariance = np.diag(np.exp(2 * log_std[0].astype(np.float64)))
     return Located(Poses(x[None] + decoding.center, canonical_quats(q[None])), covariance)

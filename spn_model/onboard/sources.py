@@ -1,4 +1,4 @@
-"""Images and frames of videos as OpenCV reads them."""
+"""Images and video frames as OpenCV reads them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ _MAX_IMAGE_BYTES = 500_000_000
 
 
 def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
-    """Number, seconds since the video's start (NaN for an image), and BGR, upright, of each frame.
+    """Yield number, time in seconds and upright BGR image of each frame of an image file or video.
 
-    Raises InputError where the file is neither image nor video.
+    The time counts from the start of the video and is NaN for an image. Raises InputError if the file is
+    neither an image nor a video.
     """
     if source.suffix.lower() in _IMAGES:
         yield 0, math.nan, read_image(source)
         return
     _check_file(source)
-    # Resolved: OpenCV takes some names for a device, a pattern or an address.
+    # Resolved, because OpenCV interprets some names as a device, a pattern or a URL.
     video = cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
     try:
         number = 0
@@ -35,16 +36,21 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
             yield number, video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image
             number += 1
         if not number:
-            raise InputError("is no video that can be decoded", path=source)
+            raise InputError("cannot be decoded as a video", path=source)
     finally:
         video.release()
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) BGR uint8, turned as its metadata say. Raises InputError where it is none."""
+    """Return an image (H, W, 3) BGR uint8, rotated according to its metadata.
+
+    Raises InputError if the file is not an image.
+    """
     _check_file(path)
     if path.stat().st_size > _MAX_IMAGE_BYTES:
-        raise InputError("is too large for an image", path=path)
+        raise InputError(
+            f"is larger than {_MAX_IMAGE_BYTES // 1_000_000} MB, too large for an image", path=path
+        )
     try:
         image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
@@ -56,4 +62,4 @@ def read_image(path: Path) -> np.ndarray:
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
-        raise InputError("does not exist" if not path.exists() else "is no file", path=path)
+        raise InputError("does not exist" if not path.exists() else "is not a file", path=path)

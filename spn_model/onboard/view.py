@@ -1,4 +1,4 @@
-"""What a network was trained to see, and the world that its poses are in; no torch."""
+"""The view that a network was trained on, and the world of its poses; no torch."""
 
 from __future__ import annotations
 
@@ -14,12 +14,24 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View:
-    """Of the data set that a network was trained on.
+    """View and world of the data set that a network was trained on.
 
-    camera : the one pinhole of all images, None where frames have their own; size : (width, height) of its
-    images; units : "m", or "model" for a world whose unit means nothing; origin : of the East-North-Up
-    world, with what heights refer to, None where the place is not known; up_is_known : z points up;
-    dataset : fingerprint of the file; made_from : fingerprints of what the file was made from, by name.
+    Attributes
+    ----------
+    camera : Camera or None
+        Common pinhole of all images; None if each frame has its own.
+    size : tuple of int
+        Width and height of the images.
+    units : str
+        "m", or "model" for a world of arbitrary scale.
+    origin : GeoOrigin or None
+        Origin of the East-North-Up world and its height reference; None if it is not georeferenced.
+    up_is_known : bool
+        Whether z points up.
+    dataset : str
+        Fingerprint of the data set.
+    made_from : mapping of str to str
+        Fingerprints of what the data set was made from, by name.
     """
 
     camera: Camera | None
@@ -31,7 +43,7 @@ class View:
     made_from: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for json.dumps; what is not known is null."""
+        """Return plain values for JSON; unknown ones are null."""
         return {
             "camera": None if self.camera is None else camera_to_json(self.camera),
             "size": list(self.size),
@@ -44,13 +56,13 @@ class View:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> View:
-        """Raises KeyError, TypeError or ValueError where it is not what `to_json` gives."""
+        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid."""
         camera, units, up = value["camera"], value["units"], value["up_is_known"]
         width, height = (int(side) for side in value["size"])
         if units not in ("m", "model") or not isinstance(up, bool):
             raise ValueError(f"units {units!r}, up_is_known {up!r}")
         if not (0 < width <= 65_536 and 0 < height <= 65_536):
-            raise ValueError(f"images of {width}x{height}")
+            raise ValueError(f"image size {width}x{height}")
         return cls(
             camera=None if camera is None else camera_from_json(camera),
             size=(width, height),
@@ -65,5 +77,5 @@ class View:
 def _origin(value: Mapping[str, Any]) -> GeoOrigin:
     lat_deg, lon_deg, alt_m = (float(value[name]) for name in ("lat_deg", "lon_deg", "alt_m"))
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360 and math.isfinite(alt_m)):
-        raise ValueError(f"the origin {lat_deg}, {lon_deg}, {alt_m} is no place")
+        raise ValueError(f"the origin {lat_deg}, {lon_deg}, {alt_m} is not a valid location")
     return GeoOrigin(lat_deg, lon_deg, alt_m, HeightReference(value["height_reference"]))

@@ -24,7 +24,7 @@ from spn_model.examples.dataset_view import view_of
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export
 from spn_model.export.exported import ExportedBundle
-from spn_model.export.graphs import _CellMeans, deployment, reference, write_graph
+from spn_model.export.graphs import _FixedAdaptivePool, deployment, reference, write_graph
 from spn_model.models import checkpoint
 from spn_model.models.registry import make
 from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
@@ -88,7 +88,7 @@ def test_a_graph_computes_what_torch_computes(hall, tmp_path, kind, options):
     write_graph(tmp_path / "m.onnx", deployed)
     session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"))
     with Dataset(hall) as data:
-        image = deployed.sized(data.groups["train"].image(0))
+        image = deployed.graph_input(data.groups["train"].image(0))
     assert image.shape == (1, deployed.size[1], deployed.size[0], 3)
     assert [one.name for one in session.get_outputs()] == list(deployed.decoding.outputs)
     found = session.run(list(deployed.decoding.outputs), {INPUT: image})
@@ -105,7 +105,7 @@ def test_uneven_pooling_is_torchs(size):
     """Means over cells that do not divide the maps are those of adaptive pooling."""
     maps = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
     wanted = nn.AdaptiveAvgPool2d((7, 7))(maps)
-    assert torch.allclose(_CellMeans(size, (7, 7))(maps), wanted, atol=1e-6)
+    assert torch.allclose(_FixedAdaptivePool(size, (7, 7))(maps), wanted, atol=1e-6)
 
 
 def test_a_bundle_is_whole(made, hall, network):
@@ -176,10 +176,10 @@ def test_what_stands_is_not_replaced(made, hall, network, tmp_path):
     own = tmp_path / "own"
     own.mkdir()
     (own / "holiday.jpg").write_bytes(b"x")
-    with pytest.raises(StageError, match="something else than a bundle"):
+    with pytest.raises(StageError, match="something other than a bundle"):
         export(network, hall, own, {}, quiet, OPTIONS, overwrite=True)
     write_json(own / "bundle.json", {})
-    with pytest.raises(StageError, match="something else than a bundle"):
+    with pytest.raises(StageError, match="something other than a bundle"):
         export(network, hall, own, {}, quiet, OPTIONS, overwrite=True)
     assert (own / "holiday.jpg").read_bytes() == b"x"
 
@@ -195,18 +195,18 @@ def test_a_graph_that_computes_something_else_is_not_written(hall, network, tmp_
         lambda path, deployed: path.write_bytes(broken.read_bytes()),
     )
     options = replace(OPTIONS, int8=False)
-    with pytest.raises(GeometryError, match="computes something else"):
+    with pytest.raises(GeometryError, match="does not match the network"):
         export(network, hall, tmp_path / "bundle", {}, quiet, options)
     assert [path.name for path in tmp_path.iterdir()] == ["graph.onnx"]
     lenient = replace(options, output_tolerance=1.0)
-    with pytest.raises(GeometryError, match="gives other poses"):
+    with pytest.raises(GeometryError, match="poses differ from the network"):
         export(network, hall, tmp_path / "bundle", {}, quiet, lenient)
 
 
 def test_a_data_set_of_another_world_is_refused(network, tmp_path):
     """Errors against labels of another place would mean nothing."""
     other = write_box(tmp_path / "dataset.h5", train=2)
-    with pytest.raises(InputError, match="of another world"):
+    with pytest.raises(InputError, match="belongs to another world"):
         export(network, other, tmp_path / "bundle", {}, quiet, OPTIONS)
     assert not (tmp_path / "bundle").exists()
 
@@ -297,7 +297,7 @@ def test_regressors_keep_their_covariance(hall, tmp_path):
     own = model.estimate(images, matrices)
     localizer = Localizer(made.folder)
     assert (localizer.camera.width, localizer.camera.height) == (160, 90)
-    small = deployment(model, view.size).sized(images[0])
+    small = deployment(model, view.size).graph_input(images[0])
     found = localizer.decode(localizer.run(small))
     assert found.poses.centers == pytest.approx(own.poses.centers, abs=1e-4)
     assert found.covariance == pytest.approx(own.covariance[0], rel=1e-4)

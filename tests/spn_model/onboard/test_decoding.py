@@ -148,7 +148,7 @@ def test_cells_without_a_number_are_left_out():
     assert error_m[0] < 1e-6
     xyz[:, 1:] = np.nan
     xyz[:, 0, 5:] = np.inf
-    with pytest.raises(GeometryError, match="5 cells are sure of what they show, need 12"):
+    with pytest.raises(GeometryError, match="only 5 cells are confident, need 12"):
         decoded(xyz, log_scale, replace(STILL, cells=3000))
 
 

@@ -149,7 +149,7 @@ def test_another_size_of_the_same_shape_is_scaled(bundle, flown, truth):
     localizer = Localizer(bundle)
     found = localizer.localize(flown[1], LENS.scaled(1280, 720))
     assert pose_errors(found.poses, truth[1:2])[0] < 0.3
-    with pytest.raises(InputError, match="the image is 640x480, the camera is of 640x360"):
+    with pytest.raises(InputError, match="the image is 640x480, but the camera is 640x360"):
         localizer.localize(np.zeros((480, 640, 3), np.uint8), LENS)
     beside = Camera("PINHOLE", 640, 360, np.array([425.0, 425.0, 9000.0, 180.0]))
     with pytest.raises(InputError, match="sees nothing of the view"):
@@ -222,7 +222,7 @@ def test_json_lines_hold_the_same(bundle, sources, camera_file):
     [
         ("none.jpg", None, "none.jpg: does not exist"),
         ("bad.jpg", b"no image", "bad.jpg: cannot be read as an image"),
-        ("bad.mp4", b"no video", "bad.mp4: is no video that can be decoded"),
+        ("bad.mp4", b"no video", "bad.mp4: cannot be decoded as a video"),
     ],
 )
 def test_a_source_that_is_none_is_told_in_one_line(
@@ -251,7 +251,7 @@ def test_a_place_on_the_globe_is_told():
     cells = dict(zip(lines.COLUMNS, row, strict=True))
     assert (cells["source"], cells["frame"], cells["time_s"]) == ('x,"y"', "3", "")
     assert (cells["cov_00"], cells["cov_55"], cells["cov_01"]) == ("1", "6", "0")
-    nowhere = Located.nowhere("too few cells, or none")
+    nowhere = Located.failed("too few cells, or none")
     row = next(csv.reader([lines.csv_line("x", 0, 0.0, nowhere, origin)]))
     assert row[3] == "too few cells, or none"
     assert set(row[4:]) == {""}
@@ -324,12 +324,18 @@ def linked(folder: Path) -> None:
 
 
 HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
-    "not JSON": (lambda f: (f / "bundle.json").write_text("{"), "no description of a bundle"),
-    "deep": (lambda f: (f / "bundle.json").write_text("[" * 99_999), "no description of a bundle"),
+    "not JSON": (lambda f: (f / "bundle.json").write_text("{"), "not a valid bundle description"),
+    "deep": (
+        lambda f: (f / "bundle.json").write_text("[" * 99_999),
+        "not a valid bundle description",
+    ),
     "large": (lambda f: (f / "bundle.json").write_text(" " * 1_000_001), "larger than 1 MB"),
     "a list": (lambda f: (f / "bundle.json").write_text("[]"), "its format is not"),
-    "newer": (edited(lambda d: d.update(version=2)), "is of format 2, this program reads 1"),
-    "no version": (edited(lambda d: d.update(version=float("inf"))), "no description of a bundle"),
+    "newer": (edited(lambda d: d.update(version=2)), "has format 2, but this program reads 1"),
+    "no version": (
+        edited(lambda d: d.update(version=float("inf"))),
+        "not a valid bundle description",
+    ),
     "no view": (edited(lambda d: d.pop("view")), "is damaged"),
     "infinite": (edited(lambda d: d["decoding"].update(stride_px=float("inf"))), "is damaged"),
     "no number": (edited(lambda d: d["decoding"].update(first_px="7")), "is damaged"),
@@ -340,16 +346,16 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "huge input": (edited(lambda d: d["input"].update(width=60_000)), "is damaged"),
     "a lens": (
         edited(lambda d: d.update(input=camera_to_json(LENS))),
-        "is no pinhole",
+        "is not a pinhole",
     ),
     "path": (edited(lambda d: d["graphs"]["float32"].update(file="../m.onnx")), "is damaged"),
     "precision": (edited(lambda d: d["graphs"].update(int4=d["graphs"]["int8"])), "is damaged"),
     "other input": (edited(lambda d: d["input"].update(width=322)), "its input is"),
     "other cells": (edited(lambda d: d["decoding"].update(stride_px=64.0)), "its outputs are"),
     "cut": (cut, "copy it again"),
-    "flipped": (flipped, "is not the file that the bundle was made with"),
-    "gone": (lambda f: (f / "model.onnx").unlink(), "copy the whole folder"),
-    "link": (linked, "copy the whole folder"),
+    "flipped": (flipped, r"SHA-256 differs from bundle\.json"),
+    "gone": (lambda f: (f / "model.onnx").unlink(), "copy the whole bundle folder"),
+    "link": (linked, "copy the whole bundle folder"),
     "weights outside": (with_graph(reading("../secret.bin")), "cannot load it"),
     "weights anywhere": (with_graph(reading("/etc/hostname")), "cannot load it"),
     "other graph": (with_graph(reading("near.bin")), "its input is"),
@@ -371,13 +377,13 @@ def test_a_bundle_that_is_wrong_is_refused(bundle, tmp_path, name):
 
 def test_what_is_no_bundle_is_told(bundle, tmp_path):
     """An empty folder, and a bundle without the graph that is asked for."""
-    with pytest.raises(InputError, match=r"it holds no bundle\.json"):
+    with pytest.raises(InputError, match=r"it has no bundle\.json"):
         read_bundle(tmp_path)
     folder = tmp_path / "bundle"
     shutil.copytree(bundle, folder)
     edited(lambda d: d["graphs"].pop("int8"))(folder)
     assert Localizer(folder).camera.width == 320
-    with pytest.raises(InputError, match="holds no int8 graph"):
+    with pytest.raises(InputError, match="has no int8 graph"):
         Localizer(folder, int8=True)
 
 
@@ -389,7 +395,7 @@ def test_frames_are_read_upright_and_bounded(tmp_path, flown, monkeypatch):
     assert (number, np.isnan(time_s)) == (0, True)
     assert np.array_equal(image, flown[0])
     monkeypatch.setattr("spn_model.onboard.sources._MAX_IMAGE_BYTES", 100)
-    with pytest.raises(InputError, match="is too large for an image"):
+    with pytest.raises(InputError, match="too large for an image"):
         read_image(path)
 
 
@@ -431,5 +437,5 @@ def test_benchmark_of_given_frames(bundle, flown, camera_file, tmp_path):
     frame.write_bytes(b"no image")
     broken = CliRunner().invoke(main, [*arguments, "--camera", str(camera_file)])
     assert broken.exit_code == 1
-    assert "the program on board failed" in broken.output
+    assert "the onboard program failed" in broken.output
     assert "cannot be read as an image" in broken.output
