@@ -1,0 +1,1 @@
+"""Reconstruction of a model from frames, with retries, and its diagnosis."""

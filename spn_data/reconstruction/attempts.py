@@ -1,4 +1,4 @@
-"""The ladder of reconstruction: what is tried in which order, and for the frames that are left out."""
+"""Attempts of a reconstruction: what is tried in which order, also for frames that were not registered."""
 
 from __future__ import annotations
 
@@ -11,51 +11,105 @@ from spn_data.matching.putative import MatchOptions
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """How a model is made from frames."""
+    """Options of a reconstruction.
+
+    Attributes
+    ----------
+    features : FeatureOptions
+    pairs : PairOptions
+    matching : MatchOptions
+    engine : str
+        COLMAP's mapper: "incremental" or "global".
+    thinned_features : int
+        Number of features per image, those with most matches, from which poses are first estimated.
+    camera_model : str
+        Camera model of the final bundle adjustments.
+    refine_principal_point : bool
+    threads : int
+        Threads of the mapper, and worker processes before it.
+    cluster : str
+        Address of a Dask scheduler whose workers extract and match features; empty for this machine.
+    seed : int
+        Random seed.
+    enough_share : float
+        Share of registered frames below which everything is tried again with more features.
+    usable_share : float
+        Share of registered frames below which there is no model.
+    """
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
-    engine: str = "incremental"  # or "global"
-    thinned_features: int = 512  # of each image, matched most: from which poses are found first
-    camera_model: str = "RADIAL"  # of the last bundle adjustments
+    engine: str = "incremental"
+    thinned_features: int = 512
+    camera_model: str = "RADIAL"
     refine_principal_point: bool = False
-    threads: int = 2  # of the mapper, and worker processes before it
-    cluster: str = ""  # address of a Dask scheduler, whose workers find features and matches
+    threads: int = 2
+    cluster: str = ""
     seed: int = 0
-    enough_share: float = 0.95  # registered, below which all is tried again with more features
-    usable_share: float = 0.1  # registered, below which there is no model
+    enough_share: float = 0.95
+    usable_share: float = 0.1
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One rung of the ladder of retries."""
+    """One attempt at a reconstruction.
+
+    Attributes
+    ----------
+    name : str
+    why : str
+        How it differs from the first attempt, for the user.
+    database : str
+        Name of its database file.
+    features : FeatureOptions
+    pairs : PairOptions
+    missing_features : FeatureOptions
+        Options for the few frames that are still not registered.
+    hold_intrinsics : bool
+        Keep intrinsics fixed until the final bundle adjustment.
+    thinned : bool
+        Estimate poses from the features with most matches, then triangulate points from all features.
+    """
 
     name: str
     why: str
     database: str
     features: FeatureOptions
     pairs: PairOptions
-    missing_features: FeatureOptions  # of the few frames that are left out all the same
+    missing_features: FeatureOptions
     hold_intrinsics: bool = False
-    thinned: bool = False  # poses from the features that match most, then points from all
+    thinned: bool = False
 
 
 @dataclass(frozen=True)
 class Chance:
-    """What is tried for the frames that a model leaves out."""
+    """A second chance for the frames that a model does not contain.
+
+    Attributes
+    ----------
+    name : str
+    what : str
+        What is tried, for the user.
+    database : str
+        Name of its database file.
+    features : FeatureOptions
+    most_missing : float
+        Maximum share of missing frames for which it is tried.
+    """
 
     name: str
     what: str
     database: str
     features: FeatureOptions
-    most_missing: float  # share of the frames, above which it is not tried
+    most_missing: float
 
 
 def attempts(options: ReconstructOptions) -> list[Attempt]:
-    """As the options are; with intrinsics that cannot drift; and with more features on wider pairs.
+    """Return the attempts in order: as configured, with fixed intrinsics, with more features and wider pairs.
 
-    Poses from all features take four times as long and come out the same: only where that fails are all used.
+    Poses from all features take four times as long and have the same accuracy; all features are used only if
+    the first attempt fails.
     """
     features, pairs = options.features, options.pairs
     more = replace(
@@ -76,11 +130,13 @@ def attempts(options: ReconstructOptions) -> list[Attempt]:
     ]
 
 
-_FEW_SHARE = 0.2  # left out, above which it is not for the features of some frames
+_FEW_MISSING = (
+    0.2  # share of the frames; with more missing, the features of single frames are not the cause
+)
 
 
 def chances(attempt: Attempt) -> list[Chance]:
-    """Wider pairs, and then more features too where few are missing."""
+    """Return the second chances of an attempt: wider pairs, then more features if few frames are missing."""
     again = Chance(
         "again", "wider pairs for the missing frames", attempt.database, attempt.features, 1.0
     )
@@ -91,6 +147,6 @@ def chances(attempt: Attempt) -> list[Chance]:
         "more features in the missing frames",
         f"database-{attempt.name}-closer.db",
         attempt.missing_features,
-        _FEW_SHARE,
+        _FEW_MISSING,
     )
     return [again, closer]

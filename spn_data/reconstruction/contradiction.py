@@ -1,4 +1,4 @@
-"""Whether a model contradicts what its images show together, or what is known of its lenses."""
+"""Checks of a model against the matches of its images and the known focal lengths of its cameras."""
 
 from __future__ import annotations
 
@@ -11,59 +11,78 @@ from spn_data.colmap.model import Scene
 from spn_data.geometry.epipolar import essential_matrix, sampson_errors
 from spn_data.reconstruction.correspondences import FramesToMap
 
-# Epipolar error of a match in focal lengths, 12 px of a drone's video; a wrong pose leaves a few hundredths
-# of them below it.
-_FITS = 0.0136
-_SHARE = 0.5  # of a pair's matches that must fit
+# Epipolar error of an inlier in units of the focal length, 12 px in a drone's video. With a wrong pose only a
+# few percent of the matches are below it.
+_MAX_ERROR = 0.0136
+_MIN_SHARE = 0.5  # of a pair's matches that must be inliers
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Two images that match well, of whose matches the model's poses explain less than half."""
+    """Two images with many matches, of which the model's poses explain less than half.
+
+    Attributes
+    ----------
+    images : (str, str)
+        Image names.
+    matches : int
+        Number of verified matches.
+    share : float
+        Share of the matches that the poses explain.
+    """
 
     images: tuple[str, str]
     matches: int
-    share: float  # that fits
+    share: float
 
 
 def contradictions(database: MapDatabase, scene: Scene) -> list[Contradiction]:
-    """Of the pairs of registered images that have the median number of matches or more; worst first.
+    """Return the contradicted pairs of registered images, those with most matches first.
 
-    Wrong pairs, which a right model contradicts, have few matches: facades of equal windows give a quarter
-    of the median. Between parts that lie wrongly to each other it is the best pairs that are contradicted.
+    Only pairs with at least the median number of matches are checked. Wrong pairs, which contradict a correct
+    model, have few matches: facades with equal windows give a quarter of the median. If parts of a model have
+    wrong relative poses, the best pairs between them are contradicted.
     """
     row = {name: k for k, name in enumerate(scene.names)}
     verified = database.verified_pairs()
     pairs = {pair: n for pair, n in verified.items() if pair[0] in row and pair[1] in row}
     if not pairs:
         return []
-    telling = float(np.median(list(pairs.values())))
+    min_matches = float(np.median(list(pairs.values())))
     rays: dict[str, np.ndarray] = {}
     found = []
     for (a, b), n in sorted(pairs.items()):
-        if n < telling:
+        if n < min_matches:
             continue
         for name in (a, b):
             if name not in rays:
                 rays[name] = _rays(database, scene, name, row[name])
         matches = database.read_inliers(a, b)
         essential = essential_matrix(scene.poses, row[a], row[b])
-        off = sampson_errors(rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential)
-        share = float(np.mean(off < _FITS))
-        if share < _SHARE:
+        errors = sampson_errors(rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential)
+        share = float(np.mean(errors < _MAX_ERROR))
+        if share < _MIN_SHARE:
             found.append(Contradiction((a, b), n, share))
     return sorted(found, key=lambda one: -one.matches)
 
 
 def _rays(database: MapDatabase, scene: Scene, name: str, k: int) -> np.ndarray:
-    """(K, 2) of all features of an image, on the plane at distance one."""
+    """Return the normalized image coordinates (K, 2) of all features of an image."""
     pixels = database.read_keypoints(name)[:, :2].astype(np.float64)
     return scene.cameras[int(scene.camera_ids[k])].unproject(pixels)
 
 
 @dataclass(frozen=True)
 class FocalChange:
-    """A lens whose focal length was known, and came out otherwise."""
+    """Camera whose known focal length changed during reconstruction.
+
+    Attributes
+    ----------
+    camera : str
+        Key of the camera.
+    said_px, found_px : float
+        Known and estimated focal length.
+    """
 
     camera: str
     said_px: float
@@ -71,15 +90,27 @@ class FocalChange:
 
     @property
     def ratio(self) -> float:
-        """Of the longer to the shorter one."""
+        """Longer focal length divided by the shorter one."""
         return max(self.found_px / self.said_px, self.said_px / self.found_px)
 
 
 def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[FocalChange]:
-    """Lenses of known focal length that came out by more than `ratio` longer or shorter; worst first.
+    """Return cameras of known focal length whose estimate differs too much, largest ratio first.
 
-    Far longer and far off, what a flight shows looks the same but for perspective: a weak geometry lets
-    adjustments drift there, without a large error or a pair that tells.
+    A far longer focal length with a far larger distance gives the same image except for perspective. With
+    weak geometry, bundle adjustments drift there without large errors or contradicted pairs.
+
+    Parameters
+    ----------
+    scene : Scene
+    frames : FramesToMap
+        Provides the known focal lengths.
+    ratio : float
+        Maximum ratio of the longer to the shorter focal length.
+
+    Returns
+    -------
+    list of FocalChange
     """
     key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
     lenses = {key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)}

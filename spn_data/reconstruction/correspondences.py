@@ -1,4 +1,4 @@
-"""Features and verified matches of frames, computed by workers into one database."""
+"""Features and verified matches of frames, computed by workers and stored in one database."""
 
 from __future__ import annotations
 
@@ -21,10 +21,22 @@ from spn_data.work.timing import Progress
 
 @dataclass(frozen=True, eq=False)
 class FramesToMap:
-    """What reconstruction knows of N frames.
+    """Input of a reconstruction: N frames and what is known of them.
 
-    names : relative to `folder`; sequences, cameras : (N,) keys; positions_m : (N, 3) ENU, NaN where
-    unknown; start_cameras : by key, with whether the focal length is known; masks : file by sequence.
+    Attributes
+    ----------
+    folder : Path
+        Image folder.
+    names : tuple of str
+        Image paths relative to `folder`.
+    sequences, cameras : ndarray, shape (N,), str
+        Keys of sequences and cameras.
+    positions_m : ndarray, shape (N, 3)
+        ENU positions in metres; NaN if unknown.
+    start_cameras : dict of str to (Camera, bool)
+        Initial intrinsics by camera key, and whether the focal length is known.
+    masks : dict of str to Path
+        Mask image by sequence.
     """
 
     folder: Path
@@ -43,7 +55,18 @@ def extract_missing(
     dispatch: Dispatch,
     progress: Progress,
 ) -> None:
-    """Features of the frames that have none in the database yet."""
+    """Extract the features of all frames that have none in the database yet.
+
+    Parameters
+    ----------
+    database : MapDatabase
+        Features are written to it.
+    frames : FramesToMap
+    options : FeatureOptions
+    dispatch : Dispatch
+        Runs the work on workers.
+    progress : Progress
+    """
     missing = [
         (name, str(sequence))
         for name, sequence in zip(frames.names, frames.sequences, strict=True)
@@ -66,14 +89,14 @@ def extract_missing(
     dispatch(extract_from_bytes, batches(), store)
 
 
-_FRAMES_OF_VOCABULARY = 200  # whose descriptors its words are drawn from
+_VOCABULARY_FRAMES = 200  # whose descriptors the visual words are learnt from
 
 
 def appearance_of(database: MapDatabase, frames: FramesToMap, options: PairOptions) -> np.ndarray:
-    """(N, D) of the frames, in words made of these very frames."""
-    # All descriptors at once would be half a megabyte a frame.
-    telling = frames.names[:: math.ceil(len(frames.names) / _FRAMES_OF_VOCABULARY)]
-    described = [database.read_features(name).descriptors for name in telling]
+    """Return appearance descriptors (N, D) of the frames, with visual words learnt from the same frames."""
+    # All descriptors at once would take half a megabyte per frame.
+    sample = frames.names[:: math.ceil(len(frames.names) / _VOCABULARY_FRAMES)]
+    described = [database.read_features(name).descriptors for name in sample]
     vocabulary = visual_vocabulary(described, options)
     return np.stack(
         [
@@ -83,7 +106,7 @@ def appearance_of(database: MapDatabase, frames: FramesToMap, options: PairOptio
     )
 
 
-_PAIRS_A_BATCH = 16
+_PAIRS_PER_BATCH = 16
 
 
 def match_missing(
@@ -94,7 +117,20 @@ def match_missing(
     dispatch: Dispatch,
     progress: Progress,
 ) -> None:
-    """Match and verify the pairs that the database does not hold yet."""
+    """Match and verify the pairs that the database does not contain yet.
+
+    Parameters
+    ----------
+    database : MapDatabase
+        Contains the features of all frames; pairs are written to it.
+    frames : FramesToMap
+    pairs : list of (int, int)
+        Rows of the frames.
+    options : MatchOptions
+    dispatch : Dispatch
+        Runs the work on workers.
+    progress : Progress
+    """
     ids = [database.ids[name] for name in frames.names]
     missing = [(i, j) for i, j in pairs if not database.has_pair((ids[i], ids[j]))]
     done = len(pairs) - len(missing)
@@ -105,8 +141,8 @@ def match_missing(
         return ImageForMatching(cache[i], camera, focal_is_known)
 
     def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
-        for start in range(0, len(missing), _PAIRS_A_BATCH):
-            batch = missing[start : start + _PAIRS_A_BATCH]
+        for start in range(0, len(missing), _PAIRS_PER_BATCH):
+            batch = missing[start : start + _PAIRS_PER_BATCH]
             needed = {i for pair in batch for i in pair}
             for i in set(cache) - needed:
                 del cache[i]

@@ -1,4 +1,4 @@
-"""Zoom, shear and stretch that each frame has for itself, as electronic stabilisation leaves them."""
+"""Zoom, shear and stretch of single frames, as electronic stabilisation causes them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from spn_data.reconstruction.residual_fit import (
     solve_spd,
 )
 
-_LENS_SIGMA = 0.02  # zoom, shear or stretch that all frames may have alike
-_MISFIT = 2.5  # times the noise: what lens model and matches leave in real models' frames, measured
-_WELL_KNOWN = (
-    1.5e-3  # sigma up to which a combination of frames' zooms, shears or stretches is used
-)
+_LENS_SIGMA = 0.02  # prior of the zoom, shear or stretch that all frames share
+_MISFIT = 2.5  # factor of the noise due to lens model and matches, measured on real models
+_MAX_SIGMA = 1.5e-3  # of the combinations of frames' zooms, shears or stretches that are used
 
 
 def frame_jitter(
     blocks: list[tuple[LensObservations, Partialled]], readout_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Scatter (3,) between frames of their own zoom, shear and stretch, and how many sigmas it is worth (3,).
+    """Estimate the scatter (3,) between frames of zoom, shear and stretch, and its significance (3,).
 
-    Each kind is estimated beside the others, poses and points, so its errors are correlated between frames
-    and very unequal; the scatter is that of the greatest likelihood given their covariance.
+    The significance is in sigmas. Each kind is estimated jointly with the others, poses and points, so its
+    errors are correlated between frames and very unequal. The scatter is the maximum-likelihood estimate
+    given their covariance.
     """
     modes: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(FRAME_EFFECTS)]
     for block, partialled in blocks:
@@ -36,7 +35,7 @@ def frame_jitter(
         columns = np.arange(readout_column)
         normal = block.normal[np.ix_(columns, columns)].copy()
         own = block.frame_columns[:, POSE:].ravel()
-        # What all frames have alike is the lens's, and weakly held here.
+        # The part that all frames share belongs to the lens: constrain it weakly.
         normal[own, own] += variance / _LENS_SIGMA**2
         right = np.zeros((len(columns), len(own) + 1))
         right[own, np.arange(len(own))] = 1
@@ -58,8 +57,11 @@ def frame_jitter(
 
 
 def most_likely_scatter(noise: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Most likely scatter beyond noise of independent values (n,) of noise variances (n,), and its sigmas."""
-    known = (noise > 0) & (noise < _WELL_KNOWN**2)
+    """Return the maximum-likelihood scatter beyond noise, and its significance in sigmas.
+
+    The values (n,) are independent, with noise variances (n,). The scatter is NaN if too few are known well.
+    """
+    known = (noise > 0) & (noise < _MAX_SIGMA**2)
     if known.sum() < max(5, len(noise) / 2):
         return float("nan"), 0.0
     noise, values = _MISFIT**2 * noise[known], values[known]

@@ -1,4 +1,4 @@
-"""registration.csv: what became of each frame that was to be mapped."""
+"""File registration.csv: whether each frame was registered, and why not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ REGISTRATION = "registration.csv"
 
 
 def write_registration(folder: Path, rows: tuple[FrameRegistration, ...]) -> None:
-    """Write what became of each frame beside the model."""
+    """Write registration.csv into the folder of a model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the model.
+    rows : tuple of FrameRegistration
+        One per frame.
+    """
     columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(FrameRegistration)}
     columns["registered"] = ["registered" if row.registered else "missing" for row in rows]
     columns["error_px"] = ["" if math.isnan(r.error_px) else f"{r.error_px:.4f}" for r in rows]
@@ -21,6 +29,17 @@ def write_registration(folder: Path, rows: tuple[FrameRegistration, ...]) -> Non
 
 
 def read_reasons(folder: Path) -> dict[str, str]:
-    """Why a frame is missing in the model of a folder, by name; empty where it is not."""
+    """Read why frames are missing in a model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the model.
+
+    Returns
+    -------
+    dict of str to str
+        Reason by frame name; empty for registered frames.
+    """
     columns = [f.name for f in fields(FrameRegistration)]
     return {row["name"]: row["reason"] for _, row in read_csv(folder / REGISTRATION, columns)}

@@ -1,8 +1,9 @@
-"""What else than points, poses and lens explains a model's residuals: bundle adjustment, linearised.
+"""Effects in a model's residuals that points, poses and lens do not explain: linearized bundle adjustment.
 
-A finished bundle adjustment has moved points, poses and lens to explain as much of an unmodelled effect
-as they can. To measure the effect it is put in beside them as another unknown of the same least squares,
-in one Gauss-Newton step: then nothing of it is lost to them (Frisch-Waugh-Lovell).
+A finished bundle adjustment has moved points, poses and lens to absorb as much of an unmodelled effect as
+they can. To measure the effect, it is estimated jointly with them as an additional unknown of the same
+least-squares problem, in one Gauss-Newton step, so that none of it is lost to them (Frisch-Waugh-Lovell
+theorem).
 """
 
 from __future__ import annotations
@@ -22,22 +23,39 @@ from spn_data.geometry.least_squares import (
     rows_to_sparse,
 )
 
-FRAME_EFFECTS = 3  # zoom, shear, stretch of the rows, each of one frame
+FRAME_EFFECTS = 3  # zoom, shear and stretch of one frame
 _PER_FRAME = POSE + FRAME_EFFECTS
-_POINT_RIDGE = 1e-7  # points seen under a tiny angle have a depth that nothing fixes
-_RIDGE = 1e-9  # of each unknown's own information: the gauge is free, and solving must not stumble
+_POINT_RIDGE = 1e-7  # the depth of points with tiny triangulation angles is undetermined
+_RIDGE = 1e-9  # relative to each unknown's information: the gauge is free, which makes the matrix singular
 
 
 @dataclass(frozen=True, eq=False)
 class LensObservations:
-    """M observations of F frames of one lens, linearised at the model.
+    """M observations in F frames of one lens, linearized at the model.
 
-    frames : (F,) positions in the scene; frame : (M,) 0..F-1; weights : (M,), robust.
-    effects : (M, 2, E) displacement in px of the measured pixel by one unit of each wanted effect.
-    residuals_px : (M, 2) projected minus measured. per_frame : (M, 2, 9) and lens : (M, 2, 8), change of
-    the residual; whitened : (M, 2, 3), the same of the point, orthonormal over the point's observations.
-    point : (M,) 0..P-1; normal : (9F+8+E+1, 9F+8+E+1), weighted, points eliminated; the last E columns
-    but one are the effects, the last is the residual.
+    Attributes
+    ----------
+    frames : ndarray, shape (F,)
+        Rows in the scene.
+    frame : ndarray, shape (M,)
+        Frame of each observation, 0 to F-1.
+    weights : ndarray, shape (M,)
+        Robust weights.
+    effects : ndarray, shape (M, 2, E)
+        Displacement of the measured pixel in px per unit of each effect to estimate.
+    residuals_px : ndarray, shape (M, 2)
+        Projected minus measured.
+    per_frame : ndarray, shape (M, 2, 9)
+        Jacobian of the residuals by pose, zoom, shear and stretch.
+    lens : ndarray, shape (M, 2, 8)
+        Jacobian by the intrinsics.
+    whitened : ndarray, shape (M, 2, 3)
+        Jacobian by the point, orthonormal over the point's observations.
+    point : ndarray, shape (M,)
+        Point of each observation, 0 to P-1.
+    normal : ndarray, shape (9F+8+E+1, 9F+8+E+1)
+        Weighted normal equations with the points eliminated (Schur complement). The E columns before the last
+        one belong to the effects, the last one to the residual.
     """
 
     frames: np.ndarray
@@ -53,21 +71,25 @@ class LensObservations:
 
     @property
     def frame_columns(self) -> np.ndarray:
-        """(F, 9) columns of `normal`: pose, then zoom, shear, stretch."""
+        """Columns (F, 9) of `normal`: pose, then zoom, shear, stretch."""
         return np.arange(_PER_FRAME * len(self.frames)).reshape(-1, _PER_FRAME)
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Of the residuals, after points and poses."""
+        """Degrees of freedom of the residuals after points and poses."""
         return int(2 * len(self.frame) - 3 * (self.point.max() + 1) - POSE * len(self.frames))
 
 
 @dataclass(frozen=True, eq=False)
 class Partialled:
-    """Effects and residuals of a block after all that points, poses and lens explain of them.
+    """Effects and residuals of a block after removing what points, poses and lens explain of them.
 
-    effects : (M, 2, E); residuals_px : (M, 2); pose_per_effect : (F, 6, E), how far the poses were pushed by
-    one unit of the effect when it was not modelled.
+    Attributes
+    ----------
+    effects : ndarray, shape (M, 2, E)
+    residuals_px : ndarray, shape (M, 2)
+    pose_per_effect : ndarray, shape (F, 6, E)
+        Displacement of the poses by one unit of the effect if it is not modelled.
     """
 
     effects: np.ndarray
@@ -76,10 +98,10 @@ class Partialled:
 
 
 def frame_effects(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Displacements (M, 2, 3) by zoom, shear and stretch of 1 about the image's middle.
+    """Return displacements (M, 2, 3) by a zoom, shear and stretch of 1 about the image centre.
 
-    zoom : of both axes; shear : rows move sideways with their distance below the middle; stretch : of
-    the rows' distance alone.
+    Zoom scales both axes; shear shifts rows sideways in proportion to their distance below the centre;
+    stretch scales the row distance only.
     """
     x, y = (pixels - np.array([camera.width, camera.height]) / 2).T
     zero = np.zeros_like(x)
@@ -98,20 +120,37 @@ def linearize(
     *,
     max_observations: int,
 ) -> LensObservations | None:
-    """A block of some frames (F,) of one lens, with the effects rolling shutter (per second) and zoom trend.
+    """Linearize the observations of some frames (F,) of one lens.
 
-    twists : (F, 6) velocity of a still world in the camera frame, per second: moves, then rotation vector.
-    trend : (F,) weight of the zoom in each frame. None where too little is seen by three frames or more.
+    The effects are rolling shutter (per second of readout) and zoom trend.
+
+    Parameters
+    ----------
+    scene : Scene
+    seen : MapObservations
+    frames : ndarray, shape (F,)
+        Rows in the scene.
+    twists : ndarray, shape (F, 6)
+        Velocity of a static world in the camera frame per second: translation, then rotation vector.
+    trend : ndarray, shape (F,)
+        Weight of the zoom trend in each frame.
+    max_observations : int
+        Number of observations to use, drawn by whole tracks.
+
+    Returns
+    -------
+    LensObservations or None
+        None if tracks of three or more frames have too few observations.
     """
     camera = scene.cameras[int(scene.camera_ids[frames[0]])]
     place = np.full(len(scene.names), -1)
     place[frames] = np.arange(len(frames))
     rows = np.flatnonzero((place[seen.image_idx] >= 0) & np.isfinite(seen.residuals_px).all(axis=1))
-    # A point that is nearly in the camera's plane projects anywhere, and no weight bounds its derivatives.
+    # A point near the camera's plane projects anywhere, and no weight bounds its derivatives.
     length = np.linalg.norm(seen.residuals_px[rows], axis=1)
     rows = rows[length <= 20 * np.median(length)] if len(rows) else rows
     tracks = np.bincount(seen.point_idx[rows], minlength=len(scene.points))
-    # Chosen by chance and not by length: long tracks lie in some parts of the scene only.
+    # Choose tracks at random, not by length: long tracks cover only some parts of the scene.
     order = np.random.default_rng(0).permutation(np.flatnonzero(tracks >= 3))
     order = order[: int(np.searchsorted(np.cumsum(tracks[order]), max_observations)) + 1]
     position = np.full(len(scene.points), -1)
@@ -124,7 +163,7 @@ def linearize(
     offsets = scene.points[seen.point_idx[rows]] - poses.centers[frame]
     points_cam = np.einsum("mij,mj->mi", poses.rotations[frame], offsets)
     by_point, lens = projection_jacobians(camera, points_cam)
-    # Unlike elsewhere, a move is along the camera's axes.
+    # Unlike elsewhere, translations are along the camera's axes.
     pose = np.concatenate([by_point, np.cross(points_cam[:, None], by_point)], axis=2)
     pixels = seen.pixels[rows]
     share = pixels[:, 1] / camera.height - 0.5
@@ -147,7 +186,7 @@ def linearize(
 
 
 def huber_weights(residuals_px: np.ndarray, *, beyond_sigmas: float = 2.5) -> np.ndarray:
-    """Weights (M,) that bound the pull of an observation; sigma from the median length."""
+    """Return Huber weights (M,) of residuals (M, 2); sigma is estimated from the median length."""
     length = np.linalg.norm(residuals_px, axis=1)
     sigma = max(float(np.median(length)) / 1.1774, 1e-6)  # median of a Rayleigh distribution
     return np.minimum(1.0, beyond_sigmas * sigma / np.maximum(length, 1e-12))
@@ -162,6 +201,7 @@ def _normal(
     point: np.ndarray,
     weights: np.ndarray,
 ) -> np.ndarray:
+    """Return the normal equations with whitened points eliminated."""
     m = len(frame)
     first_shared = _PER_FRAME * frames
     columns = np.concatenate(
@@ -180,13 +220,13 @@ def _normal(
     through_points = p.T @ a
     direct = a.T @ a
     normal = np.asarray((direct - through_points.T @ through_points).todense())
-    # What is left of an unknown after its points can be less than rounding.
+    # The information left after eliminating the points can be below the rounding error.
     normal[np.diag_indices(len(normal))] += 1e-8 * direct.diagonal()
     return normal
 
 
 def partial_out(block: LensObservations) -> Partialled:
-    """Take from effects and residuals what points, poses and lens explain of them."""
+    """Remove from effects and residuals what points, poses and lens explain of them."""
     frames = len(block.frames)
     first_shared = _PER_FRAME * frames
     nuisance = np.concatenate(
@@ -208,7 +248,10 @@ def partial_out(block: LensObservations) -> Partialled:
 
 
 def solve_spd(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a positive semi-definite system, scaled to a unit diagonal and held where nothing fixes it."""
+    """Solve a positive semi-definite system.
+
+    The matrix is scaled to unit diagonal and regularized against undetermined combinations.
+    """
     diagonal = np.diag(matrix)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = matrix * scale[:, None] * scale

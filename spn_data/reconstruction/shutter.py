@@ -1,4 +1,4 @@
-"""Rolling shutter and electronic stabilisation: found in a model's residuals, with the size of the effect."""
+"""Detection and size of rolling shutter and electronic stabilisation in a model's residuals."""
 
 from __future__ import annotations
 
@@ -20,37 +20,70 @@ from spn_data.reconstruction.residual_fit import (
 )
 
 _KINDS = ("zoom", "shear", "stretch")
-_PLAUSIBLE_READOUT_S = 0.07  # slowest sensors of drones take about 50 ms for a frame
+_PLAUSIBLE_READOUT_S = 0.07  # the slowest drone sensors need about 50 ms per frame
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShutterOptions:
-    """What counts as known motion and as a finding, and how much work to do."""
+    """Thresholds of the diagnosis and limits on its cost.
 
-    max_gap_s: float = 3.0  # between frames whose motion is interpolated
-    min_frames: int = 10  # of a sequence, with known motion, to judge the shutter
-    max_block_frames: int = 120  # linearised together; time grows with its square
-    max_observations_per_frame: int = 300  # used; more adds time, not certainty
-    min_sigmas: float = 5.0  # of a finding
-    min_displacement_px: float = 0.3  # of a finding, 95 % of points move less
+    Attributes
+    ----------
+    max_gap_s : float
+        Maximum time between frames for interpolating the motion.
+    min_frames : int
+        Minimum number of frames with known motion to judge the shutter of a sequence.
+    max_block_frames : int
+        Maximum number of frames linearized together; time grows with its square.
+    max_observations_per_frame : int
+        Maximum number of observations used; more take time without improving the result.
+    min_sigmas : float
+        Minimum significance of a finding.
+    min_displacement_px : float
+        Minimum size of a finding: 95 % of the points move less than the reported displacement.
+    """
+
+    max_gap_s: float = 3.0
+    min_frames: int = 10
+    max_block_frames: int = 120
+    max_observations_per_frame: int = 300
+    min_sigmas: float = 5.0
+    min_displacement_px: float = 0.3
 
 
 @dataclass(frozen=True)
 class ShutterDiagnosis:
-    """What residuals tell of the shutter and the stabilisation of one sequence and camera.
+    """Diagnosis of shutter and stabilisation for one sequence and camera. Undetermined values are NaN.
 
-    frames : used. NaN is what the flight does not tell.
-    readout_s, readout_sigma_s : from first to last row; negative from the last to the first.
-    displacement_rms_px, displacement_p95_px : by which the readout moves points.
-    explained_share : of the squared residuals, by the readout.
-    pose_shift, pose_turn_deg : RMS by which the readout pushed camera centres (the model's unit) and
-    rotations, but for what is common to all.
-    zoom_rms, shear_rms, stretch_rms : of the frames' own zoom, shear and stretch about the image's middle,
-    beyond noise; zoom_sigmas, shear_sigmas, stretch_sigmas : how certain they are.
-    jitter_p95_px : by which those of `jitters` move 95 % of the points at most.
-    zoom_drift, zoom_drift_sigma : relative change of the focal length from the first frame to the last.
-    rolls : the readout is a finding; jitters : the findings among zoom, shear and stretch; drifts : the
-    drift is a finding.
+    Attributes
+    ----------
+    sequence : str
+    camera_id : int
+    frames : int
+        Number of frames used.
+    readout_s, readout_sigma_s : float
+        Readout time from first to last row; negative if read from last to first.
+    displacement_rms_px, displacement_p95_px : float
+        Displacement of the points by the readout.
+    explained_share : float
+        Share of the squared residuals that the readout explains.
+    pose_shift, pose_turn_deg : float
+        RMS displacement of camera centres (in the model's unit) and rotations by the readout, except for what
+        is common to all.
+    zoom_rms, shear_rms, stretch_rms : float
+        Zoom, shear and stretch of single frames about the image centre, beyond noise.
+    zoom_sigmas, shear_sigmas, stretch_sigmas : float
+        Their significance.
+    jitter_p95_px : float
+        95th percentile of the point displacement by those in `jitters`.
+    zoom_drift, zoom_drift_sigma : float
+        Relative change of the focal length from the first frame to the last.
+    rolls : bool
+        Whether the readout is a finding.
+    jitters : tuple of str
+        Findings among zoom, shear and stretch.
+    drifts : bool
+        Whether the drift is a finding.
     """
 
     sequence: str
@@ -77,7 +110,7 @@ class ShutterDiagnosis:
     drifts: bool
 
     def counts(self) -> dict[str, object]:
-        """As JSON holds it: None for what is not known."""
+        """Return the values for JSON; None replaces NaN."""
         values: dict[str, object] = {}
         for name, value in asdict(self).items():
             if isinstance(value, float):
@@ -85,52 +118,59 @@ class ShutterDiagnosis:
             values[name] = list(value) if isinstance(value, tuple) else value
         return values
 
-    def tell(self, metres_per_unit: float | None = None) -> str:
-        """One sentence to the user for all that was found, or nothing.
+    def describe(self, metres_per_unit: float | None = None) -> str:
+        """Return one sentence for the user that lists all findings, or an empty string.
 
-        metres_per_unit : of the model, where it is georeferenced.
+        Parameters
+        ----------
+        metres_per_unit : float, optional
+            Scale of the model if it is georeferenced.
+
+        Returns
+        -------
+        str
         """
-        found = []
+        findings = []
         if self.rolls:
-            found.append(self._tell_readout(metres_per_unit))
+            findings.append(self._describe_readout(metres_per_unit))
         if self.jitters:
-            found.append(self._tell_jitter())
+            findings.append(self._describe_jitter())
         if self.drifts:
-            found.append(
-                f"the focal length drifts by {_plain(100 * self.zoom_drift)} % (sigma "
-                f"{_plain(100 * self.zoom_drift_sigma, 1)} %) from the first frame to the last; "
+            findings.append(
+                f"the focal length drifts by {_decimal(100 * self.zoom_drift)} % (sigma "
+                f"{_decimal(100 * self.zoom_drift_sigma, 1)} %) from the first frame to the last; "
                 "fix zoom and focus"
             )
-        return f"{self.sequence}: {'; '.join(found)}" if found else ""
+        return f"{self.sequence}: {'; '.join(findings)}" if findings else ""
 
-    def _tell_readout(self, metres_per_unit: float | None) -> str:
+    def _describe_readout(self, metres_per_unit: float | None) -> str:
         direction = "first to last" if self.readout_s > 0 else "last to first"
         text = (
             f"rolling shutter of about {1000 * abs(self.readout_s):.0f} ms (sigma "
-            f"{_plain(1000 * self.readout_sigma_s, 1)} ms) from {direction} row moves points by up to "
+            f"{_decimal(1000 * self.readout_sigma_s, 1)} ms) from {direction} row moves points by up to "
             f"{self.displacement_p95_px:.1f} px"
         )
         if abs(self.readout_s) > _PLAUSIBLE_READOUT_S:
-            text += " (sensors are faster: stabilisation or wrong times may add to it)"
-        off = f"{_plain(self.pose_turn_deg)} degrees"
+            text += " (sensors are faster: stabilisation or wrong times may contribute)"
+        off = f"{_decimal(self.pose_turn_deg)} degrees"
         if metres_per_unit is not None:
-            off = f"{_plain(100 * metres_per_unit * self.pose_shift)} cm and {off}"
+            off = f"{_decimal(100 * metres_per_unit * self.pose_shift)} cm and {off}"
         return (
             f"{text}; poses may be off by {off}; "
             "fly slower or film with a mechanical or global shutter"
         )
 
-    def _tell_jitter(self) -> str:
+    def _describe_jitter(self) -> str:
         sizes = {"zoom": self.zoom_rms, "shear": self.shear_rms, "stretch": self.stretch_rms}
-        kinds = " and ".join(f"{kind} by {_plain(100 * sizes[kind])} %" for kind in self.jitters)
+        kinds = " and ".join(f"{kind} by {_decimal(100 * sizes[kind])} %" for kind in self.jitters)
         return (
             f"frames differ in {kinds} (RMS), which moves points by up to {self.jitter_p95_px:.1f} px, "
             "as electronic stabilisation does; switch it off when filming"
         )
 
 
-def _plain(value: float, digits: int = 2) -> str:
-    """A number of some significant digits and without an exponent."""
+def _decimal(value: float, digits: int = 2) -> str:
+    """Format a number with some significant digits and without an exponent."""
     return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
 
 
@@ -141,31 +181,51 @@ def diagnose_shutter(
     time_s: np.ndarray,
     options: ShutterOptions | None = None,
 ) -> tuple[ShutterDiagnosis, ...]:
-    """What the residuals of a model tell of each sequence and camera that has enough frames.
+    """Diagnose the shutter of each sequence and camera with enough frames from the residuals of a model.
 
-    sequences (N,) str and time_s (N,) belong to scene.names. See docs/shutter.md for the method.
+    See docs/shutter.md for the method.
+
+    Parameters
+    ----------
+    scene : Scene
+    observations : MapObservations
+    sequences : ndarray, shape (N,), str
+        Sequence of each image, in the order of `scene.names`.
+    time_s : ndarray, shape (N,)
+        Time of each image in its sequence.
+    options : ShutterOptions, optional
+
+    Returns
+    -------
+    tuple of ShutterDiagnosis
+
+    Raises
+    ------
+    ValueError
+        If `sequences` or `time_s` does not match the scene, or a time is not finite.
     """
     options = options or ShutterOptions()
     if len(sequences) != len(scene.names) or len(time_s) != len(scene.names):
         raise ValueError(f"{len(sequences)} sequences for {len(scene.names)} images")
     if not np.isfinite(time_s).all():
-        raise ValueError("every image needs a time")
-    found = []
+        raise ValueError("every image needs a finite time")
+    diagnoses = []
     for sequence in sorted(set(sequences.tolist())):
         for camera_id in sorted(set(scene.camera_ids[sequences == sequence].tolist())):
             rows = np.flatnonzero((sequences == sequence) & (scene.camera_ids == camera_id))
             rows = rows[np.argsort(time_s[rows], kind="stable")]
             diagnosis = _diagnose(scene, observations, rows, time_s[rows], str(sequence), options)
             if diagnosis is not None:
-                found.append(diagnosis)
-    return tuple(found)
+                diagnoses.append(diagnosis)
+    return tuple(diagnoses)
 
 
 def world_twists(poses: Poses, time_s: np.ndarray, *, max_gap_s: float) -> np.ndarray:
-    """Velocity (N, 6) of a still world in the camera frame of moving cameras: units and radians per second.
+    """Return the velocity (N, 6) of a static world in the frame of a moving camera.
 
-    poses (N) in order of time_s (N,). NaN where the motion is not known: beside a gap of more than
-    max_gap_s, at equal times, and at the ends.
+    The velocity is in units and radians per second. The poses (N) are in the order of time_s (N,). The
+    velocity is NaN if the motion is unknown: next to a gap of more than max_gap_s, at equal times, and at the
+    ends.
     """
     twists = np.full((len(poses), 6), np.nan)
     rotations = poses.rotations
@@ -230,7 +290,7 @@ def _diagnose(
     own = np.concatenate([b.per_frame[:, :, POSE:] for b, _ in blocks])
     squares = ((own * np.where(sure, jitter, 0.0)) ** 2).sum(axis=(1, 2))
     jitter_px = 2 * float(np.sqrt(squares.mean()))
-    # Shakes between two frames look like jitter where rows are read one after the other.
+    # With a rolling shutter, vibrations between two frames look like jitter.
     jitters = jitter_px > max(options.min_displacement_px, p95 if rolls else 0.0)
     zooms = np.concatenate([b.per_frame[:, :, POSE] for b, _ in blocks])
     drift, drift_sigma = float(effects[1]), float(sigmas[1])
@@ -268,11 +328,12 @@ def _diagnose(
 def _fit_effects(
     blocks: list[tuple[LensObservations, Partialled]],
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Effects (E,), their sigmas (E,), and the share of squared residuals that the first explains.
+    """Return effects (E,), their sigmas (E,), and the share of squared residuals explained by the first.
 
-    Sigmas are from the scatter between frames, with neighbours in time correlated (Newey and West 1987),
-    for errors within a frame and in points that neighbours share are not independent; and never below
-    those of independent errors, for the scatter of few frames can be small by chance.
+    The sigmas are cluster-robust: they follow from the scatter between frames, with frames adjacent in time
+    correlated (Newey and West 1987), because errors within a frame and in points that adjacent frames share
+    are not independent. They are never below those of independent errors, as the scatter of few frames can be
+    small by chance.
     """
     information = sum(
         np.einsum("m,mki,mkj->ij", b.weights, p.effects, p.effects) for b, p in blocks
@@ -305,7 +366,7 @@ def _fit_effects(
 def _pose_shift(
     scene: Scene, blocks: list[tuple[LensObservations, Partialled]], readout_s: float
 ) -> tuple[float, float]:
-    """RMS of centres (units) and rotations (degrees) that the readout moved, but for a common similarity."""
+    """Return the RMS shift of centres (units) and rotations (degrees) by the readout, after a similarity."""
     shifts, turns = [], []
     for block, partialled in blocks:
         poses = scene.poses[block.frames]

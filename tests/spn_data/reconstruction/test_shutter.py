@@ -150,14 +150,14 @@ def test_a_rolling_shutter_is_measured_through_what_bundle_adjustment_hid(
     told_m = found.pose_shift * truth_from_model.scale
     assert 0.5 < told_m / np.sqrt(np.mean(error_m**2)) < 2
     assert 0.4 < found.pose_turn_deg / np.sqrt(np.mean(turn_deg**2)) < 2.5
-    assert "rolling shutter of about" in found.tell(1.0)
+    assert "rolling shutter of about" in found.describe(1.0)
 
 
 @pytest.mark.slow
 def test_a_global_shutter_raises_no_alarm(tmp: Path) -> None:
     """Over 20 seeds nothing is told, and the readout's error is what its sigma says."""
     found = [film(tmp, seed, Flaws(), 30, 12).diagnose() for seed in range(20)]
-    assert [d.tell() for d in found] == [""] * 20
+    assert [d.describe() for d in found] == [""] * 20
     scores = np.array([d.readout_s / d.readout_sigma_s for d in found])
     assert np.abs(scores).max() < 3.5
     assert 0.5 < np.sqrt(np.mean(scores**2)) < 1.6
@@ -170,7 +170,7 @@ def test_zoom_jitter_is_told_as_stabilisation_and_not_as_a_shutter(tmp: Path) ->
     assert not found.rolls
     assert found.zoom_rms == pytest.approx(0.005, rel=0.33)
     assert 1.5 < found.jitter_p95_px < 6
-    assert "frames differ in zoom by 0." in found.tell()
+    assert "frames differ in zoom by 0." in found.describe()
 
 
 def test_a_drifting_focal_length_is_told(tmp: Path) -> None:
@@ -179,7 +179,7 @@ def test_a_drifting_focal_length_is_told(tmp: Path) -> None:
     assert found.drifts
     assert not found.rolls
     assert 0.01 < found.zoom_drift < 0.025
-    assert "focal length drifts by 1." in found.tell()
+    assert "focal length drifts by 1." in found.describe()
 
 
 def test_blocks_of_a_long_flight_agree_with_the_whole(tmp: Path) -> None:
@@ -222,7 +222,7 @@ def test_wild_and_unknown_residuals_do_not_change_the_finding(tmp: Path) -> None
     assert found.zoom_rms == pytest.approx(filmed.diagnose().zoom_rms, rel=0.1)
     residuals[:] = 0
     assert (
-        replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose().tell() == ""
+        replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose().describe() == ""
     )
     residuals[:] = np.nan
     nothing = replace(filmed.seen, residuals_px=residuals)
@@ -294,13 +294,13 @@ def test_the_sentence_names_size_cause_and_remedy() -> None:
         shear_sigmas=0.0, stretch_sigmas=0.0, jitter_p95_px=0.0, zoom_drift=0.0,
         zoom_drift_sigma=1e-4, rolls=True, jitters=(), drifts=False,
     )  # fmt: skip
-    assert found.tell(2.0) == (
+    assert found.describe(2.0) == (
         "flight1: rolling shutter of about 28 ms (sigma 2 ms) from first to last row moves points by "
         "up to 6.0 px; poses may be off by 10 cm and 0.31 degrees; fly slower or film with a "
         "mechanical or global shutter"
     )
-    assert "poses may be off by 0.31 degrees; fly" in found.tell()
-    assert "sensors are faster" in replace(found, readout_s=-0.09).tell()
-    assert "from last to first row" in replace(found, readout_s=-0.09).tell()
-    assert "off by 120 cm" in replace(found, pose_shift=1.234).tell(1.0)
-    assert replace(found, rolls=False).tell() == ""
+    assert "poses may be off by 0.31 degrees; fly" in found.describe()
+    assert "sensors are faster" in replace(found, readout_s=-0.09).describe()
+    assert "from last to first row" in replace(found, readout_s=-0.09).describe()
+    assert "off by 120 cm" in replace(found, pose_shift=1.234).describe(1.0)
+    assert replace(found, rolls=False).describe() == ""
