@@ -1,24 +1,36 @@
-"""The user's area on disk: its names, stages that appear whole or not at all, and what is stale."""
+"""The user's area on disk: stages that appear atomically, their records, and which of them are stale."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
+from spn_data.area.facts import Facts, read_facts, write_facts
+from spn_data.area.names import (
+    COMPARED,
+    EVALUATION,
+    FORMER_GROUPS,
+    FRAMES,
+    GEO,
+    GROUPS,
+    MODEL,
+    RUNS,
+    SCRATCH,
+    SPLIT,
+    STAGES,
+    TRACKED,
+)
 from spn_data.capture.sources import safe_name
-from spn_data.errors import FormatError, InputError, InUseError, StageError
-from spn_data.storage.files import LOCK, locked, write_atomically
-from spn_data.storage.json_files import VERSION, check_version, write_json
+from spn_data.errors import InputError, InUseError, StageError
+from spn_data.storage.files import LOCK, locked
+from spn_data.storage.json_files import VERSION, write_json
 from spn_data.storage.stage_record import (
     StageRecord,
     current_stage,
@@ -27,26 +39,6 @@ from spn_data.storage.stage_record import (
     versions,
 )
 
-FRAMES, MODEL, GEO, SPLIT = "1-frames", "2-model", "3-geo", "5-split"
-STAGES = (FRAMES, MODEL, GEO)  # of the map; --add exchanges them together
-EVALUATION, TRACKED = "4-eval", "4-tracked"  # folders with one stage a sequence
-_GROUPS = (EVALUATION, TRACKED)
-_FORMER_GROUPS = {
-    TRACKED: "4-dense"
-}  # as version 0.1 called them; read and extended where they are
-RUNS = "runs"  # trained networks, a folder each; made by spn-model
-CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
-ERRORS, FIGURES, BUNDLE = "errors.csv", "figures", "bundle"
-CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
-COMPARED = "compared"  # beside them: several runs evaluated together
-
-# What only unfinished work holds: it is removed once the stage's record stands.
-SCRATCH: dict[str, tuple[str, ...]] = {
-    FRAMES: (".analysis",),
-    MODEL: ("mapping-*", "database-*", "refined"),
-    EVALUATION: (".analysis", ".matches"),
-}
-
 _FACTS = "area.toml"
 _RECORD = "stage.json"
 _STARTED = "started.json"
@@ -54,20 +46,18 @@ _NEXT = ".next"
 _READY = "ready"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """What the user says of the area: facts, not tuning.
-
-    sources : folders and files that were reconstructed, in the order in which they were given; relative ones
-    count from the area's folder. evaluation : what each evaluation sequence was registered from, by its name.
-    """
-
-    sources: tuple[str, ...] = ()
-    evaluation: Mapping[str, str] = field(default_factory=dict)
-
-
 class StageWork:
-    """A stage being made, in a folder of its own that survives an interruption."""
+    """A stage in progress, in a partial folder that survives an interruption.
+
+    Attributes
+    ----------
+    record : StageRecord
+        Record of the stage, without results.
+    path : Path
+        The partial folder.
+    resumed : bool
+        Whether the folder contains work of an interrupted run.
+    """
 
     def __init__(self, area: Area, record: StageRecord, path: Path, *, resumed: bool):
         self._area = area
@@ -83,7 +73,7 @@ class StageWork:
         cpu_seconds: dict[str, float],
         notes: tuple[str, ...] = (),
     ) -> StageRecord:
-        """Make the stage appear under its name, in place of the one that it replaces."""
+        """Write the record and move the stage to its final place, replacing an earlier version."""
         record = replace(
             self.record,
             counts=counts,
@@ -98,17 +88,27 @@ class StageWork:
         return record
 
     def discard(self) -> None:
-        """Leave nothing of it, where the work came to no result and going on would gain nothing."""
+        """Remove the partial folder, for work without a result that is not worth resuming."""
         shutil.rmtree(self.path)
 
 
 class Area:
-    """A folder that `reconstruct` fills stage by stage."""
+    """A folder that is filled stage by stage.
+
+    Creating an instance completes the renames of a process that was killed in the middle of them.
+
+    Attributes
+    ----------
+    root : Path
+        The area's folder, which need not exist.
+    facts : Facts
+        What the user stated about it.
+    """
 
     def __init__(self, root: Path):
         self.root = root
-        self._finish_exchange()
-        self.facts = self._read_facts()
+        self._complete_renames()
+        self.facts = read_facts(self.root / _FACTS)
 
     def folder(self, stage: str) -> Path:
         """Return the folder of a stage, which need not exist."""
@@ -116,12 +116,12 @@ class Area:
         return self.group_folder(group) / name
 
     def group_folder(self, group: str) -> Path:
-        """Return the folder of a stage or group; that of a former name where the area has one."""
-        former = self.root / _FORMER_GROUPS.get(group, group)
+        """Return the folder of a stage or group, under its former name if the area has that one."""
+        former = self.root / FORMER_GROUPS.get(group, group)
         return former if former.is_dir() else self.root / group
 
     def has(self, stage: str) -> bool:
-        """A stage folder that exists is complete."""
+        """Return whether a stage is complete: its folder exists only then."""
         return self.folder(stage).is_dir()
 
     def _old(self, stage: str) -> Path:
@@ -129,31 +129,32 @@ class Area:
         return folder.with_name(f".old-{folder.name}")
 
     def partial(self, stage: str) -> Path:
+        """Return the folder of a stage in progress."""
         folder = self.folder(stage)
         return folder.with_name(f".{folder.name}.partial")
 
     def sequences(self, group: str) -> tuple[str, ...]:
-        """Names of the complete stages of a group (EVALUATION or TRACKED), or of RUNS, sorted."""
+        """Return the sorted names of the complete stages of a group (EVALUATION or TRACKED), or of RUNS."""
         folder = self.group_folder(group)
         found = folder.iterdir() if folder.is_dir() else iter(())
         return tuple(sorted(p.name for p in found if p.is_dir() and not p.name.startswith(".")))
 
     def stages(self) -> tuple[str, ...]:
-        """All stages that stand, in the order of work."""
-        after = [f"{group}/{name}" for group in _GROUPS for name in self.sequences(group)]
+        """Return all complete stages in processing order."""
+        after = [f"{group}/{name}" for group in GROUPS for name in self.sequences(group)]
         return tuple(stage for stage in (*STAGES, *after, SPLIT) if self.has(stage))
 
     def run_folder(self, name: str) -> Path:
-        """Folder of a trained network, which need not exist. Raises InputError for what names no folder."""
+        """Return the folder of a trained network; raise InputError if the name is not valid."""
         if safe_name(name) != name or name == COMPARED:
             raise InputError(
-                f"{name!r} cannot name a run; use letters, digits, dot, dash and underscore, and not "
+                f"{name!r} is not a valid run name; use letters, digits, dot, dash and underscore, but not "
                 f"{COMPARED!r}"
             )
         return self.root / RUNS / name
 
     def upstream_names(self, stage: str) -> tuple[str, ...]:
-        """The stages that `stage` is made from, as the area is now."""
+        """Return the stages that `stage` depends on in the present area."""
         group, _, name = stage.partition("/")
         if stage == SPLIT:
             found = [s for s in self.stages() if s != SPLIT]
@@ -164,33 +165,41 @@ class Area:
         return {FRAMES: (), MODEL: (FRAMES,), GEO: (FRAMES, MODEL), EVALUATION: (MODEL,)}[group]
 
     def record(self, stage: str) -> StageRecord:
-        """Raises StageError where the stage is missing, FormatError where a newer version made it."""
+        """Return the record of a stage.
+
+        Raises
+        ------
+        StageError
+            If the stage is missing.
+        FormatError
+            If its record is damaged or of a newer version.
+        """
         path = self.folder(stage) / _RECORD
         if not path.exists():
             raise StageError(f"{self.folder(stage)} is missing; run {command_of(stage)} first")
         return read_record(path)
 
     def stale_because(self, stage: str) -> str | None:
-        """Why a stage no longer fits what it was made from, or None."""
+        """Return why a stage is out of date with respect to its upstream stages, or None."""
         record = self.record(stage)
         for name, fingerprint in record.upstream.items():
             if not self.has(current_stage(name)):
                 return f"{name} is missing"
             if self.record(current_stage(name)).fingerprint() != fingerprint:
-                return f"{name} was made anew since"
+                return f"{name} was redone since"
         known = {current_stage(name) for name in record.upstream}
         added = [name for name in self.upstream_names(stage) if name not in known]
         return f"{added[0]} was added since" if added else None
 
     def upstream_of(self, stage: str) -> dict[str, str]:
-        """Fingerprints of the stages that `stage` is made from. Raises StageError for a stale one."""
+        """Return the fingerprints of the stages that `stage` depends on; raise StageError if one is stale."""
         names = self.upstream_names(stage)
         for name in names:
             self.check_fresh(name)
         return {name: self.record(name).fingerprint() for name in names}
 
     def check_fresh(self, stage: str) -> None:
-        """Raises StageError where a stage is missing or stale."""
+        """Raise StageError if a stage is missing or stale."""
         reason = self.stale_because(stage)
         if reason:
             raise StageError(
@@ -205,10 +214,29 @@ class Area:
         *,
         overwrite: bool,
     ) -> StageWork | StageRecord:
-        """The record where the stage stands already, made of the same; else the work to do.
+        """Start or resume a stage, or return its record if it is already up to date.
 
-        Unfinished work made of the same goes on. Raises StageError where finished or unfinished work
-        made of something else would be lost and `overwrite` is false.
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+        options : mapping
+            JSON-serialisable options of the stage.
+        inputs : mapping of str to str
+            Fingerprint of each input file, by name.
+        overwrite : bool
+            Whether work made from other options or inputs may be discarded.
+
+        Returns
+        -------
+        StageWork or StageRecord
+            The work to do; or the record of the complete stage if it was made from the same.
+
+        Raises
+        ------
+        StageError
+            If an upstream stage is missing or stale, or work made from something else would be lost and
+            `overwrite` is false.
         """
         record = StageRecord(
             stage=stage,
@@ -223,8 +251,8 @@ class Area:
             if not overwrite:
                 change = difference(found, record)
                 raise StageError(
-                    f"{self.folder(stage)} stands already and {change}; "
-                    "--overwrite makes it anew, another --area leaves it"
+                    f"{self.folder(stage)} already exists but {change}; "
+                    "use --overwrite to redo it, or another --area to keep it"
                 )
         path = self.partial(stage)
         started = path / _STARTED
@@ -232,14 +260,14 @@ class Area:
         if resumed:
             found = read_record(started)
             if found.made_of != record.made_of:
-                if not overwrite and _holds_work(path):
+                if not overwrite and _has_files(path):
                     raise StageError(
-                        f"{path} holds unfinished work and {difference(found, record)}; "
-                        "give the same options to go on, or --overwrite to start anew"
+                        f"{path} contains unfinished work that {difference(found, record)}; "
+                        "use the same options to continue, or --overwrite to start over"
                     )
                 shutil.rmtree(path)
                 resumed = False
-            elif (path / _RECORD).exists():  # a kill while scratch files were removed
+            elif (path / _RECORD).exists():  # killed while temporary files were being removed
                 self.put_in_place(stage, path)
                 return self.record(stage)
         if not resumed:
@@ -249,7 +277,7 @@ class Area:
         return StageWork(self, record, path, resumed=resumed)
 
     def put_in_place(self, stage: str, path: Path) -> None:
-        """Rename a complete folder to the stage's name; a kill at any moment loses neither version."""
+        """Rename a complete folder to the stage's folder; a kill at any moment loses neither version."""
         for pattern in SCRATCH.get(stage.partition("/")[0], ()):
             for scratch in path.glob(pattern):
                 shutil.rmtree(scratch) if scratch.is_dir() else scratch.unlink()
@@ -262,7 +290,10 @@ class Area:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Only one process at a time changes an area. Makes the folder; removes it if it stays empty."""
+        """Hold the lock of the area, so that only one process at a time changes it.
+
+        Creates the folder, and removes it again if it stays empty. Raises InUseError if it is in use.
+        """
         is_new = not self.root.exists()
         _make_folder(self.root)
         with locked(self.root, "spn-data"):
@@ -272,24 +303,24 @@ class Area:
                 if is_new and [path.name for path in self.root.iterdir()] == [LOCK]:
                     shutil.rmtree(self.root)
 
-    def _finish_exchange(self) -> None:
-        """Complete the renames that a killed process left half-way; not those of one that still runs."""
+    def _complete_renames(self) -> None:
+        """Complete renames that a killed process left unfinished, unless another process is at work."""
         exchanging = (self.root / _NEXT / _READY).exists()
-        if not exchanging and not self._moved_away():
+        if not exchanging and not self._half_replaced():
             return
         try:
             with self.locked():
-                for stage in self._moved_away():
+                for stage in self._half_replaced():
                     self._old(stage).rename(self.folder(stage))
                 if (self.root / _NEXT / _READY).exists():
                     self._replace_by_next()
         except InUseError:
             return
 
-    def _moved_away(self) -> list[str]:
-        """Stages between the two renames of an exchange."""
+    def _half_replaced(self) -> list[str]:
+        """Return the stages whose old folder is moved away and whose new one is not yet in place."""
         names = [*STAGES, SPLIT]
-        for group in _GROUPS:
+        for group in GROUPS:
             names += [
                 f"{group}/{old.name.removeprefix('.old-')}"
                 for old in self.group_folder(group).glob(".old-*")
@@ -297,50 +328,38 @@ class Area:
         return [s for s in names if self._old(s).exists() and not self.folder(s).exists()]
 
     def stored_path(self, path: Path) -> str:
-        """A user's path as area.toml holds it: a relative one from the area's folder on, so that it is found
-        from any current folder, and where both have moved together."""
+        """Return a user's path as stored in area.toml, with relative paths starting at the area's folder.
+
+        It can then be resolved from any current folder, also after both have been moved together.
+        """
         if not path.is_absolute():
             path = Path(os.path.relpath(os.path.abspath(path), os.path.realpath(self.root)))
         return str(path).encode(errors="backslashreplace").decode()
 
     def write_facts(self, facts: Facts) -> None:
+        """Write area.toml if its content changes."""
         if facts == self.facts and (self.root / _FACTS).exists():
             return
-        table = {"version": VERSION, "sources": list(facts.sources)}
-        if facts.evaluation:
-            table["evaluation"] = dict(sorted(facts.evaluation.items()))
-        text = tomli_w.dumps(table)
-        write_atomically(self.root / _FACTS, text)
+        write_facts(self.root / _FACTS, facts)
         self.facts = facts
 
-    def _read_facts(self) -> Facts:
-        path = self.root / _FACTS
-        if not path.exists():
-            return Facts()
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-            check_version(path, table["version"])
-            evaluation = {str(k): str(v) for k, v in dict(table.get("evaluation", {})).items()}
-            return Facts(sources=tuple(str(s) for s in table["sources"]), evaluation=evaluation)
-        except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"{path}: not an area file of this program ({error!r})") from error
-
     def next_area(self) -> Area:
-        """An area inside this one in which its next version is made, whole, before it replaces this."""
+        """Return an area inside this one in which its next version is built before it replaces this one."""
         return Area(self.root / _NEXT)
 
     def has_unfinished_addition(self) -> bool:
+        """Return whether a next version was begun."""
         return (self.root / _NEXT).exists()
 
     def discard_next(self) -> None:
-        """Throw away what an unfinished addition has made."""
+        """Remove the next version."""
         shutil.rmtree(self.root / _NEXT, ignore_errors=True)
 
     def replace_by_next(self) -> None:
-        """Replace the stages by those of the next version, all or none."""
+        """Replace the stages of the map by those of the next version, all or none."""
         (self.root / _NEXT / _READY).touch()
         self._replace_by_next()
-        self.facts = self._read_facts()
+        self.facts = read_facts(self.root / _FACTS)
 
     def _replace_by_next(self) -> None:
         following = self.root / _NEXT
@@ -358,7 +377,7 @@ class Area:
 
 
 def command_of(stage: str) -> str:
-    """The command that makes a stage."""
+    """Return the command that makes a stage."""
     group, _, name = stage.partition("/")
     commands = {
         GEO: "spn-data georegister",
@@ -373,9 +392,9 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StageError(f"{path} cannot be made: {error.strerror}") from error
+        raise StageError(f"{path} cannot be created: {error.strerror}") from error
 
 
-def _holds_work(path: Path) -> bool:
-    """Whether an unfinished stage has made any file yet."""
+def _has_files(path: Path) -> bool:
+    """Return whether an unfinished stage contains any files yet."""
     return any(p.is_file() and p.name != _STARTED for p in path.rglob("*"))

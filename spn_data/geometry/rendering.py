@@ -91,7 +91,7 @@ def _largest_half_width_tan(camera: Camera, width: int, height: int) -> float:
     low, high = 0.0, _WIDEST_TAN
     if not fits(1e-6):
         raise GeometryError(
-            "a camera's principal point lies outside its image: no pinhole view can be centred on it"
+            "a camera's principal point is outside its image: no pinhole view can be centred on it"
         )
     for _ in range(60):
         middle = (low + high) / 2

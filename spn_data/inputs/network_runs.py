@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from spn_data.area.area import CHECKPOINT, COMPARED, FIGURES, METRICS, RUNS, SPLIT, Area
+from spn_data.area.area import Area
+from spn_data.area.names import CHECKPOINT, COMPARED, DATASET, FIGURES, METRICS, RUNS, SPLIT
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
@@ -30,7 +31,7 @@ def read_runs(area: Area) -> tuple[tuple[RunFacts, ...], tuple[str, ...]]:
     folder = area.root / RUNS
     names = [n for n in area.sequences(RUNS) if (folder / n / METRICS).is_file()]
     names.sort(key=lambda name: (name != COMPARED, name))
-    dataset = area.folder(SPLIT) / "dataset.h5"
+    dataset = area.folder(SPLIT) / DATASET
     current = content_fingerprint(dataset) if dataset.is_file() else ""
     found: list[RunFacts] = []
     broken: list[str] = []

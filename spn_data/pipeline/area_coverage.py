@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, GEO, MODEL, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import COVERAGE, EVALUATION, GEO, MODEL, PLANNED_COVERAGE, TRACKED
 from spn_data.coverage.nearest_frame import CoverageOptions
 from spn_data.coverage.refly import ReflightPlan, ReflyOptions, plan_reflight
 from spn_data.coverage.sequence_table import (
@@ -33,7 +34,6 @@ from spn_data.pipeline.geo_stage import recorded_options
 from spn_data.storage.json_files import VERSION, finite, read_json, write_json
 from spn_data.work.timing import Progress
 
-EVALUATED, PLANNED = "coverage", "coverage-waypoints"  # folders in the area
 WAYPOINTS = "waypoints"  # name of the plan, as of a sequence
 _FILE = "coverage.json"
 
@@ -82,7 +82,7 @@ def cover_area(
     labelled = read_labelled_area(area)
     place = _place(area, labelled)
     if waypoints is None:
-        folder = area.folder(EVALUATED)
+        folder = area.folder(COVERAGE)
         queries = {
             name: _queries_of(labels, labelled) for name, labels in labelled.evaluation.items()
         }
@@ -92,7 +92,7 @@ def cover_area(
                 "spn-data register VIDEO --name NAME adds one, --waypoints FILE.csv takes a plan instead"
             )
     else:
-        folder = area.folder(PLANNED)
+        folder = area.folder(PLANNED_COVERAGE)
         if place is None:
             raise StageError(
                 f"{area.root}: the map has no East, North and Up, which waypoints are stated in; "
@@ -117,7 +117,7 @@ def check_new(path: Path, *, overwrite: bool) -> None:
         raise InputError("its folder does not exist", path=path)
 
 
-def read_coverage(area: Area, folder: str = EVALUATED) -> dict[str, Any] | None:
+def read_coverage(area: Area, folder: str = COVERAGE) -> dict[str, Any] | None:
     """What coverage.json holds (docs/coverage.md); None where coverage was not asked for yet."""
     path = area.folder(folder) / _FILE
     if not path.exists():
@@ -138,7 +138,7 @@ def stale_because(area: Area, coverage: Mapping[str, Any]) -> str | None:
         if stage not in before:
             return f"{stage} was added since"
         if before[stage] != now[stage]:
-            return f"{stage} was made anew since"
+            return f"{stage} was redone since"
     return None
 
 

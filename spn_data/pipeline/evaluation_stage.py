@@ -9,20 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, Area, Facts, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.facts import Facts
+from spn_data.area.names import (
+    CAMERA,
+    CAMERAS,
+    EVALUATION,
+    FRAMES,
+    GEO,
+    MODEL,
+    OBSERVATIONS,
+    POSES,
+    REGISTRATION,
+)
 from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
-from spn_data.inputs.area_labels import (
-    CAMERA,
-    POSES,
-    REGISTRATION,
-    SEEN,
-    read_geo,
-    read_world_from_model,
-    similarity_to_json,
-)
+from spn_data.inputs.area_labels import read_geo, read_world_from_model
 from spn_data.inputs.evaluation_source import find_source, take_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
@@ -132,7 +136,7 @@ def _register(
     labels = labels.transformed(world_from_model)
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
-        write_label_observations(work.path / SEEN, found.seen)
+        write_label_observations(work.path / OBSERVATIONS, found.seen)
         lens = {} if covariance is None else _lens_json(covariance)
         camera = {"version": VERSION, **camera_to_json(solution.camera), **lens}
         write_json(work.path / CAMERA, {**camera, "start": _start_json(taken.start)})
@@ -144,7 +148,7 @@ def _register(
             work.path / REGISTRATION,
             {
                 "version": VERSION,
-                "world_from_model": similarity_to_json(world_from_model),
+                "world_from_model": world_from_model.to_json(),
                 "map_before": before[MODEL],
                 "map_after": after[MODEL],
                 "geo_before": before.get(GEO),
@@ -184,7 +188,7 @@ def _misfit(found: Registered) -> list[str]:
 
 def _mapping_lenses(area: Area) -> dict[str, Camera]:
     """The mapping lenses as mapping estimated them, by key."""
-    sizes = read_json(area.folder(FRAMES) / "cameras.json")["cameras"]
+    sizes = read_json(area.folder(FRAMES) / CAMERAS)["cameras"]
     estimated = area.record(MODEL).counts["cameras"]
     return {
         key: camera_from_json({**sizes[key], "model": lens["model"], "params": lens["params"]})

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from spn_data.area.area import FRAMES, GEO, MODEL, STAGES, Area, Facts
+from spn_data.area.area import Area
+from spn_data.area.facts import Facts
+from spn_data.area.names import FRAMES, GEO, GEO_FIT, MODEL, STAGES
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegistration.result import GeoFit
 from spn_data.pipeline.frames_stage import FramesOptions, Plan, choose_frames, plan
@@ -85,7 +87,7 @@ def add(
             raise StageError(f"{area.folder(stage)} is missing: nothing to add to; leave out --add")
     geo = _geo_options(area, options)
     if area.has(GEO):
-        origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
+        origin = GeoFit.from_json(read_json(area.folder(GEO) / GEO_FIT)).origin
         geo = replace(geo, fit=replace(geo.fit, origin=origin))
     options = replace(options, geo=geo)
     found = plan(inputs, options.frames, extended=area, tested=area)

@@ -127,9 +127,9 @@ def difference(found: StageRecord, wanted: StageRecord) -> str:
         k for k in set(wanted.inputs) & set(found.inputs) if wanted.inputs[k] != found.inputs[k]
     )
     for what, names in (
-        ("does not hold", new),
-        ("holds the missing", gone),
-        ("saw another", changed),
+        ("does not include", new),
+        ("includes the missing", gone),
+        ("used a different", changed),
     ):
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""

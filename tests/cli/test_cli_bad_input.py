@@ -21,7 +21,8 @@ from click.testing import CliRunner, Result
 from spn_cli.console import Group
 from spn_cli.data import main
 
-from spn_data.area.area import FRAMES, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, MODEL
 from spn_data.errors import StageError
 from spn_data.storage.json_files import VERSION
 
@@ -116,7 +117,7 @@ def test_all_frames_blurred_is_said(flight1: Path, tmp_path: Path) -> None:
 
 def test_an_area_below_a_file_is_refused(flight1: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    assert "cannot be made: Not a directory" in refused(
+    assert "cannot be created: Not a directory" in refused(
         flight1, "--area", tmp_path / "file" / "area"
     )
     assert (tmp_path / "file").read_text() == "mine"
@@ -139,9 +140,9 @@ def test_an_area_of_a_newer_version_is_refused_and_left_alone(
     ("option", "message"),
     [
         (("--max-features", "900"), "was made with features.max_features = 800, now 900"),
-        (("--fov", "80"), "1-frames stands already and was made with fov_deg.* = 72.0, now 80.0"),
-        (("--gnss-sigma", "1", "2"), "3-geo stands already and was made with fit.gnss_sigma_m"),
-        (("--seed", "3"), "2-model stands already and was made with seed = 0, now 3"),
+        (("--fov", "80"), "1-frames already exists but was made with fov_deg.* = 72.0, now 80.0"),
+        (("--gnss-sigma", "1", "2"), "3-geo already exists but was made with fit.gnss_sigma_m"),
+        (("--seed", "3"), "2-model already exists but was made with seed = 0, now 3"),
     ],
 )  # fmt: skip
 def test_a_changed_option_is_refused_by_name_and_changes_nothing(
@@ -150,7 +151,7 @@ def test_a_changed_option_is_refused_by_name_and_changes_nothing(
     before = contents(finished_area)
     found = refused(flight1, "--area", finished_area, *FAST, *option)
     assert message in found
-    assert "--overwrite makes it anew" in found
+    assert "use --overwrite to redo it" in found
     assert contents(finished_area) == before
 
 
@@ -238,7 +239,7 @@ def test_a_damaged_database_is_named(flight1: Path, finished_area: Path, tmp_pat
     (partial / "stage.json").rename(partial / "started.json")
     (partial / "database.db").write_bytes(b"no database" * 1000)
     message = refused(flight1, "--area", area, *FAST)
-    assert "database.db: damaged, or not a COLMAP database; remove it" in message
+    assert "database.db: not a COLMAP database, or damaged; delete it" in message
     (partial / "database.db").unlink()
     assert run("reconstruct", flight1, "--area", area, *FAST).exit_code == 0
 

@@ -14,7 +14,8 @@ import pytest
 from click.testing import CliRunner
 from spn_cli.data import main
 
-from spn_data.area.area import EVALUATION, FRAMES, GEO, Area
+from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, FRAMES, GEO, PLANNED_COVERAGE
 from spn_data.coverage.nearest_frame import CoverageOptions, coverage_strata
 from spn_data.coverage.sequence_table import COLUMNS
 from spn_data.coverage.waypoints import WaypointFrame, read_waypoints
@@ -25,10 +26,9 @@ from spn_data.inputs.area_labels import (
     LabelledArea,
     read_labelled_area,
     read_world_from_model,
-    similarity_to_json,
 )
 from spn_data.labels.labels import LabelObservations, Labels, write_label_observations, write_labels
-from spn_data.pipeline.area_coverage import PLANNED, read_coverage, stale_because
+from spn_data.pipeline.area_coverage import read_coverage, stale_because
 from spn_data.storage.json_files import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,7 +64,7 @@ def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
     )
     camera = next(iter(read_json(area.folder("1-frames") / "cameras.json")["cameras"].values()))
     write_json(work.path / "camera.json", {"version": 1, **camera})
-    transform = similarity_to_json(read_world_from_model(area))
+    transform = read_world_from_model(area).to_json()
     write_json(work.path / "registration.json", {"version": 1, "world_from_model": transform})
     work.finish(counts={"frames": n}, seconds={}, cpu_seconds={})
 
@@ -146,11 +146,11 @@ def test_a_plan_is_covered_instead(area, tmp_path):
     plan.write_text("x,y,z,heading_deg,pitch_deg,camera\n0,0,4,0,0,\n500,0,4,0,0,near\n")
     shown = run("--area", area, "--waypoints", plan, "--fov", "60")
     assert "frames 2" in shown
-    rows = rows_of(area / PLANNED / "waypoints.csv")
+    rows = rows_of(area / PLANNED_COVERAGE / "waypoints.csv")
     assert [row["name"] for row in rows] == ["line 2", "line 3"]
     assert rows[1]["stratum"] == "low"
     assert float(rows[1]["view_share"]) == 0
-    found = read_coverage(Area(area), PLANNED)
+    found = read_coverage(Area(area), PLANNED_COVERAGE)
     assert found["waypoints"] == "plan.csv"
     assert sorted(found["made_of"]) == ["2-model", "3-geo"]
     assert (area / "coverage" / "coverage.json").read_bytes() == before
@@ -169,7 +169,7 @@ def test_a_camera_of_waypoints_may_be_given(area, labelled, tmp_path):
     shares = []
     for words in ((), ("--camera", tmp_path / "c.json"), ("--fov", "8")):
         run("--area", area, "--waypoints", plan, *words)
-        rows = rows_of(area / PLANNED / "waypoints.csv")
+        rows = rows_of(area / PLANNED_COVERAGE / "waypoints.csv")
         shares.append([float(row["view_share"]) for row in rows])
     assert shares[1] == shares[2]
     assert shares[0][0] > shares[1][0] > 0
@@ -194,7 +194,7 @@ def test_another_map_or_sequence_makes_it_stale(area, labelled):
     assert stale_because(Area(area), found) == "4-eval/second was added since"
     shutil.rmtree(area / EVALUATION / "second")
     register(Area(area), "near", poses, ["registered"] * 3)
-    assert stale_because(Area(area), found) == "4-eval/near was made anew since"
+    assert stale_because(Area(area), found) == "4-eval/near was redone since"
 
 
 def test_without_metres_there_are_units_of_the_model(area):

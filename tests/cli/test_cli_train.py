@@ -121,7 +121,7 @@ def test_another_data_set_over_a_run_is_refused(place):
     write_field(place / "dataset.h5", 13, 3)
     refused = trained(place)
     assert refused.exit_code == 1
-    assert "saw another data set" in refused.output
+    assert "used a different data set" in refused.output
 
 
 def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
@@ -177,10 +177,10 @@ def test_what_nothing_can_be_trained_with_leaves_no_run(place):
     """A recipe that is none, a device that is not there, a bad name, a stage's unknown option."""
     (place / "bad.toml").write_text(TOML.replace("frozen = true", "frosen = true"))
     for words, told in (
-        (("--recipe", "nothing"), "there is no recipe 'nothing'"),
-        (("--device", "tpu"), "there is no device 'tpu'"),
+        (("--recipe", "nothing"), "unknown recipe 'nothing'"),
+        (("--device", "tpu"), "unknown device 'tpu'"),
         (("--pretrain", str(place / "none.h5")), None),
-        (("--run", "../up"), "cannot name a run"),
+        (("--run", "../up"), "is not a valid run name"),
         (("--recipe", str(place / "bad.toml")), "has no option 'frosen'"),
     ):
         ran = trained(place, *words)

@@ -1,4 +1,4 @@
-"""The area's stages appear whole or not at all, and nothing of the user's is lost."""
+"""Stages of an area appear atomically, and no data of the user is lost."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.area.area import FRAMES, GEO, MODEL, Area, Facts, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.facts import Facts
+from spn_data.area.names import FRAMES, GEO, MODEL
 from spn_data.errors import FormatError, StageError
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import VERSION
@@ -53,7 +55,7 @@ def test_interrupted_work_of_other_options_is_not_thrown_away(tmp_path: Path) ->
     begun = area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
     assert isinstance(begun, StageWork)
     (begun.path / "half").write_text("done")
-    with pytest.raises(StageError, match=r"unfinished work and was made with n = 1, now 2"):
+    with pytest.raises(StageError, match=r"unfinished work that was made with n = 1, now 2"):
         area.begin(FRAMES, {"n": 2}, {}, overwrite=False)
     work = area.begin(FRAMES, {"n": 2}, {}, overwrite=True)
     assert isinstance(work, StageWork)
@@ -69,7 +71,7 @@ def test_an_unchanged_stage_is_not_made_again(tmp_path: Path) -> None:
 def test_a_finished_stage_is_overwritten_only_on_demand(tmp_path: Path) -> None:
     area = Area(tmp_path)
     make(area, FRAMES, "first", n=1)
-    with pytest.raises(StageError, match="n = 1, now 2; --overwrite"):
+    with pytest.raises(StageError, match="n = 1, now 2; use --overwrite"):
         area.begin(FRAMES, {"n": 2}, {}, overwrite=False)
     assert content(area, FRAMES) == "first"
     make(area, FRAMES, "second", n=2, overwrite=True)
@@ -81,9 +83,9 @@ def test_changed_input_is_named(tmp_path: Path) -> None:
     work = area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "2"}, overwrite=False)
     assert isinstance(work, StageWork)
     work.finish(counts={}, seconds={}, cpu_seconds={})
-    with pytest.raises(StageError, match=r"saw another b\.mp4"):
+    with pytest.raises(StageError, match=r"used a different b\.mp4"):
         area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "3"}, overwrite=False)
-    with pytest.raises(StageError, match=r"does not hold c\.mp4"):
+    with pytest.raises(StageError, match=r"does not include c\.mp4"):
         area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "2", "c.mp4": "3"}, overwrite=False)
 
 
@@ -93,8 +95,8 @@ def test_a_stage_made_from_an_earlier_one_is_stale(tmp_path: Path) -> None:
     make(area, MODEL, "model")
     assert area.stale_because(MODEL) is None
     make(area, FRAMES, "other frames", overwrite=True, n=2)
-    assert area.stale_because(MODEL) == "1-frames was made anew since"
-    with pytest.raises(StageError, match="2-model is stale: 1-frames was made anew"):
+    assert area.stale_because(MODEL) == "1-frames was redone since"
+    with pytest.raises(StageError, match="2-model is stale: 1-frames was redone"):
         area.begin(GEO, {}, {}, overwrite=True)
 
 
@@ -107,7 +109,7 @@ def test_a_kill_between_the_two_renames_loses_neither_version(tmp_path: Path) ->
 
 @pytest.mark.parametrize("killed_after", [0, 1, 2, 3])
 def test_the_next_version_replaces_all_stages_or_none(tmp_path: Path, killed_after: int) -> None:
-    """A kill at any rename of the exchange leaves an area that the next start completes."""
+    """After a kill at any rename of the replacement, the next start completes it."""
     area = Area(tmp_path)
     for stage in (FRAMES, MODEL, GEO):
         make(area, stage, "old")
@@ -155,7 +157,7 @@ def test_two_processes_do_not_change_one_area(tmp_path: Path) -> None:
 
 def test_an_area_where_a_file_stands_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StageError, match="cannot be made"), Area(tmp_path / "file").locked():
+    with pytest.raises(StageError, match="cannot be created"), Area(tmp_path / "file").locked():
         pass
 
 

@@ -29,7 +29,7 @@ def _points() -> np.ndarray:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_projection_agrees_with_pycolmap(model):
-    """Parameter order, distortion and pixel origin are COLMAP's."""
+    """Parameter order, distortion and pixel origin are those of COLMAP."""
     theirs = pycolmap.Camera(model=model, width=1280, height=720, params=PARAMS[model])
     expected = np.array([theirs.img_from_cam(p) for p in _points()])
     assert _camera(model).project(_points()) == pytest.approx(expected, abs=1e-9)
@@ -48,7 +48,7 @@ def test_projection_agrees_with_opencv_half_a_pixel_off(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_unprojection_undoes_projection(model):
-    """Rays of all pixels of the image come back to 1e-6 pixels."""
+    """Projected rays return to their pixels within 1e-6 px, all over the image."""
     camera = _camera(model)
     x, y = np.meshgrid(np.linspace(0.5, 1279.5, 21), np.linspace(0.5, 719.5, 13))
     pixels = np.column_stack([x.ravel(), y.ravel()])
@@ -57,7 +57,7 @@ def test_unprojection_undoes_projection(model):
 
 
 def test_points_behind_the_camera_have_no_pixel():
-    """NaN, not a mirrored pixel."""
+    """They are NaN, not mirrored pixels."""
     pixels = _camera("OPENCV").project(np.array([[0.0, 0, 1], [0, 0, -1], [1, 1, 0]]))
     assert np.isfinite(pixels[0]).all()
     assert np.isnan(pixels[1:]).all()
@@ -73,7 +73,7 @@ def test_the_field_of_view_is_that_of_the_undistorted_image():
 
 
 def test_a_camera_of_a_scaled_image_sees_the_same_rays():
-    """Half the size: half the pixel coordinates, distortion terms unchanged."""
+    """At half the size, pixel coordinates are halved and distortion terms are unchanged."""
     camera = _camera("OPENCV")
     half = camera.scaled(640, 360)
     assert half.project(_points()) == pytest.approx(camera.project(_points()) / 2, abs=1e-9)
@@ -81,7 +81,7 @@ def test_a_camera_of_a_scaled_image_sees_the_same_rays():
 
 
 def test_the_number_of_parameters_is_checked():
-    """A model that is not known, and one parameter too few, are our own mistakes."""
+    """An unknown model or a missing parameter is a programming error."""
     with pytest.raises(ValueError, match="FISHEYE"):
         Camera("FISHEYE", 10, 10, np.zeros(4))
     with pytest.raises(ValueError, match="takes 8 parameters, got 7"):

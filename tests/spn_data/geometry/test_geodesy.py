@@ -14,7 +14,7 @@ from spn_data.geometry.geodesy import (
     wgs84_from_ecef,
 )
 
-# pycolmap defaults to GRS80, whose poles lie 0.1 mm elsewhere.
+# pycolmap defaults to GRS80, whose poles differ by 0.1 mm.
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 PLACES = np.array(
     [
@@ -29,20 +29,20 @@ PLACES = np.array(
 
 
 def test_earth_centred_coordinates_agree_with_pycolmap():
-    """The ellipsoid's formula, to a nanometre or so, on all sides of the Earth."""
+    """ECEF coordinates agree to about a nanometre, on all sides of the Earth."""
     theirs = WGS84.ellipsoid_to_ecef(PLACES)
     assert ecef_from_wgs84(PLACES) == pytest.approx(theirs, abs=1e-7)
 
 
 def test_earth_centred_coordinates_have_their_known_values():
-    """On the equator the radius is the semi-major axis, at the pole the semi-minor one."""
+    """The radius is the semi-major axis on the equator and the semi-minor axis at the pole."""
     places = np.array([[0.0, 0.0, 0.0], [0.0, 90.0, 1.0], [90.0, 0.0, 0.0]])
     known = np.array([[6378137.0, 0, 0], [0, 6378138.0, 0], [0, 0, 6356752.314245]])
     assert ecef_from_wgs84(places) == pytest.approx(known, abs=1e-6)
 
 
 def test_the_way_back_from_earth_centred_coordinates_is_exact():
-    """To 1e-9 m in height and 1e-14 degrees or so in angle, at the poles too."""
+    """The round trip is exact to 1e-9 m in height and about 1e-14 degrees in angle, also at the poles."""
     places = np.concatenate(
         [PLACES, [[90.0, 0.0, 5.0], [-90.0, 0.0, -5.0], [45.0, 100.0, 20000.0]]]
     )
@@ -54,7 +54,7 @@ def test_the_way_back_from_earth_centred_coordinates_is_exact():
 
 @pytest.mark.parametrize("place", PLACES.tolist())
 def test_local_metres_agree_with_pycolmap(place):
-    """East, north and up of points up to a kilometre away, and the way back."""
+    """East, north and up agree for points up to a kilometre away, in both directions."""
     origin = GeoOrigin(*place)
     rng = np.random.default_rng(0)
     enu = rng.uniform(-1000, 1000, (20, 3))
@@ -65,7 +65,7 @@ def test_local_metres_agree_with_pycolmap(place):
 
 
 def test_axes_point_east_north_and_up():
-    """A little more longitude is east, latitude north, height up: in the south and west too."""
+    """More longitude is east, more latitude north, more height up; also in the south and west."""
     for lat, lon in ((49.0, 8.4), (-33.4, -70.6)):
         origin = GeoOrigin(lat, lon, 100.0)
         moved = np.array([[lat, lon + 1e-4, 100.0], [lat + 1e-4, lon, 100.0], [lat, lon, 107.0]])
@@ -78,13 +78,13 @@ def test_axes_point_east_north_and_up():
 
 
 def test_one_point_may_come_without_a_list():
-    """(3,) in, (3,) out."""
+    """An input of shape (3,) gives a result of shape (3,)."""
     origin = GeoOrigin(49.0, 8.4, 100.0)
     assert origin.enu_from_wgs84(np.array([49.0, 8.4, 100.0])) == pytest.approx([0, 0, 0], abs=1e-6)
     assert origin.wgs84_from_enu(np.zeros(3)) == pytest.approx([49.0, 8.4, 100.0])
 
 
 def test_an_origin_knows_what_its_height_is_above():
-    """The ellipsoid unless said otherwise; the names are those of the files."""
+    """The default reference is the ellipsoid; the names are those used in files."""
     assert GeoOrigin(0, 0, 0).height_reference is HeightReference.ELLIPSOID
     assert [str(r) for r in HeightReference] == ["ellipsoid", "amsl", "takeoff", "unknown"]

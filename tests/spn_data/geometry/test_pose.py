@@ -42,7 +42,7 @@ def test_rotation_matrices_agree_with_pycolmap():
 
 
 def test_quaternions_survive_the_way_through_matrices_and_vectors():
-    """Also at half a turn, where the usual formulas divide by zero, and at none."""
+    """Round trips are exact, also at half a turn, where the usual formulas divide by zero, and at zero."""
     special = [
         [0, 1, 0, 0],
         [0, 0, 1, 0],
@@ -60,7 +60,7 @@ def test_quaternions_survive_the_way_through_matrices_and_vectors():
 
 
 def test_a_quaternion_and_its_negative_are_one_rotation():
-    """canonical_quats makes them equal, with w >= 0; of length zero there is none."""
+    """canonical_quats makes them equal, with w >= 0; length zero is an error."""
     quats = _random_quats(50)
     assert canonical_quats(-3 * quats) == pytest.approx(quats)
     assert (quats[:, 0] >= 0).all()
@@ -70,7 +70,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
 
 
 def test_small_rotation_errors_are_exact():
-    """A millionth of a degree is measured as such, which arccos cannot; q and -q do not differ."""
+    """Errors of a millionth of a degree are measured, which arccos cannot do; q and -q are equal."""
     quats = _random_quats(20)
     for angle_deg in (1e-6, 1e-3, 1.0, 90.0, 179.999):
         turn = rotations_from_vectors(np.tile([0, np.deg2rad(angle_deg), 0], (20, 1)))
@@ -99,7 +99,7 @@ def test_heading_pitch_roll_point_where_the_gimbal_says(angles, forward, right):
 
 
 def test_angles_survive_the_way_through_rotations():
-    """Anywhere but at the poles all three come back; straight down roll is 0 and heading the image's top."""
+    """All three angles are recovered except straight down: there roll is 0 and heading is the image's top."""
     rng = np.random.default_rng(1)
     angles = np.column_stack(
         [rng.uniform(0, 360, 100), rng.uniform(-89, 89, 100), rng.uniform(-179, 179, 100)]
@@ -110,7 +110,7 @@ def test_angles_survive_the_way_through_rotations():
 
 
 def test_poses_agree_with_pycolmap_s_projection_center():
-    """From and to COLMAP's cam_from_world; the centre is -R^T t."""
+    """Conversion from and to COLMAP's cam_from_world agrees; the centre is -R^T t."""
     rng = np.random.default_rng(2)
     quats_xyzw = np.roll(_random_quats(10, 3), -1, axis=1)
     translations = rng.standard_normal((10, 3))
@@ -125,7 +125,7 @@ def test_poses_agree_with_pycolmap_s_projection_center():
 
 
 def test_poses_can_be_picked_and_walked():
-    """Length, mask, slice and iteration."""
+    """Poses have a length and support masks, slices and iteration."""
     poses = Poses(np.arange(12.0).reshape(4, 3), _random_quats(4))
     assert len(poses[np.array([True, False, True, False])]) == 2
     assert poses[1:3].centers[0].tolist() == [3, 4, 5]
@@ -150,14 +150,14 @@ def test_a_similarity_agrees_with_pycolmap_s_estimate():
 
 
 def test_a_similarity_never_mirrors():
-    """Points fitted to their mirror image give a rotation all the same."""
+    """Points fitted to their mirror image give a proper rotation."""
     source = np.random.default_rng(5).standard_normal((20, 3))
     fit = Similarity.fit(source, source * [1, 1, -1])
     assert np.linalg.det(fit.rotation) == pytest.approx(1)
 
 
 def test_a_plane_is_enough_for_a_similarity_and_a_line_is_not():
-    """Flat flights are the rule; on a line, at one point, or with two points nothing fixes the rotation."""
+    """Coplanar points suffice; for collinear, coincident or only two points it is undetermined."""
     rng = np.random.default_rng(6)
     flat = np.column_stack([rng.standard_normal((10, 2)), np.zeros(10)])
     true = Similarity(3.0, rotations_from_vectors(np.array([1.0, 2.0, 0.5])), np.ones(3))
@@ -171,7 +171,7 @@ def test_a_plane_is_enough_for_a_similarity_and_a_line_is_not():
 
 
 def test_weights_of_a_similarity_count_points_as_often():
-    """A weight of two is the point twice, a weight of zero is no point."""
+    """A weight of two counts a point twice, a weight of zero ignores it."""
     rng = np.random.default_rng(7)
     source, target = rng.standard_normal((6, 3)), rng.standard_normal((6, 3))
     weighted = Similarity.fit(source, target, np.array([2.0, 1, 1, 1, 1, 0]))
@@ -181,7 +181,7 @@ def test_weights_of_a_similarity_count_points_as_often():
 
 
 def test_similarities_compose_and_invert():
-    """``c_from_b @ b_from_a`` applies b_from_a first; an inverse undoes it, for cameras too."""
+    """``c_from_b @ b_from_a`` applies b_from_a first; the inverse undoes a transform, also for cameras."""
     b_from_a = Similarity(
         2.0, rotations_from_vectors(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3])
     )
@@ -202,7 +202,7 @@ def test_similarities_compose_and_invert():
 
 
 def test_a_moved_camera_still_sees_its_points_at_the_same_pixels():
-    """Camera coordinates scale with the similarity, so that projections stay."""
+    """Camera coordinates scale with the similarity, so projections do not change."""
     b_from_a = Similarity(
         3.0, rotations_from_vectors(np.array([0.4, -1.0, 0.3])), np.array([9.0, 2, 3])
     )
@@ -215,7 +215,7 @@ def test_a_moved_camera_still_sees_its_points_at_the_same_pixels():
 
 
 def test_poses_are_put_together_and_at_rows_and_the_rest_is_unknown():
-    """What nothing is known of is NaN, never an identity; of no parts come no poses."""
+    """Unknown poses are NaN, never the identity; no parts give no poses."""
     some = Poses(np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([[1.0, 0, 0, 0], [0, 1, 0, 0]]))
     both = Poses.concatenate([some[1:], some])
     assert both.centers[:, 0].tolist() == [4, 1, 4]

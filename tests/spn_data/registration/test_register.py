@@ -19,7 +19,8 @@ import pytest
 from click.testing import CliRunner, Result
 from spn_cli.data import main
 
-from spn_data.area.area import EVALUATION, GEO, MODEL, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, GEO, MODEL, TRACKED
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
@@ -27,7 +28,6 @@ from spn_data.inputs.area_labels import (
     LabelledArea,
     read_labelled_area,
     read_world_from_model,
-    similarity_from_json,
 )
 from spn_data.labels.labels import _COLUMNS, Labels, read_label_observations, read_labels
 from spn_data.labels.map_hash import map_hash
@@ -211,7 +211,7 @@ def test_other_options_need_overwrite_and_the_first_ones_give_the_first_result(
     options = (flight2 / "flight2.mp4", "--name", "medium", "--threads", "1")
     refused = run("register", *options, "--rate", "2", "--area", area)
     assert refused.exit_code == 1
-    assert "4-eval/medium stands already" in refused.stderr
+    assert "4-eval/medium already exists but" in refused.stderr
     assert "--overwrite" in refused.stderr
     assert poses_file(area).read_bytes() == first
     register(area, *options, "--rate", "2", "--overwrite")
@@ -437,7 +437,7 @@ def test_labels_move_with_their_map(area: Path) -> None:
     assert np.allclose(found.covariance[has], expected.covariance[has], rtol=1e-6)
     for group in (EVALUATION, TRACKED):
         folder = area / group / "medium"
-        stored = similarity_from_json(read_json(folder / "registration.json")["world_from_model"])
+        stored = Similarity.from_json(read_json(folder / "registration.json")["world_from_model"])
         assert np.array_equal(stored.translation, new.translation)
         on_disk = read_labels(folder / "poses.csv")
         rows = np.flatnonzero(np.isin(found.names, on_disk.names))

@@ -364,4 +364,4 @@ def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
 
 def test_a_stale_split_fails():
     assert audit.check_up_to_date(None).verdict is AuditVerdict.PASS
-    assert audit.has_failed([audit.check_up_to_date("3-geo was made anew since")])
+    assert audit.has_failed([audit.check_up_to_date("3-geo was redone since")])

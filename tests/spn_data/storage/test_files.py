@@ -1,4 +1,4 @@
-"""Files that stand under their name only when they are complete."""
+"""Files that appear atomically, and CSV files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spn_data.storage.files import atomic_writer, read_csv, write_atomically, wr
 
 
 def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> None:
-    """Neither the caller's mistake nor a disk that is full touches the file or leaves a rest."""
+    """Neither an exception in the block nor a full disk changes the file or leaves a temporary file."""
     path = tmp_path / "list.csv"
     write_atomically(path, "before")
     with pytest.raises(TypeError):
@@ -27,13 +27,13 @@ def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> N
 
 
 def test_text_is_utf8_with_its_own_line_ends(tmp_path: Path) -> None:
-    """Whatever the locale, so that it is read on another machine."""
+    """Text does not depend on the locale, so it can be read on another machine."""
     write_csv(tmp_path / "a.csv", {"straße": ["é", "x\r\ny"], "n": [1, 2]})
     assert (tmp_path / "a.csv").read_bytes() == 'straße,n\né,1\n"x\r\ny",2\n'.encode()
 
 
 def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
-    """A folder that is missing is the user's to see, with the file's name."""
+    """A missing folder is reported with the name of the file."""
     with pytest.raises(StageError, match=r"none/a\.txt cannot be written: No such file"):
         write_atomically(tmp_path / "none" / "a.txt", "")
 
@@ -52,7 +52,7 @@ def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
 def test_csv_of_others_is_refused_with_its_line(
     tmp_path: Path, content: bytes, message: str
 ) -> None:
-    """Another header, a row cut short, quotes that never end, bytes that are no text, too much of it."""
+    """Another header, a truncated row, an unclosed quote, invalid UTF-8 and an oversized file are refused."""
     path = tmp_path / "t.csv"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):

@@ -1,4 +1,4 @@
-"""The uncertainty of a map in itself: against dense algebra, repeated bundle adjustments, and its gauge."""
+"""Covariance of a map, checked against dense algebra, repeated bundle adjustments, and its gauge."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ INDEPENDENT = MapCovarianceOptions(clustered=False)
 
 @dataclass(frozen=True, eq=False)
 class Small:
-    """Two lenses, frames along an arc about a heap of points, and who sees what; no noise."""
+    """Two lenses, frames along an arc around a point cloud, and noise-free measurements."""
 
     scene: Scene
     seen: MapObservations
 
     def noisy(self, noise_px: np.ndarray) -> Small:
-        """Measurements that are off by (M, 2), and the bundle adjustment of them."""
+        """Return the bundle adjustment of measurements with errors (M, 2)."""
         return adjusted(self.scene, self.seen, self.seen.pixels + noise_px)
 
 
@@ -84,7 +84,7 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
 
 
 def adjusted(scene: Scene, seen: MapObservations, pixels: np.ndarray) -> Small:
-    """COLMAP's bundle adjustment of measurements, from the scene as it is."""
+    """Run COLMAP's bundle adjustment on measurements, starting from the given scene."""
     tracks: list[list[tuple[int, int]]] = [[] for _ in scene.points]
     measured = []
     for k in range(len(scene.names)):
@@ -113,7 +113,7 @@ def _observed(model: pycolmap.Reconstruction) -> tuple[Scene, MapObservations]:
 
 
 def drifting(rng: np.random.Generator, seen: MapObservations, sigma_px: float) -> np.ndarray:
-    """(M, 2) errors that walk along each track: neighbours in it correlate by 0.9."""
+    """Return errors (M, 2) that drift along each track: neighbours are correlated by 0.9."""
     noise = sigma_px * rng.standard_normal((len(seen.point_idx), 2))
     for k in range(int(seen.point_idx.max()) + 1):
         rows = np.flatnonzero(seen.point_idx == k)  # sorted by frame
@@ -123,7 +123,7 @@ def drifting(rng: np.random.Generator, seen: MapObservations, sigma_px: float) -
 
 
 def errors_of(found: Scene, truth: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Truth minus found in the found gauge, after the best similarity: poses (N, 6) and points (P, 3)."""
+    """Return truth minus estimate after the best-fit similarity: poses (N, 6) and points (P, 3)."""
     found_from_true = Similarity.fit(truth.poses.centers, found.poses.centers)
     true = found_from_true.apply_to_poses(truth.poses)
     turns = rotation_vectors(true.rotations @ np.swapaxes(found.poses.rotations, 1, 2))
@@ -132,7 +132,7 @@ def errors_of(found: Scene, truth: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scores(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """(N,) e^T C^-1 e of errors (N, k)."""
+    """Return the squared Mahalanobis norms (N,) e^T C^-1 e of errors (N, k)."""
     return np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
 
 
@@ -143,7 +143,7 @@ def linearized(scene: Scene, seen: MapObservations) -> tuple[Unknowns, Linearize
 
 
 def some_functional(scene: Scene, camera_id: int | None = None, seed: int = 1) -> Functional:
-    """Three values of the positions of 20 points, and of a lens."""
+    """Return a functional with three values of 20 points and of a lens."""
     rng = np.random.default_rng(seed)
     index = rng.choice(len(scene.points), 20, replace=False)
     by_lens = None if camera_id is None else rng.normal(size=(3, 8)) * [1, 1, 0, 0, *[100] * 4]
@@ -151,7 +151,7 @@ def some_functional(scene: Scene, camera_id: int | None = None, seed: int = 1) -
 
 
 def test_derivatives_are_those_of_the_residuals() -> None:
-    """Frames, lenses and points moved by a hair change the residuals as the linearisation says."""
+    """Small changes of poses, intrinsics and points change the residuals as linearised."""
     scene, seen = small().scene, small().seen
     unknowns, bundle = linearized(scene, seen)
     rng = np.random.default_rng(3)
@@ -174,7 +174,7 @@ def test_derivatives_are_those_of_the_residuals() -> None:
 
 
 def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
-    """The seven directions of the gauge are null vectors of the information, to rounding."""
+    """The seven gauge directions are null vectors of the reduced normal matrix, up to rounding."""
     scene, seen = small().scene, small().seen
     unknowns, bundle = linearized(scene, seen)
     information = bundle.reduced_normal_matrix()
@@ -183,7 +183,7 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
 
 
 def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np.ndarray:
-    """Of all unknowns, points last: the whole normal matrix inverted under the seven conditions."""
+    """Return the covariance of all unknowns, points last: the inverse under the seven inner constraints."""
     unknowns, bundle = linearized(scene, seen)
     n, p = bundle.design.shape[1], 3 * len(scene.points)
     by_point = np.zeros((bundle.design.shape[0], p))
@@ -232,7 +232,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
 
 
 def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
-    """K M K with M summed track by track, and the share that degrees of freedom give."""
+    """The result is K M K with M summed over tracks, times the correction for the redundancy."""
     rng = np.random.default_rng(6)
     whole = small(8, 60)
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
@@ -258,8 +258,10 @@ def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["independent", "drifting"])
 def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
-    """Over 30 draws of noise, poses and functionals of points score as chi-squared within a third; errors
-    that drift along tracks do so only where they are not taken as independent."""
+    """Over 30 noise draws, poses and functionals have chi-squared errors within a third (NEES).
+
+    Errors that drift along tracks do so only if they are not taken as independent.
+    """
     rng = np.random.default_rng(12)
     whole = small(points=800)
     told: dict[str, list[np.ndarray]] = {"poses": [], "points": [], "poses if independent": []}
@@ -289,7 +291,7 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
 
 
 def test_a_similarity_moves_covariances_with_the_map() -> None:
-    """Scaled by 7, turned and moved, the map has the same errors in its new unit and axes."""
+    """Scaled by 7, rotated and translated, the map has the same errors in its new unit and axes."""
     rng = np.random.default_rng(8)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -318,7 +320,7 @@ def test_a_similarity_moves_covariances_with_the_map() -> None:
 
 
 def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Linearised 100 measurements at a time, nothing changes, and no cluster is cut."""
+    """Linearising 100 measurements at a time changes nothing and splits no cluster."""
     rng = np.random.default_rng(13)
     whole = small()
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
@@ -335,7 +337,7 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_many_functionals_at_once_are_those_one_by_one() -> None:
-    """A batch of three, one of them without points."""
+    """A batch of three agrees with single calls, including one without points."""
     rng = np.random.default_rng(9)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -351,7 +353,7 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
 
 
 def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> None:
-    """Seen from two frames in one place, its depth is unknown, and poses stay as sure as they were."""
+    """A point seen from two frames in one place has an undetermined depth; the poses are not affected."""
     rng = np.random.default_rng(10)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -376,7 +378,7 @@ def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> Non
 
 
 def test_a_map_in_two_pieces_is_refused() -> None:
-    """Two halves that share no point have two gauges, and no covariance between them."""
+    """Two halves without common points have two gauges, and no covariance between them."""
     whole = small(12, 300, 6)
     seen = whole.seen
     left = np.bincount(seen.point_idx, seen.image_idx < 6) / whole.scene.track_lengths

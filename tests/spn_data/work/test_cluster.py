@@ -1,4 +1,4 @@
-"""Batches on a real Dask cluster: two workers on loopback, in an empty folder, that cannot read the area."""
+"""Batches on a real Dask cluster: two workers on loopback, in an empty folder, without access to the area."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ from click.testing import CliRunner
 from spn_cli.data import main
 
 import spn_data
-from spn_data.area.area import EVALUATION, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import DATABASE, EVALUATION, MODEL, POSES
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import read_scene
 from spn_data.errors import InputError
-from spn_data.inputs.area_labels import POSES
 from spn_data.labels.labels import read_labels
 from spn_data.matching.features import FeatureOptions, extract_from_bytes
-from spn_data.pipeline.model_stage import DATABASE
 from spn_data.work import cluster
 from spn_data.work.cluster import fingerprint, run_on_cluster
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 
 PACKAGE = Path(spn_data.__file__).parent
-# Python runs it at its start: whatever opens, lists or changes something in a folder is refused.
+# Python runs this at start-up: opening, listing or changing anything in a folder is refused.
 BLIND = """
 import os, sys
 folder = os.environ["NOT_TO_BE_READ"]
@@ -55,7 +54,7 @@ class Cluster:
         self._start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port))
 
     def add_worker(self, package: Path = PACKAGE, blind_to: Path | None = None) -> None:
-        """One with a thread; it loads this program from the folder above `package`."""
+        """Start a worker with one thread, which loads this program from the folder above `package`."""
         self.workers.append(
             self._start(
                 *(
@@ -109,7 +108,7 @@ def triple(x: int) -> int:
 
 
 def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -> None:
-    """Killed after the fifth of forty, with batches in its hands and results not yet fetched."""
+    """The worker is killed after the fifth of forty results, with batches running and results waiting."""
     started.add_worker()
     started.add_worker()
     results: list[str] = []
@@ -119,7 +118,7 @@ def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -
         if len(results) == 5:
             started.workers[0].kill()
 
-    # A function that the workers have: they know nothing of the tests.
+    # A function that the workers have: they cannot import the tests.
     batches = [(str(k), ("{}", k)) for k in range(40)]
     run_on_cluster(started.address, str.format, iter(batches), store)
     assert sorted(map(int, results)) == list(range(40))
@@ -183,7 +182,7 @@ def test_without_dask_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 def killing_one(
     started: Cluster, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> Iterator[list[str]]:
-    """Kills the first worker after so many results."""
+    """Kill the first worker after a number of stored results; yield what was stored."""
     stored: list[str] = []
 
     def counted(method: Callable[..., None]) -> Callable[..., None]:
@@ -205,7 +204,7 @@ def killing_one(
 def test_a_cluster_gives_the_labels_that_this_machine_gives(
     started: Cluster, flight2: Path, finished_area: Path, tmp_path: Path
 ) -> None:
-    """Of another flight; the workers can read neither the map nor the flight's frames."""
+    """The flight is another one; the workers can read neither the map nor the flight's frames."""
     near, far = (Path(shutil.copytree(finished_area, tmp_path / name)) for name in ("near", "far"))
     for _ in range(2):
         started.add_worker(blind_to=far)
@@ -226,7 +225,7 @@ def test_a_cluster_makes_the_model_that_this_machine_makes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Bit for bit, by two workers that can read nothing of it; one is killed among the features."""
+    """The model is identical bit for bit, although one of two workers is killed during feature extraction."""
     area = tmp_path / "area"
     for _ in range(2):
         started.add_worker(blind_to=area)

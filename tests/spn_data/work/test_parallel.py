@@ -1,4 +1,4 @@
-"""Batches in worker processes: nothing lost, nothing done twice, and a crash named."""
+"""Batches in worker processes: nothing is lost or done twice, and a crash is reported."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def square(x: int) -> int:
 
 
 def die_once(marker: str, x: int) -> int:
-    """Kills its process the first time that any batch comes here with x = 3."""
+    """Kill the worker the first time a batch with x = 3 arrives."""
     if x == 3 and not Path(marker).exists():
         Path(marker).touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -50,7 +50,7 @@ def work_for(cpu_s: float) -> int:
 
 
 def held_mb_before(allocating_mb: int) -> float:
-    """What the process holds when it is called; then it allocates so much, and frees it."""
+    """Return the memory that the process holds when called, then allocate and free a given amount."""
     lines = Path("/proc/self/status").read_text().splitlines()
     held_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
     bytearray(allocating_mb * 2**20)
@@ -118,7 +118,7 @@ def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
         living = cpu_seconds() - before
     ended = cpu_seconds() - before
     assert living > 1.0
-    assert living - 0.1 < ended < living + 0.7  # what it takes to end, and what it took to start
+    assert living - 0.1 < ended < living + 0.7  # time to end, and time to start
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do as they like")
@@ -152,7 +152,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     worker = int(pid_file.read_text())
     while time.monotonic() < deadline:
         try:
-            # A zombie has ended too; its parent is gone, so that nobody may have collected it yet.
+            # A zombie has ended too: its parent is gone, and it may not have been reaped yet.
             state = Path(f"/proc/{worker}/stat").read_text().rsplit(")", 1)[1].split()[0]
         except FileNotFoundError:
             return
@@ -163,7 +163,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_at_any_moment_ends_it_though_answers_are_under_way(tmp_path: Path) -> None:
-    """A worker killed in the middle of a large answer leaves half of it in the pipe."""
+    """A worker that is killed while sending a large answer leaves half of it in the pipe."""
     script = tmp_path / "parent.py"
     script.write_text(
         "import signal, sys\n"

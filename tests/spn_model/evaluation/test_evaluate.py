@@ -368,7 +368,7 @@ def test_the_course_of_a_training_is_drawn(tmp_path):
 def test_a_damaged_log_is_told_with_its_line(tmp_path, cell):
     """What is no number is not drawn around."""
     path = write_log(tmp_path / "log.csv", [LOG[0], {**LOG[2], cell: "<svg>"}])
-    with pytest.raises(InputError, match=r"log\.csv:3: is no log of a training"):
+    with pytest.raises(InputError, match=r"log\.csv:3: is not a training log"):
         read_log(path)
 
 
@@ -433,7 +433,7 @@ def test_a_run_that_is_not_there_is_told(tmp_path):
     for name in ("compared", "../up", ""):
         ran = evaluated(tmp_path / "area", "--run", name)
         assert ran.exit_code == 1
-        assert "cannot name a run" in ran.output
+        assert "is not a valid run name" in ran.output
 
 
 def test_an_area_without_a_split_says_what_to_do(tmp_path):
