@@ -8,7 +8,8 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from spn_cli import console, show_labels
-from spn_data.area.area import (
+from spn_data.area.area import Area
+from spn_data.area.names import (
     CHECKPOINT,
     COMPARED,
     EVALUATION,
@@ -20,7 +21,6 @@ from spn_data.area.area import (
     STAGES,
     STATE,
     TRACKED,
-    Area,
 )
 from spn_data.errors import StageError
 from spn_data.pipeline.frames_stage import Plan
