@@ -121,7 +121,7 @@ def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
             raise InputError(f"has more than {MAX_WAYPOINTS:,} rows", path=path, line=line)
         try:
             if len(cells) != len(header):
-                raise ValueError(f"{len(cells)} cells, the header has {len(header)}")
+                raise ValueError(f"{len(cells)} cells, but the header has {len(header)}")
             values.append(
                 {name: _number(name, cells[k]) for name, k in columns.items() if name != "camera"}
             )
@@ -130,7 +130,7 @@ def read_waypoints(path: Path | str, place: WaypointFrame) -> Waypoints:
             raise InputError(str(error), path=path, line=line) from error
         lines.append(line)
     if not lines:
-        raise InputError("a header and no rows", path=path, line=header_line)
+        raise InputError("has a header but no rows", path=path, line=header_line)
     table = {name: np.array([row[name] for row in values]) for name in values[0]}
     for name in ("heading_deg", "pitch_deg"):
         _reject(np.isnan(table[name]), f"{name} is missing", lines, path)

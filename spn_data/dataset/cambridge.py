@@ -1,7 +1,7 @@
-"""Lists of poses in the format of Cambridge Landmarks (Kendall et al. 2015): dataset_train.txt and its like.
+"""Pose lists in Cambridge Landmarks format (Kendall et al. 2015), such as dataset_train.txt.
 
-Three header lines, then `path x y z qw qx qy qz` an image: the camera's centre in the world, and the
-quaternion that turns world axes into camera axes, scalar first.
+Three header lines are followed by one line `path x y z qw qx qy qz` per image: the camera centre in the
+world, and the quaternion that rotates world axes into camera axes, scalar first.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from spn_data.storage.files import write_atomically
 TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (
     f"dataset_{part}.txt" for part in ("train", "validation", "test")
 )
-NVM = "reconstruction.nvm"  # the model beside the lists
+NVM = "reconstruction.nvm"  # the model next to the lists
 HEADER = ("Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", "")
 MAX_FRAMES = 1_000_000
 _MAX_LINE_BYTES = 4096
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d{1,3})?")
-# Six decimals leave a unit quaternion's length within 1e-6 of one.
+# Printed with six decimals, a unit quaternion has a length within 1e-6 of one.
 _UNIT_TO_THE_DIGITS = 1e-5
 _UNIT_AT_ALL = 0.01
 _FAR_TIMES = 20.0
@@ -33,13 +33,19 @@ _FAR_TIMES = 20.0
 
 @dataclass(frozen=True, eq=False)
 class CambridgeList:
-    """N images with their poses, in the file's order.
+    """Images and their poses, in the order of the file.
 
-    names : paths below the scene's folder, unique, with "/" between folders, leading nowhere else.
-    poses : in the world of the file, whose unit, origin and up it does not state. Quaternions that are
-        unit to the file's digits are kept as printed, so that they can be printed again.
-    quats_as_read : (N, 4), scalar first, as they stand in the file.
-    header : the file's first three lines.
+    Attributes
+    ----------
+    names : tuple of str
+        N unique image paths below the scene's folder, with "/" between folders.
+    poses : Poses
+        N poses in the world of the file, which does not state unit, origin or direction of up. Quaternions
+        that are unit to the file's precision are kept as printed, so that they can be printed identically.
+    quats_as_read : ndarray, shape (N, 4)
+        Quaternions as printed in the file, scalar first.
+    header : tuple of str
+        First three lines of the file.
     """
 
     names: tuple[str, ...]
@@ -52,11 +58,27 @@ class CambridgeList:
 
 
 def read_cambridge(path: Path | str) -> CambridgeList:
-    """Raises InputError, with the line, where it is not such a list or leads out of its folder."""
+    """Read a pose list in Cambridge Landmarks format.
+
+    Parameters
+    ----------
+    path : path-like
+        List file.
+
+    Returns
+    -------
+    CambridgeList
+        Images and poses.
+
+    Raises
+    ------
+    InputError
+        With the line number, if the file is malformed or an image path leads out of its folder.
+    """
     path = Path(path)
     try:
         if not path.is_file():
-            raise InputError("is no file" if path.exists() else "does not exist", path=path)
+            raise InputError("is not a file" if path.exists() else "does not exist", path=path)
         lines = _lines(path)
         header = tuple(_header_line(path, k, next(lines, (k + 1, None))[1]) for k in range(3))
         rows = _rows(path, lines)
@@ -65,7 +87,7 @@ def read_cambridge(path: Path | str) -> CambridgeList:
     values = np.array(list(rows.values()), dtype=np.float64).reshape(-1, 7)
     as_read = values[:, 3:]
     canonical = canonical_quats(as_read)
-    # Dividing by the length again would change the last digit of some.
+    # Normalising quaternions that are already unit would change the last digit of some.
     is_unit = np.abs(np.linalg.norm(as_read, axis=1) - 1) <= _UNIT_TO_THE_DIGITS
     sign = np.where(np.einsum("ni,ni->n", canonical, as_read) < 0, -1.0, 1.0)
     quats = np.where(is_unit[:, None], sign[:, None] * as_read, canonical)
@@ -75,16 +97,29 @@ def read_cambridge(path: Path | str) -> CambridgeList:
 
 
 def write_cambridge(path: Path, names: Sequence[str], poses: Poses) -> None:
-    """The list of images `names` with their poses, six decimals; the file appears whole.
+    """Write a pose list with six decimals, atomically.
 
-    names : paths that `read_cambridge` takes, without spaces. Raises ValueError for other names and for
-    poses that are not finite.
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    names : sequence of str
+        N image paths that `read_cambridge` accepts, without spaces.
+    poses : Poses
+        N poses.
+
+    Raises
+    ------
+    ValueError
+        If a name is invalid or not unique, or a pose is not finite.
     """
     if len(names) != len(poses) or len(set(names)) != len(names):
-        raise ValueError(f"{len(names)} names ({len(set(names))} different), {len(poses)} poses")
+        raise ValueError(
+            f"{len(names)} names ({len(set(names))} unique) do not match {len(poses)} poses"
+        )
     numbers = np.concatenate([poses.centers, poses.quats_wxyz], axis=1)
     if not np.isfinite(numbers).all():
-        raise ValueError("a pose that is not finite can't be listed")
+        raise ValueError("cannot write a pose that is not finite")
     lines = list(HEADER)
     for name, row in zip(names, numbers.tolist(), strict=True):
         _check_name(name)
@@ -92,8 +127,20 @@ def write_cambridge(path: Path, names: Sequence[str], poses: Poses) -> None:
     write_atomically(path, "\n".join(lines) + "\n")
 
 
-def far_positions(centers: np.ndarray) -> np.ndarray:
-    """(N,) bool: more than 20 times as far from the median centre as 9 of 10 are; none of fewer than 10."""
+def position_outliers(centers: np.ndarray) -> np.ndarray:
+    """Detect camera centres absurdly far from the others.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (N, 3)
+        Camera centres.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        Centres more than 20 times as far from the median centre as the 90 % quantile. All false for fewer
+        than 10 centres.
+    """
     if len(centers) < 10:
         return np.zeros(len(centers), dtype=bool)
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
@@ -101,50 +148,58 @@ def far_positions(centers: np.ndarray) -> np.ndarray:
     return distance > _FAR_TIMES * usual if usual > 0 else np.zeros(len(centers), dtype=bool)
 
 
-def oddities(found: CambridgeList) -> list[str]:
-    """What a list holds that its user should know, a sentence each; empty for an ordinary one."""
+def find_anomalies(listed: CambridgeList) -> list[str]:
+    """Return a sentence for the user on each anomaly of a list; empty for an ordinary list.
+
+    Anomalies are position outliers, quaternions that are not unit or have a negative scalar part, and
+    duplicate poses.
+    """
     sentences = []
-    far = far_positions(found.poses.centers)
-    middle = np.median(found.poses.centers, axis=0) if len(found) else np.zeros(3)
+    far = position_outliers(listed.poses.centers)
+    middle = np.median(listed.poses.centers, axis=0) if len(listed) else np.zeros(3)
     for k in np.flatnonzero(far)[:10]:
-        center = found.poses.centers[k]
+        center = listed.poses.centers[k]
         position = ", ".join(f"{value:.6g}" for value in center)
         away = np.linalg.norm(center - middle)
-        usual = np.quantile(np.linalg.norm(found.poses.centers[~far] - middle, axis=1), 0.9)
+        usual = np.quantile(np.linalg.norm(listed.poses.centers[~far] - middle, axis=1), 0.9)
         sentences.append(
-            f"{found.names[k]}: position ({position}) lies {away:.3g} from the median position; "
-            f"9 of 10 others lie within {usual:.3g}"
+            f"{listed.names[k]}: position ({position}) is {away:.3g} from the median position; "
+            f"90 % of the others are within {usual:.3g}"
         )
     if np.count_nonzero(far) > 10:
-        sentences.append(f"{np.count_nonzero(far) - 10} more positions lie that far away")
-    length = np.linalg.norm(found.quats_as_read, axis=1)
-    sentences += _of_rows(
-        found, np.abs(length - 1) > _UNIT_TO_THE_DIGITS, "quaternion is not of length one; divided"
+        sentences.append(f"{np.count_nonzero(far) - 10} more positions are that far away")
+    length = np.linalg.norm(listed.quats_as_read, axis=1)
+    sentences += _sentence_on_rows(
+        listed,
+        np.abs(length - 1) > _UNIT_TO_THE_DIGITS,
+        "quaternion was not unit and is normalised",
     )
-    turned = np.einsum("ni,ni->n", found.quats_as_read, found.poses.quats_wxyz) < 0
-    sentences += _of_rows(
-        found, turned, "quaternion with a negative scalar part; its sign is turned, same rotation"
+    flipped = np.einsum("ni,ni->n", listed.quats_as_read, listed.poses.quats_wxyz) < 0
+    sentences += _sentence_on_rows(
+        listed,
+        flipped,
+        "quaternion has a negative scalar part; its sign is flipped (same rotation)",
     )
     _, first = np.unique(
-        np.concatenate([found.poses.centers, found.poses.quats_wxyz], axis=1),
+        np.concatenate([listed.poses.centers, listed.poses.quats_wxyz], axis=1),
         axis=0,
         return_index=True,
     )
-    again = np.ones(len(found), dtype=bool)
-    again[first] = False
-    sentences += _of_rows(found, again, "same pose as an earlier image, to the last digit")
+    duplicate = np.ones(len(listed), dtype=bool)
+    duplicate[first] = False
+    sentences += _sentence_on_rows(listed, duplicate, "exactly the same pose as an earlier image")
     return sentences
 
 
-def _of_rows(found: CambridgeList, rows: np.ndarray, sentence: str) -> list[str]:
+def _sentence_on_rows(listed: CambridgeList, rows: np.ndarray, sentence: str) -> list[str]:
     if not rows.any():
         return []
     more = f" and {np.count_nonzero(rows) - 1} more" if np.count_nonzero(rows) > 1 else ""
-    return [f"{found.names[int(np.argmax(rows))]}{more}: {sentence}"]
+    return [f"{listed.names[int(np.argmax(rows))]}{more}: {sentence}"]
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(line number, text without its end) of a file in which no line is endless."""
+    """Yield line number and stripped text; raise InputError for overlong lines."""
     with path.open("rb") as file:
         number = 0
         while raw := file.readline(_MAX_LINE_BYTES + 1):
@@ -171,8 +226,8 @@ def _header_line(path: Path, k: int, text: str | None) -> str:
     )
     if text is None or not is_right:
         raise InputError(
-            f"{'nothing' if text is None else repr(text[:60])} where a Cambridge list has "
-            f"{HEADER[k]!r}: it begins with three header lines",
+            f"{'nothing' if text is None else repr(text[:60])} instead of "
+            f"{HEADER[k]!r}: a Cambridge list begins with three header lines",
             path=path,
             line=k + 1,
         )
@@ -206,17 +261,17 @@ def _row(text: str) -> tuple[str, list[float]]:
             raise ValueError(f"{cell[:40]!r} is not a number")
     values = [float(cell) for cell in cells[1:]]
     if not max(map(abs, values)) <= 1e15:
-        raise ValueError("a number beyond 1e15")
+        raise ValueError("a number exceeds 1e15")
     length = float(np.linalg.norm(values[3:]))
     if not abs(length - 1) <= _UNIT_AT_ALL:
         raise ValueError(
-            f"the quaternion has length {length:.6g}, not 1: are the columns mixed up?"
+            f"the quaternion has length {length:.6g} instead of 1: check the order of the columns"
         )
     return cells[0], values
 
 
 def _check_name(name: str) -> None:
-    """ValueError unless the name is a path that stays below the folder it is looked up in."""
+    """Raise ValueError unless the name is a relative path that stays below the list's folder."""
     parts = name.split("/")
     if (
         any(part in ("", ".", "..") for part in parts)

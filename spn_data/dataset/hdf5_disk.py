@@ -1,4 +1,4 @@
-"""The file that HDF5 writes to, behind which a full disk may stand."""
+"""File object for HDF5 that defers disk errors, such as a full disk."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 
-class Disk(io.RawIOBase):
-    """A file for h5py that keeps the first error of the disk, and takes everything from then on.
+class DeferredErrorFile(io.RawIOBase):
+    """File for h5py that records the first disk error and silently accepts all later writes.
 
-    HDF5 can't give up a file whose last bytes don't reach the disk: it tries again at the end of the
-    process, and crashes it. So it is told that all went well, and `error` is for its user to look at.
+    HDF5 cannot abandon a file whose last bytes cannot be written: it retries at process exit and crashes.
+    This class therefore reports success to HDF5, and the caller has to check `error`.
     """
 
     def __init__(self, path: Path):
@@ -22,6 +22,7 @@ class Disk(io.RawIOBase):
         self._position = 0
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move the position and return it."""
         if whence == os.SEEK_END:
             offset += os.fstat(self._descriptor).st_size
         elif whence == os.SEEK_CUR:
@@ -30,27 +31,33 @@ class Disk(io.RawIOBase):
         return offset
 
     def tell(self) -> int:
+        """Return the position."""
         return self._position
 
     def readable(self) -> bool:
+        """Return True."""
         return True
 
     def writable(self) -> bool:
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
+        """Fill the buffer from the position; bytes that are not on the disk read as zero."""
         view = memoryview(buffer).cast("B")
         read = 0
         if self.error is None:
             read = os.preadv(self._descriptor, [view], self._position)
-        view[read:] = bytes(len(view) - read)  # never written: zeros, as in any file with a hole
+        view[read:] = bytes(len(view) - read)  # never written: zeros, as in a sparse file
         self._position += len(view)
         return len(view)
 
     def write(self, buffer: Any) -> int:
+        """Write the buffer unless an error has occurred, and return its full length."""
         view = memoryview(buffer).cast("B")
         written = 0
         try:
@@ -63,6 +70,7 @@ class Disk(io.RawIOBase):
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
+        """Set the size of the file unless an error has occurred."""
         size = self._position if size is None else size
         try:
             if self.error is None:
@@ -72,12 +80,13 @@ class Disk(io.RawIOBase):
         return size
 
     def sync(self) -> None:
-        """Raises OSError where what was written is not on the disk."""
+        """Flush to the disk; raise OSError if any write has failed."""
         if self.error is not None:
             raise self.error
         os.fsync(self._descriptor)
 
     def close(self) -> None:
+        """Close the file without flushing it to the disk."""
         if not self.closed:
             os.close(self._descriptor)
         super().close()

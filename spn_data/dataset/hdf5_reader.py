@@ -1,4 +1,4 @@
-"""dataset.h5 read: opened lazily, every shape and bound checked before it is relied on."""
+"""Lazy reader of dataset.h5, which validates every shape and bound before use."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from spn_data.geometry.pose import Poses
 
 _MAX_GROUPS = 10_000
 _MAX_SIDE_PX = 65_536
-_MAX_DEFLATION = 1100  # deflate compresses zeros by 1032 at most
-# HDF5 can load further filters from the disk, or read other files than this one.
+_MAX_DEFLATION = 1100  # upper bound of the compression ratio; deflate compresses zeros by 1032
+# Other filters are rejected, because HDF5 would load them as plug-ins from the disk.
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_LZF}
 _DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
 _T = TypeVar("_T")
@@ -38,9 +38,16 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """Map points that one frame sees.
+    """Map points seen by one frame.
 
-    ids : (K,); pixels : (K, 2) float32 in its image, COLMAP's pixel convention; xyz : (K, 3) in the world.
+    Attributes
+    ----------
+    ids : ndarray of int, shape (K,)
+        Ids of the points in the map.
+    pixels : ndarray of float32, shape (K, 2)
+        Pixels in the frame's image, in COLMAP's pixel convention.
+    xyz : ndarray, shape (K, 3)
+        Positions in the world.
     """
 
     ids: np.ndarray
@@ -49,20 +56,39 @@ class FramePoints:
 
 
 class Dataset:
-    """An open dataset.h5. Images and points are read when they are asked for; close it, or use `with`.
+    """Open dataset.h5, to be closed or used as a context manager. Images and points are read on demand.
 
-    Raises InputError where there is no such file, FormatError where it is no data set, one of a newer
-    version, or damaged; the latter also later, when a damaged part is read.
+    Parameters
+    ----------
+    path : Path
+        File to open.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    info : DatasetInfo
+        Properties of the whole data set.
+    groups : dict of str to DatasetGroup
+        Groups by name.
+
+    Raises
+    ------
+    InputError
+        If the file does not exist.
+    FormatError
+        If it is not a data set, has another format version, or is damaged. Damage may also be detected later,
+        when the affected part is read.
     """
 
     def __init__(self, path: Path):
         self.path = path
         if not path.is_file():
-            raise InputError("does not exist" if not path.exists() else "is no file", path=path)
+            raise InputError("does not exist" if not path.exists() else "is not a file", path=path)
         try:
             self._file = h5py.File(path, "r", locking="best-effort")
         except OSError as error:
-            raise FormatError(f"{path}: is no data set of this program ({error})") from error
+            raise FormatError(f"{path}: is not a data set of this program ({error})") from error
         try:
             self.info = self._read_info()
             self.groups = self._read_groups()
@@ -73,12 +99,12 @@ class Dataset:
     def _read_info(self) -> DatasetInfo:
         attributes = _guarded(self.path, "its attributes", lambda: _attributes(self._file))
         if attributes.get("format") != FORMAT:
-            raise FormatError(f"{self.path}: is no data set of this program")
+            raise FormatError(f"{self.path}: is not a data set of this program")
         version = _guarded(self.path, "its version", lambda: int(attributes["version"]))
         if version != VERSION:
             raise FormatError(
-                f"{self.path}: is of format {version}, this program reads {VERSION}; "
-                "make it anew, or update the program"
+                f"{self.path}: has format version {version}, this program reads {VERSION}; "
+                "create it again, or update the program"
             )
         return _guarded(
             self.path, "its attributes", lambda: DatasetInfo.from_attributes(attributes)
@@ -97,10 +123,11 @@ class Dataset:
         return _guarded(self.path, f"group {name}", read)
 
     def of_role(self, role: Role) -> list[DatasetGroup]:
-        """Its groups of a role, in the order of their names."""
+        """Return the groups with a role, sorted by name."""
         return [group for group in self.groups.values() if group.role is role]
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     def __enter__(self) -> Dataset:
@@ -116,10 +143,20 @@ class Dataset:
 
 
 class DatasetGroup:
-    """Frames of one group. Columns are read at their first use and kept; images and points are not kept.
+    """Frames of one group. Columns are read on first use and cached; images and points are not cached.
 
-    role : what it is for; image_size : (width, height), None without images; all_valid : no frame has an
-    invalid pixel; points_for_training : its points may be learnt from.
+    Attributes
+    ----------
+    name : str
+        Name of the group.
+    role : Role
+        Purpose of the group.
+    image_size : tuple of int or None
+        Width and height of the images; None without images.
+    all_valid : bool
+        Whether all pixels of all frames are valid.
+    points_for_training : bool
+        Whether the group's points may be used for training.
     """
 
     def __init__(self, path: Path, name: str, group: h5py.Group, info: DatasetInfo):
@@ -130,7 +167,7 @@ class DatasetGroup:
         points = _child(group, "points", h5py.Group)
         self.points_for_training = flag(_attributes(points)["for_training"])
         if self.points_for_training and self.role is not Role.TRAIN:
-            raise ValueError(f"its points are marked for training, but it is of role {self.role}")
+            raise ValueError(f"its points are marked for training, but its role is {self.role}")
         rows = len(_child(group, "names", h5py.Dataset))
         self._length = rows
         self._columns = {n: _table(group, n, column, rows) for n, column in COLUMNS.items()}
@@ -146,53 +183,53 @@ class DatasetGroup:
             masks = len(_child(group, "masks", h5py.Dataset))
             self._masks = _pictures(group, "masks", masks, ())
             if self._images is None or self._masks.shape[1:] != self._images.shape[1:3]:
-                raise ValueError("masks have another size than the images")
+                raise ValueError("masks and images differ in size")
 
     def __len__(self) -> int:
         return self._length
 
     @cached_property
     def names(self) -> np.ndarray:
-        """(N,) str."""
+        """Names of the frames, shape (N,)."""
         return self._texts("names")
 
     @cached_property
     def sequences(self) -> np.ndarray:
-        """(N,) str."""
+        """Sequences of the frames, shape (N,)."""
         return self._texts("sequences")
 
     @cached_property
     def strata(self) -> np.ndarray:
-        """(N,) str: high, medium, low, or empty."""
+        """Coverage strata, shape (N,): "high", "medium", "low" or ""."""
         return self._texts("strata")
 
     @cached_property
     def time_s(self) -> np.ndarray:
-        """(N,) seconds since the sequence's first frame."""
+        """Seconds since the sequence's first frame, shape (N,)."""
         return self._column("time_s")
 
     @cached_property
     def tracked(self) -> np.ndarray:
-        """(N,) bool: not chosen for the map."""
+        """Mask of tracked frames, shape (N,)."""
         return self._column("dense") != 0
 
     @cached_property
     def poses(self) -> Poses:
-        """Of the N frames in the world; all finite, quaternions unit to 1e-5."""
+        """Poses of the N frames in the world; all finite, quaternions unit to 1e-5."""
         centers, quats = self._column("centers"), self._column("quats_wxyz")
         length = np.linalg.norm(quats, axis=1)
         if not (np.isfinite(centers).all() and np.all(np.abs(length - 1) <= UNIT_TOLERANCE * 1.01)):
-            raise FormatError(f"{self._path}: group {self.name} holds a pose that is none")
+            raise FormatError(f"{self._path}: group {self.name} contains an invalid pose")
         return Poses(centers, quats)
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """(N, 6, 6), NaN where unknown."""
+        """Pose covariances, shape (N, 6, 6); NaN if unknown."""
         return self._column("covariance")
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
-        """(N, 3, 3), COLMAP's pixel convention, NaN where unknown."""
+        """Camera matrices, shape (N, 3, 3), in COLMAP's pixel convention; NaN if unknown."""
         return self._column("intrinsics")
 
     @cached_property
@@ -200,7 +237,7 @@ class DatasetGroup:
         index = self._column("mask_idx")
         count = 0 if self._masks is None else len(self._masks)
         if len(index) and not (index.min() >= -1 and index.max() < count):
-            raise FormatError(f"{self._path}: group {self.name} refers to masks that are not there")
+            raise FormatError(f"{self._path}: group {self.name} refers to masks that do not exist")
         return index
 
     @cached_property
@@ -208,40 +245,40 @@ class DatasetGroup:
         offsets = self._read("points", lambda: self._offsets[:])
         total = len(self._points["ids"])
         if offsets[0] != 0 or offsets[-1] != total or np.any(np.diff(offsets) < 0):
-            raise FormatError(f"{self._path}: offsets of the points of {self.name} are damaged")
+            raise FormatError(f"{self._path}: the point offsets of group {self.name} are damaged")
         return offsets
 
     def image(self, row: int, out: np.ndarray | None = None) -> np.ndarray:
-        """(H, W, 3) uint8 RGB of a frame; into `out` where given."""
+        """Return the RGB image of a frame, uint8, shape (H, W, 3); write it to `out` if given."""
         images = self._images
         if images is None:
-            raise InputError("holds no images, only poses", path=self._path)
+            raise InputError("contains no images, only poses", path=self._path)
         target = np.empty(images.shape[1:], np.uint8) if out is None else out
         row = range(len(self))[row]
         self._read(f"image {row}", lambda: images.read_direct(target, np.s_[row]))
         return target
 
     def valid(self, row: int) -> np.ndarray | None:
-        """(H, W) bool: pixels that show the scene; None where all of them do."""
+        """Return the mask (H, W) of pixels that show the scene, or None if all do."""
         masks, index = self._masks, int(self._mask_idx[row])
         if index < 0 or masks is None:
             return None
         return self._read(f"mask {index}", lambda: masks[index]) != 0
 
     def points(self, row: int) -> FramePoints:
-        """Map points that a frame sees."""
+        """Return the map points seen by a frame."""
         row = range(len(self))[row]
         part = slice(int(self._ends[row]), int(self._ends[row + 1]))
         read = self._read("points", lambda: {n: d[part] for n, d in self._points.items()})
         return FramePoints(read["ids"], read["pixels"], read["xyz"])
 
     def point_ids(self) -> list[np.ndarray]:
-        """For each frame the ids (K,) of the map points that it sees, all read at once."""
+        """Return the ids (K,) of the map points seen by each frame, with a single read."""
         ids = self._read("points", lambda: self._points["ids"][:])
         return np.split(ids, self._ends[1:-1]) if len(self) else []
 
     def training_points(self, row: int) -> FramePoints:
-        """As `points`, where a network may learn from them. Raises InputError in any other group."""
+        """Return `points` if they may be used for training; raise InputError for any other group."""
         if not self.points_for_training:
             raise InputError(
                 f"the points of group {self.name} are not for training", path=self._path
@@ -259,7 +296,7 @@ class DatasetGroup:
 
 
 def _guarded(path: Path, what: str, read: Callable[[], _T]) -> _T:
-    """FormatError for whatever a damaged file makes of a read."""
+    """Call `read`, and convert any error that a damaged file can cause to FormatError."""
     try:
         return read()
     except _DAMAGE as error:
@@ -267,34 +304,34 @@ def _guarded(path: Path, what: str, read: Callable[[], _T]) -> _T:
 
 
 def _child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
-    """ValueError for a link that leads out of the file, KeyError where there is nothing."""
+    """Return a member of a group; ValueError for soft and external links, KeyError if it is missing."""
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"{name} is a link")
-    found = group[name]
-    if not isinstance(found, kind):
-        raise ValueError(f"{name} is of another kind")
-    return found
+    child = group[name]
+    if not isinstance(child, kind):
+        raise ValueError(f"{name} is not a {kind.__name__}")
+    return child
 
 
 def _stored(group: h5py.Group, name: str) -> h5py.Dataset:
-    """A dataset whose values lie in this file, all of them, and need no filter but ours."""
+    """Return a dataset after checking that all its values are in this file and need only known filters."""
     dataset = _child(group, name, h5py.Dataset)
     plist = dataset.id.get_create_plist()
     filters = {plist.get_filter(k)[0] for k in range(plist.get_nfilters())}
     if dataset.is_virtual or dataset.external or not filters <= _FILTERS:
-        raise ValueError(f"{name} is stored in a way that is not read")
+        raise ValueError(f"{name} uses an unsupported storage layout or filter")
     if dataset.shape is None or dataset.chunks is None:
-        raise ValueError(f"{name} is no table of chunks")
+        raise ValueError(f"{name} is not a chunked table")
     stored = min(dataset.id.get_storage_size(), group.file.id.get_filesize())
     if dataset.nbytes > stored * (_MAX_DEFLATION if filters else 1):
-        raise ValueError(f"{name} is cut short")
+        raise ValueError(f"{name} is truncated")
     return dataset
 
 
 def _table(group: h5py.Group, name: str, column: SchemaColumn, rows: int) -> h5py.Dataset:
     dataset = _stored(group, name)
     if dataset.dtype != np.dtype(column.dtype) or dataset.shape != (rows, *column.tail):
-        raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
+        raise ValueError(f"{name} has unexpected shape {dataset.shape} or type {dataset.dtype}")
     return dataset
 
 
@@ -307,17 +344,17 @@ def _pictures(group: h5py.Group, name: str, rows: int, tail: tuple[int, ...]) ->
         or not (0 < height <= _MAX_SIDE_PX and 0 < width <= _MAX_SIDE_PX)
         or dataset.chunks != (1, height, width, *tail)
     ):
-        raise ValueError(f"{name} is {dataset.shape} of {dataset.dtype}")
+        raise ValueError(f"{name} has unexpected shape {dataset.shape} or type {dataset.dtype}")
     return dataset
 
 
 def _attributes(of: h5py.Group) -> dict[str, Any]:
-    """Numbers and texts; ValueError for values of other kinds, of which HDF5 may not survive the reading."""
-    found: dict[str, Any] = {}
+    """Read scalar numbers and texts; ValueError for other types, on which HDF5 may crash."""
+    values: dict[str, Any] = {}
     for name in of.attrs:
         attribute = of.attrs.get_id(name)
         if attribute.shape != () or attribute.dtype.kind not in "ifS":
-            raise ValueError(f"attribute {name} is no single number or text")
+            raise ValueError(f"attribute {name} is not a single number or text")
         value = of.attrs[name]
-        found[name] = value.decode() if isinstance(value, bytes) else value
-    return found
+        values[name] = value.decode() if isinstance(value, bytes) else value
+    return values

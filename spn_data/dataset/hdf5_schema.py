@@ -1,4 +1,4 @@
-"""dataset.h5: what it holds, under which names (docs/dataset.md, for readers in other languages too)."""
+"""Schema of dataset.h5: names, types and attributes (documented in docs/dataset.md for other readers)."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ CONVENTIONS = (
     "right, y down, the centre of the upper-left pixel is (0.5, 0.5); so in intrinsics and points. Images "
     "are RGB, without distortion. NaN is unknown."
 )
-# Texts have a fixed length, padded with zeros: HDF5 reads those of variable length through a heap, whose
-# damage it does not survive.
-UNIT_TOLERANCE = 1e-5  # of a quaternion: printed with six decimals, it is unit only to this
+# Texts have a fixed length, padded with zeros. HDF5 reads variable-length texts through a heap, and crashes
+# if that is damaged.
+UNIT_TOLERANCE = (
+    1e-5  # of a quaternion's length; quaternions printed with six decimals are not exactly unit
+)
 
 
 class Role(StrEnum):
-    """What a group of frames is for."""
+    """Purpose of a group of frames."""
 
     TRAIN = "train"
     VALIDATION = "validation"
@@ -39,14 +41,15 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class SchemaColumn:
-    """A dataset of a group: one row a frame, or a point; tail : shape of a row; says : for its attribute.
+    """HDF5 dataset of a group, with one row per frame or per point.
 
-    dtype : of NumPy; S256 is UTF-8 of at most 256 bytes.
+    dtype : NumPy type, S256 is UTF-8 of at most 256 bytes; tail : shape of a row; description : text of its
+    attribute "description".
     """
 
     dtype: str
     tail: tuple[int, ...]
-    says: str
+    description: str
 
 
 COLUMNS: dict[str, SchemaColumn] = {
@@ -79,12 +82,28 @@ MASKS = "1: the pixel shows the scene; 0: outside the camera's view, or masked o
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DatasetInfo:
-    """What holds for a whole data set.
+    """Properties of a whole data set.
 
-    units : "m", or "model" for a world whose unit means nothing. origin : of the East-North-Up world; None
-    where it has no known place. up_is_known : z points up. camera : the one pinhole of all images; None
-    where frames have their own. split : how frames were divided, plain values. optimistic : test frames are
-    from the flights that train. fingerprints : of what it was made from, by name. notes : for the user.
+    Attributes
+    ----------
+    units : str
+        "m", or "model" for a world with an arbitrary unit.
+    origin : GeoOrigin or None
+        Origin of the East-North-Up world; None if the world is not georeferenced.
+    up_is_known : bool
+        Whether z points up.
+    camera : Camera or None
+        Pinhole camera shared by all images; None if frames have their own intrinsics.
+    has_images : bool
+        Whether the data set contains images.
+    optimistic : bool
+        Whether test frames come from flights used for training.
+    split : mapping of str to Any
+        How the frames were split, as plain values.
+    fingerprints : mapping of str to str
+        Fingerprints of the inputs, by name.
+    notes : tuple of str
+        Sentences for the user.
     """
 
     units: str
@@ -99,11 +118,11 @@ class DatasetInfo:
 
     def __post_init__(self) -> None:
         if self.units not in ("m", "model"):
-            raise ValueError(f"units {self.units!r} are neither m nor model")
+            raise ValueError(f"units must be 'm' or 'model', got {self.units!r}")
 
     def to_attributes(self) -> dict[str, Any]:
-        """Values of the root's attributes."""
-        place = self.origin
+        """Return the attributes of the root group."""
+        origin = self.origin
         documents = {
             "camera": None if self.camera is None else camera_to_json(self.camera),
             "split": dict(self.split),
@@ -115,12 +134,12 @@ class DatasetInfo:
             "version": VERSION,
             "conventions": CONVENTIONS,
             "units": self.units,
-            "has_origin": int(place is not None),
-            "origin_lat_deg": np.nan if place is None else place.lat_deg,
-            "origin_lon_deg": np.nan if place is None else place.lon_deg,
-            "origin_alt_m": np.nan if place is None else place.alt_m,
+            "has_origin": int(origin is not None),
+            "origin_lat_deg": np.nan if origin is None else origin.lat_deg,
+            "origin_lon_deg": np.nan if origin is None else origin.lon_deg,
+            "origin_alt_m": np.nan if origin is None else origin.alt_m,
             "height_reference": (
-                HeightReference.UNKNOWN if place is None else place.height_reference
+                HeightReference.UNKNOWN if origin is None else origin.height_reference
             ).value,
             "up_is_known": int(self.up_is_known),
             "has_images": int(self.has_images),
@@ -130,11 +149,14 @@ class DatasetInfo:
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any]) -> DatasetInfo:
-        """Raises KeyError, TypeError or ValueError where they are not those that are written."""
+        """Restore from the attributes of the root group.
+
+        Raises KeyError, TypeError or ValueError if they do not follow the schema.
+        """
         camera = _json(attributes["camera"])
         split, prints, notes = (_json(attributes[n]) for n in ("split", "fingerprints", "notes"))
         if not (isinstance(split, dict) and isinstance(prints, dict) and isinstance(notes, list)):
-            raise ValueError("split, fingerprints or notes are not what is written there")
+            raise ValueError("split, fingerprints or notes have the wrong type")
         return cls(
             units=_text(attributes["units"]),
             origin=_origin(attributes) if flag(attributes["has_origin"]) else None,
@@ -150,12 +172,36 @@ class DatasetInfo:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DatasetFrame:
-    """One frame with its label, as it is written.
+    """Frame with its label, to be written.
 
-    center (3,), quat_wxyz (4,), covariance (6, 6; NaN where unknown), intrinsics (3, 3; NaN where
-    unknown). stratum : "high", "medium", "low" or "". image : (H, W, 3) uint8 RGB, None in a data set
-    without images. valid : (H, W) bool, None where all pixels are. point_ids (K,), point_pixels (K, 2) in
-    this image, point_xyz (K, 3) in the world: map points that it sees.
+    Attributes
+    ----------
+    name, sequence : str
+        Name of the frame, unique in the file, and of its sequence.
+    time_s : float
+        Seconds since the first frame of the sequence.
+    center : ndarray, shape (3,)
+        Camera centre in the world.
+    quat_wxyz : ndarray, shape (4,)
+        Unit quaternion from world to camera, scalar first, w >= 0.
+    intrinsics : ndarray, shape (3, 3)
+        Camera matrix in pixels of the image; NaN if unknown.
+    covariance : ndarray, shape (6, 6)
+        Pose covariance (centre, rotation vector); NaN if unknown.
+    tracked : bool
+        Whether this is a tracked frame.
+    stratum : str
+        "high", "medium", "low", or "" if unknown.
+    image : ndarray of uint8, shape (H, W, 3), or None
+        RGB image; None in a data set without images.
+    valid : ndarray of bool, shape (H, W), or None
+        Mask of valid pixels; None if all are valid.
+    point_ids : ndarray of int, shape (K,)
+        Ids of map points seen by the frame.
+    point_pixels : ndarray, shape (K, 2)
+        Their pixels in this image.
+    point_xyz : ndarray, shape (K, 3)
+        Their positions in the world.
     """
 
     name: str
@@ -176,12 +222,12 @@ class DatasetFrame:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} where text belongs")
+        raise TypeError(f"expected text, found {type(value).__name__}")
     return value
 
 
 def flag(value: Any) -> bool:
-    """Of an attribute; ValueError for what is neither 0 nor 1."""
+    """Convert an attribute to bool; raise ValueError if it is neither 0 nor 1."""
     if int(value) not in (0, 1):
         raise ValueError(f"{value!r} is neither 0 nor 1")
     return bool(int(value))
@@ -195,6 +241,6 @@ def _origin(attributes: Mapping[str, Any]) -> GeoOrigin:
     names = ("origin_lat_deg", "origin_lon_deg", "origin_alt_m")
     lat_deg, lon_deg, alt_m = (float(attributes[name]) for name in names)
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360 and abs(alt_m) < 1e5):
-        raise ValueError(f"the origin {lat_deg}, {lon_deg}, {alt_m} is no place")
+        raise ValueError(f"the origin {lat_deg}, {lon_deg}, {alt_m} is not a valid location")
     reference = HeightReference(_text(attributes["height_reference"]))
     return GeoOrigin(lat_deg, lon_deg, alt_m, reference)

@@ -1,4 +1,4 @@
-"""dataset.h5 written: frame by frame, in memory that does not grow; the file appears whole or not at all."""
+"""Writer of dataset.h5: frame by frame, with constant memory, and atomic."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from spn_data.dataset.hdf5_disk import Disk
+from spn_data.dataset.hdf5_disk import DeferredErrorFile
 from spn_data.dataset.hdf5_schema import (
     COLUMNS,
     IMAGES,
@@ -27,20 +27,40 @@ from spn_data.dataset.hdf5_schema import (
 )
 from spn_data.errors import InputError, StageError
 
-_FRAMES_A_BLOCK = 64  # held in memory without their images
+_FRAMES_A_BLOCK = 64  # buffered in memory without their images
 _POINTS_A_CHUNK = 16_384
 _MAX_ATTRIBUTE_BYTES = 60_000  # HDF5's own limit is 64 KiB
 _GROUP_NAME = re.compile(r"\w[\w.\- ]{0,99}")
 
 
 class DatasetWriter:
-    """Writes frames into groups, in any order of the groups.
+    """Writer of frames into the groups of dataset.h5, in any order of the groups.
+
+    The file appears at the end of the `with` block, or not at all after an error. A killed run leaves
+    `<name>.part`, which the next run replaces.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    info : DatasetInfo
+        Properties of the whole data set.
+    groups : mapping of str to Role
+        Groups to create and their roles.
+
+    Raises
+    ------
+    InputError
+        If a group name is invalid.
+    StageError
+        If the file cannot be created.
+
+    Examples
+    --------
+    ::
 
         with DatasetWriter(path, info, {"train": Role.TRAIN, "medium": Role.TEST}) as writer:
             writer.append("train", frame)
-
-    The file appears at the end of the block; after an error there is none. Where a run was killed,
-    `<name>.part` lies about, which the next one replaces.
     """
 
     def __init__(self, path: Path, info: DatasetInfo, groups: Mapping[str, Role]):
@@ -50,9 +70,11 @@ class DatasetWriter:
         self._names: set[str] = set()
         for name in groups:
             if not _GROUP_NAME.fullmatch(name):
-                raise InputError(f"a group of a data set can't be named {name!r}", path=path)
+                raise InputError(
+                    f"{name!r} is not a valid name for a group of a data set", path=path
+                )
         try:
-            self._disk = Disk(self._part)
+            self._disk = DeferredErrorFile(self._part)
         except OSError as error:
             raise _unwritable(path, error) from error
         self._file = h5py.File(self._disk, "w")
@@ -68,24 +90,24 @@ class DatasetWriter:
             raise
 
     def append(self, group: str, frame: DatasetFrame) -> None:
-        """Add a frame to a group.
+        """Append a frame to a group.
 
-        Raises StageError where the disk does not take it, InputError for a second frame of that name or
-        an image of another size than the group's.
+        Raises StageError if it cannot be written to the disk, InputError if the name is not unique or too
+        long or if the image differs in size from others of the group.
         """
         if frame.name in self._names:
             raise InputError(f"two frames are named {frame.name}", path=self._path)
         for text, column in ((frame.name, "names"), (frame.sequence, "sequences")):
             longest = int(COLUMNS[column].dtype[1:])
             if len(text.encode()) > longest:
-                raise InputError(f"the name {text} has more than {longest} bytes", path=self._path)
+                raise InputError(f"the name {text} is longer than {longest} bytes", path=self._path)
         _check(frame, has_image=self._info.has_images)
         try:
             self._groups[group].append(frame)
-        except _OtherSize as error:
+        except _SizeMismatch as error:
             raise InputError(
-                f"images of group {group} are of {error.before} and of {error.now}: a group "
-                "holds one size",
+                f"images of group {group} have sizes {error.before} and {error.now}: all images of a "
+                "group must have the same size",
                 path=self._path,
             ) from error
         if self._disk.error is not None:
@@ -124,13 +146,13 @@ class DatasetWriter:
         self._part.unlink(missing_ok=True)
 
 
-class _OtherSize(Exception):
+class _SizeMismatch(Exception):
     def __init__(self, before: tuple[int, ...], now: tuple[int, ...]):
         self.before, self.now = f"{before[1]}x{before[0]}", f"{now[1]}x{now[0]}"
 
 
 class _Group:
-    """One group being written: images at once, the rest in blocks of frames."""
+    """Group being written: images immediately, everything else in blocks of frames."""
 
     def __init__(self, group: h5py.Group, role: Role, has_images: bool):
         self._group = group
@@ -151,21 +173,22 @@ class _Group:
         _extend(offsets, np.zeros(1, np.int64))
 
     def append(self, frame: DatasetFrame) -> None:
+        """Write the image and buffer the rest."""
         if frame.image is not None:
             if self._images is None:
                 self._images = _create_images(self._group, frame.image.shape)
             if self._images.shape[1:] != frame.image.shape:
-                raise _OtherSize(self._images.shape[1:], frame.image.shape)
+                raise _SizeMismatch(self._images.shape[1:], frame.image.shape)
             self._images.resize(self._count + 1, axis=0)
             self._images[self._count] = frame.image
         self._mask_idx.append(self._mask_row(frame.valid))
-        self._frames.append(replace(frame, image=None, valid=None))  # what waits must be small
+        self._frames.append(replace(frame, image=None, valid=None))  # keeps the buffer small
         self._count += 1
         if len(self._frames) == _FRAMES_A_BLOCK:
             self._flush()
 
     def _mask_row(self, valid: np.ndarray | None) -> int:
-        """Frames of one camera share a mask: each is stored once."""
+        """Return the row of a mask, or -1 if all pixels are valid; identical masks are stored once."""
         if valid is None or valid.all():
             return -1
         packed = np.packbits(valid).tobytes()
@@ -203,37 +226,39 @@ class _Group:
         self._frames, self._mask_idx = [], []
 
     def finish(self) -> None:
+        """Write the remaining frames."""
         self._flush()
         self._group.attrs["all_valid"] = int(not self._masks)
 
 
 def _check(frame: DatasetFrame, *, has_image: bool) -> None:
-    """ValueError where a frame breaks the format: a mistake of the caller's, never of the user's."""
+    """Raise ValueError if a frame violates the format, which is an error of the caller, not the user."""
     numbers = np.concatenate([frame.center, frame.quat_wxyz])
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
-        raise ValueError(f"{frame.name}: no pose")
+        raise ValueError(f"{frame.name}: has no pose")
     if abs(np.linalg.norm(frame.quat_wxyz) - 1) > UNIT_TOLERANCE or frame.quat_wxyz[0] < 0:
         raise ValueError(f"{frame.name}: the quaternion is not canonical")
     if frame.covariance.shape != (6, 6) or frame.intrinsics.shape != (3, 3):
-        raise ValueError(f"{frame.name}: covariance or intrinsics have another shape")
+        raise ValueError(f"{frame.name}: covariance must be (6, 6) and intrinsics (3, 3)")
     if frame.stratum not in ("high", "medium", "low", ""):
-        raise ValueError(f"{frame.name}: {frame.stratum!r} is no stratum")
+        raise ValueError(f"{frame.name}: {frame.stratum!r} is not a stratum")
     k = len(frame.point_ids)
     if frame.point_pixels.shape != (k, 2) or frame.point_xyz.shape != (k, 3):
-        raise ValueError(f"{frame.name}: points differ in length")
+        raise ValueError(f"{frame.name}: ids, pixels and xyz of the points differ in length")
     if (frame.image is None) == has_image:
         raise ValueError(
-            f"{frame.name}: an image in a data set without, or none in one with images"
+            f"{frame.name}: "
+            + ("has no image" if has_image else "has an image, but the data set has none")
         )
     if frame.image is None:
         return
     if frame.image.dtype != np.uint8 or frame.image.ndim != 3 or frame.image.shape[2] != 3:
-        raise ValueError(f"{frame.name}: an image is (H, W, 3) uint8")
+        raise ValueError(f"{frame.name}: the image must be (H, W, 3) uint8")
     shape = frame.image.shape[:2]
     if frame.valid is not None and frame.valid.shape != shape:
-        raise ValueError(f"{frame.name}: the mask has another shape than the image")
+        raise ValueError(f"{frame.name}: mask and image differ in shape")
     if k and not np.all((frame.point_pixels >= 0) & (frame.point_pixels < shape[::-1])):
-        raise ValueError(f"{frame.name}: a point outside the image")
+        raise ValueError(f"{frame.name}: a point is outside the image")
 
 
 def _create(group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: int) -> h5py.Dataset:
@@ -245,12 +270,12 @@ def _create(group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: in
         dtype=_type_of(column.dtype),
         compression="gzip" if column.dtype.startswith("S") else None,
     )
-    _set_attribute(dataset, "description", column.says)
+    _set_attribute(dataset, "description", column.description)
     return dataset
 
 
 def _create_images(group: h5py.Group, shape: tuple[int, ...]) -> h5py.Dataset:
-    """One chunk an image, not compressed: gzip saves a sixth of aerial images and reads 30 times slower."""
+    """Create the images, one uncompressed chunk each; gzip would save a sixth but read 30 times slower."""
     images = group.create_dataset(
         "images", (0, *shape), np.uint8, maxshape=(None, *shape), chunks=(1, *shape)
     )
@@ -278,7 +303,7 @@ def _set_attribute(of: h5py.Group | h5py.Dataset, name: str, value: Any) -> None
     if isinstance(value, str):
         text = value.encode()
         if len(text) > _MAX_ATTRIBUTE_BYTES:
-            raise ValueError(f"{name} takes more than {_MAX_ATTRIBUTE_BYTES} bytes")
+            raise ValueError(f"{name} is longer than {_MAX_ATTRIBUTE_BYTES} bytes")
         value = np.array(text, dtype=_type_of(f"S{max(1, len(text))}"))
     of.attrs[name] = value
 

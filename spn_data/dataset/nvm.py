@@ -1,9 +1,9 @@
-"""Models in VisualSFM's format NVM_V3: cameras without distortion, points with their measurements.
+"""Models in VisualSFM's NVM_V3 format: cameras without distortion, and points with their measurements.
 
-`name focal qw qx qy qz cx cy cz 0 0` a camera: the centre, and the rotation of world axes into camera axes
-(x right, y down, z forward), scalar first. `x y z r g b n` a point, then n times `image feature dx dy`:
-where it is seen, in pixels right of and below the principal point, which is the image's centre.
-http://ccwu.me/vsfm/doc.html#nvm
+One line `name focal qw qx qy qz cx cy cz 0 0` per camera: the centre, and the rotation from world axes to
+camera axes (x right, y down, z forward), scalar first. One line per point: `x y z r g b n`, followed by n
+times `image feature dx dy`, the measurement in pixels right of and below the principal point, which is the
+image centre. See http://ccwu.me/vsfm/doc.html#nvm
 """
 
 from __future__ import annotations
@@ -29,11 +29,28 @@ _MAX_LINE_BYTES = 64_000_000  # a point seen in a million images
 
 @dataclass(frozen=True, eq=False)
 class NvmModel:
-    """N images and P points with M measurements, these sorted by point.
+    """NVM model: images, points, and measurements sorted by point.
 
-    names : of the images, unique; focal_px : (N,); distortion : (N,) VisualSFM's radial term, 0 in all
-    that we write; poses : (N); xyz : (P, 3); colors : (P, 3) uint8 RGB; point_idx, image_idx : (M,) rows;
-    feature_idx : (M,) number of the measurement in its image; offsets_px : (M, 2) from the image's centre.
+    Attributes
+    ----------
+    names : tuple of str
+        N unique image names.
+    focal_px : ndarray, shape (N,)
+        Focal lengths in pixels.
+    distortion : ndarray, shape (N,)
+        VisualSFM's radial distortion; always 0 in models written by this program.
+    poses : Poses
+        N poses.
+    xyz : ndarray, shape (P, 3)
+        Points.
+    colors : ndarray of uint8, shape (P, 3)
+        RGB colours of the points.
+    point_idx, image_idx : ndarray of int, shape (M,)
+        Point and image of each measurement.
+    feature_idx : ndarray of int, shape (M,)
+        Index of each measurement within its image.
+    offsets_px : ndarray, shape (M, 2)
+        Measurements in pixels from the image centre.
     """
 
     names: tuple[str, ...]
@@ -48,16 +65,33 @@ class NvmModel:
     offsets_px: np.ndarray
 
 
-def nvm_model(
+def build_nvm_model(
     names: tuple[str, ...],
     poses: Poses,
     focal_px: np.ndarray,
     points: tuple[np.ndarray, np.ndarray],
     measurements: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> NvmModel:
-    """A model without distortion, from points (xyz, colors) and measurements (point_idx, image_idx, offsets).
+    """Build a model without distortion.
 
-    Measurements may come in any order; points without one are left out.
+    Parameters
+    ----------
+    names : tuple of str
+        N image names.
+    poses : Poses
+        N poses.
+    focal_px : ndarray, shape (N,)
+        Focal lengths in pixels.
+    points : tuple of ndarray
+        Positions (P, 3) and RGB colours (P, 3) of the points.
+    measurements : tuple of ndarray
+        Point index (M,), image index (M,) and offset from the image centre (M, 2) of each measurement, in any
+        order.
+
+    Returns
+    -------
+    NvmModel
+        The model; points without measurements are dropped.
     """
     point_idx, image_idx, offsets_px = measurements
     order = np.lexsort((image_idx, point_idx))
@@ -78,12 +112,30 @@ def nvm_model(
 
 
 def offsets_from_center(camera: Camera, pixels: np.ndarray, focal_px: float) -> np.ndarray:
-    """(K, 2) where a camera without distortion, of that focal length and centred, sees `pixels` (K, 2)."""
+    """Undistort pixels and return their offsets from the image centre.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera of the pixels.
+    pixels : ndarray, shape (K, 2)
+        Pixels.
+    focal_px : float
+        Focal length of the undistorted camera, whose principal point is the image centre.
+
+    Returns
+    -------
+    ndarray, shape (K, 2)
+        Offsets in pixels.
+    """
     return focal_px * camera.unproject(pixels) if len(pixels) else np.zeros((0, 2))
 
 
 def write_nvm(path: Path, model: NvmModel) -> None:
-    """The file appears whole. Numbers are written so that they are read back the same, bit by bit."""
+    """Write a model atomically, with numbers that are restored bit for bit.
+
+    Raises ValueError if an image name contains whitespace or a number is not finite.
+    """
     _check(model)
     with atomic_writer(path, "w") as file:
         file.writelines(_text(model))
@@ -92,10 +144,10 @@ def write_nvm(path: Path, model: NvmModel) -> None:
 def _check(model: NvmModel) -> None:
     for name in model.names:
         if not name or any(c.isspace() or not c.isprintable() for c in name):
-            raise ValueError(f"{name!r} can't be an image's name in NVM")
+            raise ValueError(f"{name!r} is not a valid image name in NVM")
     numbers = (model.focal_px, model.poses.centers, model.poses.quats_wxyz, model.xyz)
     if not all(np.isfinite(n).all() for n in (*numbers, model.offsets_px)):
-        raise ValueError("a number that is not finite can't be written as NVM")
+        raise ValueError("cannot write a number that is not finite to NVM")
 
 
 def _text(model: NvmModel) -> Iterator[str]:
@@ -125,7 +177,7 @@ def _text(model: NvmModel) -> Iterator[str]:
 
 
 def read_nvm(path: Path | str) -> NvmModel:
-    """The first model of a file. Raises InputError, with the line, where it is none."""
+    """Read the first model of a file; raise InputError, with the line number, if it is malformed."""
     path = Path(path)
     lines = _Lines(path)
     try:
@@ -139,7 +191,7 @@ def read_nvm(path: Path | str) -> NvmModel:
 
 
 class _Lines:
-    """Lines that hold something, one after the other, none endless."""
+    """Reader of non-empty lines of limited length."""
 
     def __init__(self, path: Path):
         self.number = 0
@@ -149,10 +201,11 @@ class _Lines:
             raise InputError(f"can't be read: {error.strerror}", path=path) from error
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     def next(self, what: str) -> str:
-        """The next one; ValueError at the end of the file, which should have held `what`."""
+        """Return the next line; ValueError at the end of the file, where `what` was expected."""
         while raw := self._file.readline(_MAX_LINE_BYTES + 1):
             self.number += 1
             if len(raw) > _MAX_LINE_BYTES:
@@ -163,12 +216,12 @@ class _Lines:
                 raise ValueError("the line is not UTF-8 text") from error
             if text:
                 return text
-        raise ValueError(f"the file ends where {what} should stand")
+        raise ValueError(f"the file ends where {what} is expected")
 
 
 def _read(lines: _Lines) -> NvmModel:
     head = lines.next("NVM_V3")
-    # A fixed calibration may follow the word: each image has its focal length all the same.
+    # A fixed calibration may follow NVM_V3; it is ignored because each image has its own focal length.
     if head.split()[0] != "NVM_V3":
         raise ValueError(f"begins with {head[:40]!r}, not NVM_V3")
     names: dict[str, None] = {}
@@ -196,7 +249,7 @@ def _read(lines: _Lines) -> NvmModel:
         for k in range(7, len(cells), 4):
             image = _count(cells[k], MAX_IMAGES)
             if image >= len(names):
-                raise ValueError(f"image {image} of {len(names)}")
+                raise ValueError(f"image {image} is out of range, there are {len(names)} images")
             owners.extend((point, image, _count(cells[k + 1], 2**62)))
             offsets.extend(_numbers(cells[k + 2 : k + 4]))
     numbers = np.array(cameras).reshape(-1, 10)
@@ -224,5 +277,5 @@ def _count(cell: str, most: int) -> int:
 def _numbers(cells: list[str]) -> list[float]:
     values = [float(cell) for cell in cells]
     if not all(math.isfinite(v) and abs(v) <= 1e15 for v in values):
-        raise ValueError("a number that is not finite or beyond 1e15")
+        raise ValueError("a number is not finite or exceeds 1e15")
     return values

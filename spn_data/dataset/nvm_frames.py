@@ -1,4 +1,4 @@
-"""What a model of VisualSFM says of frames that a list names: their lenses, and the points that they see."""
+"""Cameras and map points of listed frames, taken from a VisualSFM model."""
 
 from __future__ import annotations
 
@@ -14,18 +14,34 @@ from spn_data.geometry.pose import Poses, pose_errors
 
 _RADII = 400
 _MAX_ERROR_PX = 0.1
-# A pose of the list and the model's that differ by more are of two worlds, or of two versions of one.
+# If poses of list and model differ by more, they refer to different worlds, or to different versions of one.
 _SAME_POSITION_SHARE = 1e-3  # of the frames' median distance from their middle
 _SAME_ROTATION_DEG = 0.1
 
 
 class NvmFrames:
-    """An NVM model as seen from N frames.
+    """Lookup of N listed frames in an NVM model.
 
-    Images are matched by their name, or by their path without its ending, which differs between the lists
-    and the models of Cambridge Landmarks. Points are taken where the model's pose is the list's.
+    Images are matched by name, or by path without suffix, because suffixes differ between lists and models of
+    Cambridge Landmarks. Points are used only if list and model agree on the pose.
 
-    is_known : (N,) bool, the model holds the image; has_points : (N,) bool, and at the same pose.
+    Parameters
+    ----------
+    model : NvmModel
+        The model.
+    names : sequence of str
+        Names of the N frames.
+    poses : Poses
+        Poses of the frames in the list.
+    is_training : ndarray of bool, shape (N,)
+        Which frames are training frames.
+
+    Attributes
+    ----------
+    is_known : ndarray of bool, shape (N,)
+        Whether the model contains the image.
+    has_points : ndarray of bool, shape (N,)
+        Whether the model contains the image at the same pose.
     """
 
     def __init__(
@@ -47,14 +63,14 @@ class NvmFrames:
         )
         trains = np.zeros(len(model.names), dtype=bool)
         trains[self._image[self.has_points & is_training]] = True
-        # A point may stand in an image twice.
+        # A point can be measured twice in an image.
         pairs = np.unique(
             np.stack([model.point_idx, model.image_idx])[:, trains[model.image_idx]], axis=1
         )
         self._training_frames = np.bincount(pairs[0], minlength=len(model.xyz))
 
     def camera(self, k: int, width: int, height: int) -> Camera | None:
-        """Of frame k, its image being of that size; None where the model does not hold it."""
+        """Return the camera of frame k for the given image size; None if the frame is not in the model."""
         image = int(self._image[k])
         if image < 0:
             return None
@@ -62,9 +78,10 @@ class NvmFrames:
         return camera_from_visualsfm(float(focal), float(distortion), width, height)
 
     def points(self, k: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(ids, pixels in the full-size image, positions) that frame k sees; ids count the model's points.
+        """Return ids, pixels in the full-size image, and positions of the points seen by frame k.
 
-        Of a training frame, only those that another training frame sees too.
+        Ids are indices of the model's points. For a training frame, only points that at least one other
+        training frame sees are returned.
         """
         if not self.has_points[k]:
             return np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
@@ -78,17 +95,17 @@ class NvmFrames:
 
 
 def camera_from_visualsfm(focal_px: float, distortion: float, width: int, height: int) -> Camera:
-    """Camera of an image of an NVM model, its principal point in the middle.
+    """Convert VisualSFM intrinsics to a COLMAP camera with the principal point at the image centre.
 
-    distortion : VisualSFM's r, which leads from the image to the undistorted ray:
-    ray = (1 + r * |m|^2) * m with m = offset from the centre / focal_px. COLMAP's models lead the other
-    way; without distortion it is SIMPLE_PINHOLE, else RADIAL with k1, k2 fitted over the image.
-    Raises GeometryError where that fits worse than 0.1 px, or the model folds within the image.
+    distortion : VisualSFM's r, which maps from the image to the undistorted ray:
+    ray = (1 + r * |m|^2) * m with m = offset from the centre / focal_px. COLMAP's models map in the opposite
+    direction. The result is SIMPLE_PINHOLE without distortion, otherwise RADIAL with k1, k2 fitted over the
+    image. Raises GeometryError if the fit is worse than 0.1 px, or the distortion folds within the image.
     """
     center = (width / 2, height / 2)
     if not (np.isfinite([focal_px, distortion]).all() and focal_px > 0):
         raise GeometryError(
-            f"focal length {focal_px:g} px and distortion {distortion:g} are no lens"
+            f"focal length {focal_px:g} px and distortion {distortion:g} are not a valid camera"
         )
     if distortion == 0:
         return Camera("SIMPLE_PINHOLE", width, height, np.array([focal_px, *center]))
@@ -107,7 +124,7 @@ def camera_from_visualsfm(focal_px: float, distortion: float, width: int, height
 
 
 def _same_poses(poses: Poses, others: Poses) -> np.ndarray:
-    """(N,) bool."""
+    """Return a mask (N,) of poses that agree."""
     if not len(poses):
         return np.zeros(0, dtype=bool)
     distance, angle_deg = pose_errors(others, poses)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.dataset.nvm import nvm_model, offsets_from_center, write_nvm
+from spn_data.dataset.nvm import build_nvm_model, offsets_from_center, write_nvm
 from spn_data.exports.exported_frames import ExportedFrames
 
 
@@ -20,7 +20,7 @@ def write_nvm_export(folder: Path, frames: ExportedFrames) -> None:
         mine = slice(ends[row], ends[row + 1])
         camera = frames.camera_of(row)
         offsets[mine] = offsets_from_center(camera, seen.pixels[mine], float(focal_px[row]))
-    model = nvm_model(
+    model = build_nvm_model(
         tuple(labels.names.tolist()),
         labels.poses,
         focal_px,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.dataset.cambridge import NVM, TEST_LIST, TRAIN_LIST, VALIDATION_LIST, write_cambridge
-from spn_data.dataset.nvm import nvm_model, write_nvm
+from spn_data.dataset.nvm import build_nvm_model, write_nvm
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import PinholeRenderer, undistorted_camera
 from spn_data.inputs.dataset_contents import GivenFrames
@@ -87,7 +87,7 @@ class CambridgeFolder:
             np.concatenate(ids), return_inverse=True, return_counts=True
         )
         kept = views[number] >= MIN_TRAINING_VIEWS
-        model = nvm_model(
+        model = build_nvm_model(
             tuple(names),
             frames.labels.poses[rows],
             np.array(focal_px),

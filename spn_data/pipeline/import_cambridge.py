@@ -17,8 +17,8 @@ from spn_data.dataset.cambridge import (
     TRAIN_LIST,
     VALIDATION_LIST,
     CambridgeList,
-    far_positions,
-    oddities,
+    find_anomalies,
+    position_outliers,
     read_cambridge,
 )
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
@@ -159,8 +159,8 @@ def _read_lists(folder: Path, options: ImportOptions) -> tuple[_Frames, list[str
             if name in listed:
                 raise InputError(f"{name} is in {listed[name]} too", path=folder / LISTS[role])
             listed[name] = LISTS[role]
-        notes += [f"{LISTS[role]}: {sentence}" for sentence in oddities(found)]
-        far = far_positions(found.poses.centers)
+        notes += [f"{LISTS[role]}: {sentence}" for sentence in find_anomalies(found)]
+        far = position_outliers(found.poses.centers)
         if far.any() and not options.keep_outliers:
             names = [name for name, is_far in zip(found.names, far, strict=True) if is_far]
             notes.append(f"{_some(names)}: left out for that position; --keep-outliers keeps it")

@@ -89,11 +89,11 @@ class TestRefusing:
             (f"{GOOD}\n{LAT},{LON},10,,-30", "3: heading_deg is missing"),
             (f"{LAT},,10,90,-30", "2: has no position"),
             (f"{LAT},{LON},,90,-30", "2: has no position"),
-            (f"{GOOD},7", "2: 6 cells, the header has 5"),
-            (f"{LAT},{LON},10,90", "2: 4 cells, the header has 5"),
+            (f"{GOOD},7", "2: 6 cells, but the header has 5"),
+            (f"{LAT},{LON},10,90", "2: 4 cells, but the header has 5"),
             (f'{LAT},{LON},10,90,"-30\n{GOOD}', "4: pitch_deg is '-30"),
             (f"{LAT},{LON},1_0,90,-30", "2: height_takeoff_m is '1_0', not a number"),
-            ("", "1: a header and no rows"),
+            ("", "1: has a header but no rows"),
         ],
     )
     def test_a_bad_row_is_named_with_its_line(self, tmp_path, rows, message):
@@ -149,10 +149,10 @@ class TestRefusing:
     @pytest.mark.parametrize(
         ("data", "message"),
         [
-            (b"", "the file is empty: no waypoint in it"),
+            (b"", "the file is empty: it contains no waypoint"),
             (b"\0\1\2\3", "is binary"),
-            (b'"' + b"x" * 200_000, "is no CSV"),
-            (b",,,\n" * 5, "no column for|is empty|a header and no rows"),
+            (b'"' + b"x" * 200_000, "is not valid CSV"),
+            (b",,,\n" * 5, "no column for|is empty|has a header but no rows"),
         ],
         ids=["empty", "binary", "endless quote", "commas"],
     )

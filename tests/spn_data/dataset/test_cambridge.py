@@ -7,7 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.dataset.cambridge import far_positions, oddities, read_cambridge, write_cambridge
+from spn_data.dataset.cambridge import (
+    find_anomalies,
+    position_outliers,
+    read_cambridge,
+    write_cambridge,
+)
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, rotations_from_angles
 
@@ -39,8 +44,8 @@ def test_the_outlier_in_great_court_is_told_and_kept(shared_data: Path) -> None:
     found = read_cambridge(shared_data / "cambridge/GreatCourt/dataset_train.txt")
     row = found.names.index("seq5/frame00297.png")
     assert found.poses.centers[row, 0] == 3117382476.41
-    assert np.flatnonzero(far_positions(found.poses.centers)).tolist() == [row]
-    (sentence,) = oddities(found)
+    assert np.flatnonzero(position_outliers(found.poses.centers)).tolist() == [row]
+    (sentence,) = find_anomalies(found)
     assert sentence.startswith("seq5/frame00297.png: position (3.11738e+09, -1.37673e+08, -1.24")
 
 
@@ -50,15 +55,15 @@ def test_a_position_is_far_beyond_20_times_what_is_usual() -> None:
     usual[:, 0] = np.linspace(-1, 1, 20)
     for distance, is_far in ((15.0, False), (30.0, True)):
         centers = np.vstack([usual, [[0, 0, distance]]])
-        assert far_positions(centers).tolist() == [False] * 20 + [is_far]
-    assert not far_positions(np.vstack([usual[:8], [[0, 0, 1e9]]])).any()
-    assert not far_positions(np.zeros((20, 3))).any()
+        assert position_outliers(centers).tolist() == [False] * 20 + [is_far]
+    assert not position_outliers(np.vstack([usual[:8], [[0, 0, 1e9]]])).any()
+    assert not position_outliers(np.zeros((20, 3))).any()
 
 
 def test_an_ordinary_real_list_has_no_oddities(shared_data: Path) -> None:
     for name in REAL:
         if name != "GreatCourt/dataset_train.txt":
-            assert oddities(read_cambridge(shared_data / "cambridge" / name)) == []
+            assert find_anomalies(read_cambridge(shared_data / "cambridge" / name)) == []
 
 
 def test_the_real_cameras_stand_upright_in_their_convention(shared_data: Path) -> None:
@@ -94,7 +99,7 @@ def test_a_list_of_no_images_is_read_as_such(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text(HEADER)
     found = read_cambridge(tmp_path / "list.txt")
     assert len(found) == len(found.poses) == 0
-    assert oddities(found) == []
+    assert find_anomalies(found) == []
 
 
 def test_a_turned_or_long_quaternion_is_told_and_the_second_round_trip_is_the_same(
@@ -105,7 +110,7 @@ def test_a_turned_or_long_quaternion_is_told_and_the_second_round_trip_is_the_sa
     path.write_text(HEADER + "\n".join(rows))
     found = read_cambridge(path)
     assert found.poses.quats_wxyz.tolist() == [[0.5, -0.5, -0.5, -0.5], [1, 0, 0, 0], [1, 0, 0, 0]]
-    told = oddities(found)
+    told = find_anomalies(found)
     assert [sentence.split(":")[0] for sentence in told] == ["a/2.png", "a/1.png", "a/3.png"]
     write_cambridge(tmp_path / "first.txt", found.names, found.poses)
     second = read_cambridge(tmp_path / "first.txt")
@@ -120,15 +125,15 @@ def _with(old: str, new: str) -> bytes:
 @pytest.mark.parametrize(
     ("content", "line", "words"),
     [
-        (b"", 1, "nothing where a Cambridge list has"),
-        (ROW.encode() * 5, 1, "it begins with three header lines"),
-        (HEADER.strip().encode(), 3, "nothing where"),
-        (HEADER.strip().encode() + b"\n" + ROW.encode(), 3, "it begins with three header lines"),
+        (b"", 1, "nothing instead of"),
+        (ROW.encode() * 5, 1, "begins with three header lines"),
+        (HEADER.strip().encode(), 3, "nothing instead of"),
+        (HEADER.strip().encode() + b"\n" + ROW.encode(), 3, "begins with three header lines"),
         (_with(" 0.000000\n", "\n"), 4, "7 fields, expected 8"),
         (_with("frame00001", "frame 1"), 4, "9 fields, expected 8"),
         (_with("2.000000", "nan"), 4, "'nan' is not a number"),
         (_with("2.000000", "1_0"), 4, "'1_0' is not a number"),
-        (_with("2.000000", "1e400"), 4, "a number beyond 1e15"),
+        (_with("2.000000", "1e400"), 4, "a number exceeds 1e15"),
         (_with(" 1.000000 0.000000", " 0.000000 0.000000"), 4, "length"),
         (_with("seq1/", "../"), 4, "is not a path below"),
         (_with("seq1/", "/etc/"), 4, "is not a path below"),
@@ -154,7 +159,7 @@ def test_a_broken_list_is_refused_with_its_line(
 def test_a_missing_list_or_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         read_cambridge(tmp_path / "list.txt")
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="is not a file"):
         read_cambridge(tmp_path)
 
 

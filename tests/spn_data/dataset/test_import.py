@@ -15,7 +15,7 @@ from spn_cli.import_ import import_
 from spn_data.dataset.cambridge import read_cambridge, write_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_data.dataset.nvm import nvm_model, write_nvm
+from spn_data.dataset.nvm import build_nvm_model, write_nvm
 from spn_data.dataset.nvm_frames import camera_from_visualsfm
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
@@ -135,7 +135,7 @@ def scene(tmp_path: Path) -> Path:
         write_cambridge(
             folder / f"dataset_{name}.txt", [NAMES[k] for k in rows], poses()[np.array(rows)]
         )
-    model = nvm_model(
+    model = build_nvm_model(
         tuple(name.replace(".png", ".jpg") for name in NAMES),
         poses(),
         np.full(6, 120.0),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.dataset.nvm import NvmModel, nvm_model, offsets_from_center, read_nvm, write_nvm
+from spn_data.dataset.nvm import NvmModel, build_nvm_model, offsets_from_center, read_nvm, write_nvm
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, canonical_quats
@@ -39,7 +39,7 @@ def model(seed: int = 0, images: int = 5, points: int = 40) -> NvmModel:
     offsets = focal[image_idx, None] * rays[:, :2] / rays[:, 2:]
     colors = random.integers(0, 256, (points, 3)).astype(np.uint8)
     names = tuple(f"seq/{k:06d}.png" for k in range(images))
-    return nvm_model(names, poses, focal, (xyz, colors), (point_idx, image_idx, offsets))
+    return build_nvm_model(names, poses, focal, (xyz, colors), (point_idx, image_idx, offsets))
 
 
 def test_a_model_is_read_back_bit_by_bit(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_a_point_is_where_its_line_of_text_says(tmp_path: Path) -> None:
 
 
 def test_points_that_no_image_sees_are_left_out() -> None:
-    made = nvm_model(
+    made = build_nvm_model(
         ("a.png",),
         Poses(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
         np.array([100.0]),
@@ -100,7 +100,7 @@ def test_measurements_are_without_distortion_and_from_the_centre() -> None:
         ("0 0 0 0 0\n", "0 0 nan 0 0\n", 4, "not finite"),
         ("1 0 0 0 0 0 0 0 0", "x 0 0 0 0 0 0 0 0", 4, "could not convert"),
         (" 2 0 0 5", " 3 0 0 5", 8, "expected x y z r g b n"),
-        (" 1 0 -5", " 2 0 -5", 8, "image 2 of 2"),
+        (" 1 0 -5", " 2 0 -5", 8, "image 2 is out of range"),
         ("255", "256", 8, "from 0 to 255"),
         ("\n1\n0.5", "\n2\n0.5", 10, "1 fields, expected x y z"),
         (TEXT[20:], "", 1, "begins with"),
@@ -123,7 +123,7 @@ def test_an_absurd_count_takes_no_memory(tmp_path: Path) -> None:
     """A hundred million points are claimed, none is there: the file's end is met at once."""
     path = tmp_path / "a.nvm"
     path.write_text("NVM_V3\n\n0\n\n100000000\n")
-    with pytest.raises(InputError, match="the file ends where a point should stand"):
+    with pytest.raises(InputError, match="the file ends where a point is expected"):
         read_nvm(path)
     path.write_bytes(b"\xff\xfe\n")
     with pytest.raises(InputError, match="not UTF-8"):
@@ -136,7 +136,7 @@ def test_what_can_not_be_read_back_is_not_written(tmp_path: Path) -> None:
     whole = model()
     for names in (("a b.png", *whole.names[1:]), ("", *whole.names[1:])):
         broken = NvmModel(**{**vars(whole), "names": names})
-        with pytest.raises(ValueError, match="can't be an image's name"):
+        with pytest.raises(ValueError, match="is not a valid image name"):
             write_nvm(tmp_path / "a.nvm", broken)
     broken = NvmModel(**{**vars(whole), "focal_px": np.full(5, np.nan)})
     with pytest.raises(ValueError, match="not finite"):
