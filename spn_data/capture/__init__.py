@@ -1,0 +1,1 @@
+"""Videos and photos: discovery, decoding, measurement and selection of frames."""

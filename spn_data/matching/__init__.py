@@ -1,0 +1,1 @@
+"""Image matching: features, pair selection, putative matches and guided matching."""

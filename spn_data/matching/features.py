@@ -135,7 +135,7 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
     order = np.argsort([-p.response for p in points], kind="stable")[: options.max_features]
     xy = np.array([points[i].pt for i in order], dtype=np.float64)
     size_angle = np.array([(points[i].size / 2, np.deg2rad(points[i].angle)) for i in order])
-    # OpenCV's pixel centres lie on integers.
+    # OpenCV's pixel centres are at integers.
     factors = np.array([width / small_width, height / small_height])
     xy = (xy + 0.5) * factors
     size_angle[:, 0] *= factors.mean()

@@ -1,4 +1,4 @@
-"""From sources to image files: measured, chosen, extracted; interrupted, changed and out of space."""
+"""Measuring, choosing and extracting frames, also when interrupted, changed or out of disk space."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OPTIONS = SelectionOptions()
 
 
 def texture(width: int, height: int) -> np.ndarray:
-    """BGR noise of several scales."""
+    """Create BGR noise of several scales."""
     rng = np.random.default_rng(3)
     total = np.zeros((height, width, 3))
     for cell, weight in ((3, 20), (8, 40), (25, 60)):
@@ -45,7 +45,7 @@ def texture(width: int, height: int) -> np.ndarray:
 def write_flight(
     path: Path, frames: int, *, first: int = 0, size: tuple[int, int] = (320, 240)
 ) -> None:
-    """A camera that pans 6 px a frame at 10 frames a second; every seventh frame is blurred along x."""
+    """Write a video that pans by 6 px per frame at 10 fps; every seventh frame is blurred along x."""
     width, height = size
     wide = texture(width + 6 * 50, height)
     with av.open(str(path), "w") as container:
@@ -64,7 +64,7 @@ def write_flight(
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Source:
-    """Two GoPro chapters of 30 and 20 frames."""
+    """Create two GoPro chapters of 30 and 20 frames."""
     folder = tmp_path_factory.mktemp("flight")
     write_flight(folder / "GX010001.MP4", 30)
     write_flight(folder / "GX020001.MP4", 20, first=30)
@@ -79,7 +79,7 @@ def frames_from(source: Source, options: SelectionOptions = OPTIONS) -> Frames:
 
 
 def test_chapters_are_one_sequence_on_one_clock(flight: Source) -> None:
-    """Numbers and times go on where the first file ends; the file's own frame number begins again."""
+    """Frame names and times continue after the first file; the file's own frame index restarts."""
     candidates = analyse(flight)
     assert candidates.part_start_s == (0.0, 3.0)
     frames = build_frames(candidates, choose(candidates.measured, OPTIONS))
@@ -95,7 +95,7 @@ def test_chapters_are_one_sequence_on_one_clock(flight: Source) -> None:
 
 
 def test_chosen_frames_are_the_videos_own(flight: Source, tmp_path: Path) -> None:
-    """Each file shows its frame, at full size, to JPEG's 3 levels of RMS; skipped ones are not there."""
+    """Each file shows its frame at full size, to 3 grey levels RMS (JPEG); skipped frames have no file."""
     frames = frames_from(flight)
     heard: list[int] = []
     count = extract_chosen(flight, frames, tmp_path / "out", progress=heard.append)
@@ -112,7 +112,7 @@ def test_chosen_frames_are_the_videos_own(flight: Source, tmp_path: Path) -> Non
 
 
 def test_an_interrupted_extraction_goes_on(flight: Source, tmp_path: Path) -> None:
-    """Files that exist are kept, rests of a killed run are no obstacle, the missing ones are written."""
+    """Existing files are kept, leftovers of a killed run do not matter, and missing files are written."""
     frames = frames_from(flight)
     total = extract_chosen(flight, frames, tmp_path)
     names = sorted(p.name for p in tmp_path.iterdir())
@@ -129,7 +129,7 @@ def test_an_interrupted_extraction_goes_on(flight: Source, tmp_path: Path) -> No
 
 
 def test_measurements_are_kept_until_the_video_changes(flight: Source, tmp_path: Path) -> None:
-    """The second time nothing is decoded; a touched video or a damaged cache is measured again."""
+    """The second run decodes nothing; a touched video or a damaged cache is measured again."""
     for part in flight.parts:
         shutil.copy(part, tmp_path)
     [source] = discover(tmp_path).sources
@@ -151,7 +151,7 @@ def test_measurements_are_kept_until_the_video_changes(flight: Source, tmp_path:
 
 
 def test_a_video_that_was_replaced_is_told(flight: Source, tmp_path: Path) -> None:
-    """Shorter, or of another size, than when it was measured: refused, not mixed up."""
+    """A video that is shorter or of another size than when it was measured is refused."""
     frames = frames_from(flight)
     for size, count in (((320, 240), 12), ((160, 120), 30)):
         folder = tmp_path / f"{size[0]}"
@@ -166,7 +166,7 @@ def test_a_video_that_was_replaced_is_told(flight: Source, tmp_path: Path) -> No
 
 
 def test_zoom_and_size_make_other_cameras(flight: Source, tmp_path: Path) -> None:
-    """From 24 to 48 mm and back: two cameras; a chapter of another size is one more."""
+    """Zooming from 24 to 48 mm and back gives two cameras; a chapter of another size gives one more."""
     candidates = analyse(flight)
     choice = choose(candidates.measured, OPTIONS)
     focal = np.full(50, 24.0)
@@ -182,7 +182,7 @@ def test_zoom_and_size_make_other_cameras(flight: Source, tmp_path: Path) -> Non
 
 
 def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
-    """Real photos beside an unreadable, a turned and a PNG one: copied, told, turned, converted."""
+    """Real photos are copied, a turned one is turned, a PNG converted, an unreadable one reported."""
     folder = tmp_path / "survey"
     folder.mkdir()
     real = sorted((shared_data / "photos-two-passes").glob("*.JPG"))[:3]
@@ -225,7 +225,7 @@ def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
 
 
 def test_photos_of_which_none_is_readable_are_rows_too(tmp_path: Path) -> None:
-    """No time, no telemetry, no crash: the caller's check refuses them."""
+    """Unreadable photos have neither time nor telemetry and are refused by the caller's check."""
     for name in ("a.jpg", "b.jpg"):
         (tmp_path / name).write_text("no photo")
     [source] = discover(tmp_path).sources
@@ -235,7 +235,7 @@ def test_photos_of_which_none_is_readable_are_rows_too(tmp_path: Path) -> None:
 
 
 def test_costs_are_estimated_before(flight: Source, tmp_path: Path) -> None:
-    """Disk within a factor of three of what is written; a target scales it."""
+    """The disk estimate is within a factor of three of the files written; a target scales it."""
     cost = estimate_cost([flight])
     assert cost.candidates == 50
     assert cost.chosen == round(5 * 1.3)
@@ -248,7 +248,7 @@ def test_costs_are_estimated_before(flight: Source, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_told_before_starting(tmp_path: Path) -> None:
-    """More than any disk here has; the folder need not exist yet."""
+    """More space than any disk has is refused; the folder need not exist yet."""
     with pytest.raises(
         InputError, match=r"the frames need about 1000000000\.00 GB but only .* GB are free"
     ):
@@ -257,7 +257,7 @@ def test_a_full_disk_is_told_before_starting(tmp_path: Path) -> None:
 
 
 def test_the_blur_of_a_real_flight_video_is_relative(shared_data: Path) -> None:
-    """The GoPro Karma clip along a coast, 12 s: a frame a second or so, none twice, no gap above 4 s."""
+    """The 12 s GoPro Karma clip gives about one frame per second, no duplicates, no gap above 4 s."""
     found = discover(shared_data / "video").sources
     frames = frames_from(next(s for s in found if s.sequence == "gopro-karma"))
     times = frames.time_s[frames.chosen]

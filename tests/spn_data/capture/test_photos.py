@@ -1,4 +1,4 @@
-"""Photos: upright, in 8 bits, one bad one among good ones, and masks."""
+"""Photos: upright decoding in 8 bits, unreadable ones among good ones, and masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spn_data.errors import InputError
 
 
 def marked_photo(width: int = 64, height: int = 48) -> np.ndarray:
-    """Dark RGB with a green upper-left quarter."""
+    """Create a dark RGB image with a green upper-left quarter."""
     image = np.full((height, width, 3), (120, 30, 30), np.uint8)
     image[: height // 2, : width // 2] = (0, 255, 0)
     return image
@@ -44,7 +44,7 @@ UPRIGHT = {
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("orientation", sorted(UPRIGHT))
 def test_photos_stand_upright(tmp_path: Path, orientation: int, suffix: str) -> None:
-    """All eight EXIF orientations in three formats, in colour, grey and header."""
+    """All eight EXIF orientations are applied in three formats, in colour, grey and header."""
     path = save(tmp_path / f"a{suffix}", marked_photo(), orientation)
     (width, height), (right, lower) = UPRIGHT[orientation]
     image = decode_photo(path)
@@ -58,7 +58,7 @@ def test_photos_stand_upright(tmp_path: Path, orientation: int, suffix: str) -> 
 
 
 def test_one_unreadable_photo_does_not_stop_the_others(tmp_path: Path) -> None:
-    """Text, an empty file and a damaged header are told; a truncated one shows when decoded."""
+    """Text, an empty file and a damaged header are reported; a truncated photo fails when decoded."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (200, 300, 3), dtype=np.uint8)
     good = [save(tmp_path / f"{name}.jpg", noise) for name in "abc"]
@@ -79,7 +79,7 @@ def test_one_unreadable_photo_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
-    """16 bits lose their lower half; floating point has no known range and is refused."""
+    """16 bits lose their lower byte; floating point has no known range and is refused."""
     deep = np.full((10, 20), 0x8F12, np.uint16)
     Image.fromarray(deep).save(tmp_path / "deep.png")
     assert decode_photo(tmp_path / "deep.png")[0, 0].tolist() == [0x8F] * 3
@@ -89,7 +89,7 @@ def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
 
 
 def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
-    """A PNG of 40,000 x 40,000 pixels, as it says."""
+    """A PNG whose header claims 40,000 x 40,000 pixels is refused."""
     path = tmp_path / "bomb.png"
     header = b"IHDR" + struct.pack(">IIBBBBB", 40_000, 40_000, 8, 0, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
@@ -101,7 +101,7 @@ def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
 
 
 def test_lenses_are_told_apart(shared_data: Path) -> None:
-    """The two passes are one lens at one size; the other set another."""
+    """The two passes share one lens and size; the other set has another."""
     first = sorted((shared_data / "photos-two-passes").glob("*.JPG"))[:3]
     second = sorted((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))[:2]
     lens = read_headers([*first, *second]).lens
@@ -110,14 +110,14 @@ def test_lenses_are_told_apart(shared_data: Path) -> None:
 
 
 def test_grey_is_reduced_for_measuring(shared_data: Path) -> None:
-    """Half of 2000 x 1125 or less, never enlarged."""
+    """Photos are reduced to at most the requested width and never enlarged."""
     path = min((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))
     assert decode_photo_gray(path, max_width=640).shape == (360, 640)
     assert decode_photo_gray(path, max_width=9000).shape == (1125, 2000)
 
 
 def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
-    """White is used; the same shape is resized without blending; another shape is refused."""
+    """White is usable; the same aspect ratio is resized without blending, another one is refused."""
     mask = np.zeros((90, 160), np.uint8)
     mask[:45] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -133,7 +133,7 @@ def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
 
 
 def test_a_black_mask_is_refused(tmp_path: Path) -> None:
-    """Inverted or empty masks would leave nothing, without a word."""
+    """An all-black mask, such as an inverted one, is refused instead of masking everything."""
     Image.fromarray(np.zeros((90, 160), np.uint8)).save(tmp_path / "mask.png")
     with pytest.raises(InputError, match="entirely black; usable pixels must be white"):
         load_mask(tmp_path / "mask.png", 160, 90)

@@ -1,4 +1,4 @@
-"""What a folder holds: sequences, parts of one flight, telemetry beside them, and what is ignored."""
+"""Discovery in a folder: sequences, parts of one flight, their telemetry, and what is ignored."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def names_of(source: Source) -> list[str]:
 
 
 def write_clip(path: Path, created: datetime | None, *, seconds: int = 20, width: int = 32) -> None:
-    """A flat video of one frame a second with a creation time."""
+    """Write a flat video at one frame per second with a creation time."""
     with av.open(str(path), "w") as container:
         if created is not None:
             container.metadata["creation_time"] = created.isoformat() + "Z"
@@ -42,7 +42,7 @@ def write_clip(path: Path, created: datetime | None, *, seconds: int = 20, width
 
 
 def test_an_sd_card_is_sorted_into_sequences(tmp_path: Path) -> None:
-    """Videos with their telemetry, photos by folder; proxies, hidden and unknown files are listed."""
+    """Videos get their telemetry, photos are grouped by folder; other files are listed."""
     touch(
         tmp_path,
         *("DCIM/100MEDIA/DJI_0001.MP4", "DCIM/100MEDIA/DJI_0001.SRT", "DCIM/100MEDIA/DJI_0001.LRF"),
@@ -79,7 +79,7 @@ def test_an_sd_card_is_sorted_into_sequences(tmp_path: Path) -> None:
 
 
 def test_a_single_video_is_a_folder_of_one(tmp_path: Path) -> None:
-    """With the telemetry beside it, and nothing else of its folder."""
+    """A single video is found with its telemetry and nothing else of its folder."""
     touch(tmp_path, "a.mp4", "a.srt", "A.CSV", "b.mp4", "b.srt")
     [source] = discover(tmp_path / "a.mp4").sources
     assert (source.sequence, names_of(source)) == ("a", ["a.mp4"])
@@ -87,7 +87,7 @@ def test_a_single_video_is_a_folder_of_one(tmp_path: Path) -> None:
 
 
 def test_gopro_chapters_are_one_sequence(tmp_path: Path) -> None:
-    """GX010042 is chapter 1 of recording 42; a missing chapter cuts; older names begin with GOPR."""
+    """GX010042 is chapter 1 of recording 42; a missing chapter splits it; older names start with GOPR."""
     touch(
         tmp_path,
         *("GX010042.MP4", "GX020042.MP4", "GX030042.MP4", "GX010043.MP4", "GX030043.MP4"),
@@ -121,7 +121,7 @@ START = datetime(2024, 5, 1, 10, 0, 0)
 def test_dji_parts_are_joined_where_all_speaks_for_it(
     tmp_path: Path, later_s: int | None, width: int, second: str, joined: bool
 ) -> None:
-    """Number, size, picture and creation time must all agree."""
+    """Number, file size, image size and creation time must all agree."""
     write_clip(tmp_path / "DJI_0001.MP4", START)
     later = None if later_s is None else START + timedelta(seconds=later_s)
     write_clip(tmp_path / second, later, width=width)
@@ -132,7 +132,7 @@ def test_dji_parts_are_joined_where_all_speaks_for_it(
 
 
 def test_new_dji_names_with_a_time_are_joined(tmp_path: Path) -> None:
-    """DJI_20240501100000_0001_D and DJI_20240501100020_0002_D, telemetry of both parts in order."""
+    """Names like DJI_20240501100000_0001_D are joined, with the telemetry of both parts in order."""
     write_clip(tmp_path / "DJI_20240501100000_0001_D.MP4", START)
     write_clip(tmp_path / "DJI_20240501100020_0002_D.MP4", START + timedelta(seconds=20))
     touch(tmp_path, "DJI_20240501100020_0002_D.SRT", "DJI_20240501100000_0001_D.SRT")
@@ -142,7 +142,7 @@ def test_new_dji_names_with_a_time_are_joined(tmp_path: Path) -> None:
 
 
 def test_links_are_listed_not_followed(tmp_path: Path) -> None:
-    """A link to a file or folder elsewhere is ignored with what to do about it."""
+    """A link to a file or folder elsewhere is ignored, with advice."""
     touch(tmp_path, "elsewhere/secret.mp4", "video/a.mp4")
     (tmp_path / "video" / "link.mp4").symlink_to(tmp_path / "elsewhere" / "secret.mp4")
     (tmp_path / "video" / "more").symlink_to(tmp_path / "elsewhere")
@@ -155,7 +155,7 @@ def test_links_are_listed_not_followed(tmp_path: Path) -> None:
 
 
 def test_special_files_are_not_opened(tmp_path: Path) -> None:
-    """A pipe named .mp4 would block whoever reads it."""
+    """A pipe named .mp4 is ignored, as reading it would block."""
     touch(tmp_path, "a.mp4")
     os.mkfifo(tmp_path / "b.mp4")
     found = discover(tmp_path)
@@ -164,7 +164,7 @@ def test_special_files_are_not_opened(tmp_path: Path) -> None:
 
 
 def test_names_of_sequences_are_safe_and_unique(tmp_path: Path) -> None:
-    """Whatever files are called, a sequence can name a folder, on file systems without case too."""
+    """Sequence names are valid folder names for any file name, even on case-insensitive file systems."""
     touch(tmp_path, "Flug über Köln.mp4", "полёт.mp4", "a/x.mp4", "b/x.mp4", "c/X.mp4", "..x.mp4")
     names = [s.sequence for s in discover(tmp_path).sources]
     assert names == ["Flug-uber-Koln", "x", "b-x", "c-X", "sequence"]
@@ -175,7 +175,7 @@ def test_names_of_sequences_are_safe_and_unique(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
-    """Missing, empty, other files, only links, a file of another kind."""
+    """A missing or empty folder, only other files or links, and another kind of file are refused."""
     touch(tmp_path, "other/readme.txt", "other/flight.srt", "linked/notes.txt")
     (tmp_path / "empty").mkdir()
     (tmp_path / "linked" / "a.mp4").symlink_to(tmp_path / "other" / "readme.txt")
@@ -193,7 +193,7 @@ def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_the_real_data_is_found(shared_data: Path) -> None:
-    """Three videos, and 172 photos in one sequence, in the order of their names."""
+    """Three videos are found, and 172 photos in one sequence in order of their names."""
     assert [s.sequence for s in discover(shared_data / "video").sources] == [
         "gopro-karma",
         "sample-5s",

@@ -1,4 +1,4 @@
-"""Video files: what they say, their frames' times and orientation, and what damage does."""
+"""Video files: properties, times and orientation of frames, and the effect of damage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GREEN = (0, 255, 0)
 
 
 def marked_image(width: int = 64, height: int = 48) -> np.ndarray:
-    """Dark red, with green in the upper-left quarter."""
+    """Create a dark red image with a green upper-left quarter."""
     image = np.full((height, width, 3), (30, 30, 120), np.uint8)
     image[: height // 2, : width // 2] = GREEN
     return image
@@ -39,7 +39,7 @@ def write_video(
     container_options: dict[str, str] | None = None,
     gop: int = 12,
 ) -> Path:
-    """H.264 of BGR images at presentation times `ticks` of `time_base`."""
+    """Encode BGR images as H.264 with presentation times `ticks` of `time_base`."""
     with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream("libx264", rate=10)
         stream.height, stream.width = images[0].shape[:2]
@@ -64,13 +64,13 @@ def write_video(
 
 
 def noise_images(count: int, width: int = 320, height: int = 240) -> list[np.ndarray]:
-    """Images that compress badly, so that a file has bytes to damage."""
+    """Create images that compress badly, so that a file has bytes to damage."""
     rng = np.random.default_rng(5)
     return [rng.integers(0, 255, (height, width, 3), dtype=np.uint8) for _ in range(count)]
 
 
 def test_probe_reads_a_drone_video(shared_data: Path) -> None:
-    """The GoPro Karma clip's size, rate, clock and tracks, as its maker wrote them."""
+    """Size, rate, clock and tracks of the GoPro Karma clip are those that the camera wrote."""
     info = probe(shared_data / "video" / "gopro-karma.mp4")
     assert (info.width, info.height, info.rotation_deg, info.codec) == (854, 480, 0, "h264")
     assert info.frame_count == 362
@@ -83,7 +83,7 @@ def test_probe_reads_a_drone_video(shared_data: Path) -> None:
 
 
 def test_all_frames_of_a_drone_video_come_at_its_rate(shared_data: Path) -> None:
-    """362 frames at 29.97 a second, from both decoders."""
+    """Both decoders give 362 frames at 29.97 fps."""
     path = shared_data / "video" / "gopro-karma.mp4"
     report = DecodeReport()
     gray = list(decode_gray(path, max_width=320, report=report))
@@ -104,7 +104,7 @@ def test_all_frames_of_a_drone_video_come_at_its_rate(shared_data: Path) -> None
 
 
 def test_a_real_portrait_video_of_variable_rate_keeps_its_timestamps(shared_data: Path) -> None:
-    """Of 146 frames, one with a timestamp before its predecessor's is dropped, and told."""
+    """One of 146 frames, with a timestamp before its predecessor's, is dropped and reported."""
     path = shared_data / "video" / "sample-5s_h265.mp4"
     report = DecodeReport()
     times = np.array([f.time_s for f in decode_gray(path, max_width=160, report=report)])
@@ -118,7 +118,7 @@ def test_a_real_portrait_video_of_variable_rate_keeps_its_timestamps(shared_data
 
 
 def test_times_are_the_containers_and_begin_at_zero(tmp_path: Path) -> None:
-    """Variable frame rate, first timestamp 40 ticks late."""
+    """Times follow a variable frame rate, with 0 at a first timestamp of 40 ticks."""
     ticks = [40, 41, 43, 50, 51, 90]
     images = [marked_image()] * 6
     path = write_video(tmp_path / "v.mkv", images, ticks=ticks, time_base=Fraction(1, 1000))
@@ -191,7 +191,7 @@ def test_colours_of_bt709_are_kept(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
-    """48 pixels of 4:3 are 64 wide, and the user is told."""
+    """48 pixels of 4:3 become 64, and a note says so."""
     image = marked_image(48, 48)
     path = write_video(tmp_path / "v.mp4", [image] * 2, pixel_aspect=Fraction(4, 3))
     info = probe(path)
@@ -206,7 +206,7 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
 
 
 def test_a_change_of_size_within_a_file_shows_in_the_frames(tmp_path: Path) -> None:
-    """Two transport streams one after the other, as some recorders write them."""
+    """Frames of concatenated transport streams, as some recorders write them, keep their own sizes."""
     first = write_video(tmp_path / "a.ts", [marked_image(64, 48)] * 5)
     second = write_video(tmp_path / "b.ts", [marked_image(96, 48)] * 5, ticks=list(range(5, 10)))
     path = tmp_path / "both.ts"
@@ -218,7 +218,7 @@ def test_a_change_of_size_within_a_file_shows_in_the_frames(tmp_path: Path) -> N
 
 
 def test_only_wanted_frames_are_converted(tmp_path: Path) -> None:
-    """Others pass without an image, and decoding ends after the last wanted one."""
+    """Unwanted frames have no image, and decoding ends after the last wanted one."""
     path = write_video(tmp_path / "v.mp4", [marked_image()] * 8)
     frames = list(decode(path, wanted={2, 4}))
     assert [f.index for f in frames] == [0, 1, 2, 3, 4]
@@ -226,7 +226,7 @@ def test_only_wanted_frames_are_converted(tmp_path: Path) -> None:
 
 
 def test_damaged_packets_are_passed_over_and_told(tmp_path: Path) -> None:
-    """Zeros in the middle of the stream cost some frames; those up to the next key frame are marked."""
+    """Zeros in the stream cost some frames; those up to the next key frame are marked as damaged."""
     path = write_video(tmp_path / "v.mp4", noise_images(40), gop=10)
     data = bytearray(path.read_bytes())
     begin = data.find(b"mdat") + (len(data) * 2) // 5
@@ -247,7 +247,7 @@ def test_damaged_packets_are_passed_over_and_told(tmp_path: Path) -> None:
 
 
 def test_a_video_that_breaks_off_gives_what_it_has(tmp_path: Path) -> None:
-    """An index at the front and half the pictures: the rest is told as missing."""
+    """If half the frames of a file with its index in front are cut off, the rest is reported missing."""
     options = {"movflags": "faststart"}
     path = write_video(tmp_path / "v.mp4", noise_images(40), container_options=options)
     data = path.read_bytes()
@@ -271,7 +271,7 @@ def _audio_only(path: Path) -> None:
 
 
 def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
-    """Empty, text, playlist, truncated, sound alone, folder, missing: each says which and why."""
+    """An empty, text, playlist, truncated, audio-only, folder or missing file gets its own message."""
     real = write_video(tmp_path / "real.mp4", noise_images(3))
     content = real.read_bytes()
     (tmp_path / "empty.mp4").touch()

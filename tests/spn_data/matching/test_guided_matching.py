@@ -1,4 +1,4 @@
-"""Matching along epipolar lines: the same as comparing all and masking, and more than that without lines."""
+"""Guided matching: the same as masked exhaustive matching, and more matches than without the lines."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from spn_data.matching.putative import MatchOptions, match_descriptors, unit_des
 
 CAMERA = Camera.from_horizontal_fov(800, 600, 70)
 OPTIONS = MatchOptions()
-# Aside, ahead (the epipole lies in the image), and both with some rise.
+# Sideways, forward (the epipole is in the image), and both with some climb.
 MOVES = [(1.0, 0.0, 0.0), (0.0, 0.0, 2.0), (0.7, 0.3, 0.8)]
 
 
 def views(
     move: tuple[float, float, float], n: int = 700
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of points in two views, descriptors (n, 128) of each, and F (3, 3)."""
+    """Create pixels (n, 2) of points in two views, their descriptors (n, 128), and F (3, 3)."""
     rng = np.random.default_rng(3)
     points = rng.uniform([-6, -4, 6], [6, 4, 14], size=(n, 3))
     shift = np.array(move)
@@ -33,7 +33,7 @@ def views(
 
 
 def off_lines(fundamental: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, M) distances in pixels of points b from the epipolar lines of points a."""
+    """Return distances (N, M) in pixels of points b from the epipolar lines of points a."""
     lines = np.column_stack([a, np.ones(len(a))]) @ fundamental.T
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     return np.abs(lines @ np.column_stack([b, np.ones(len(b))]).T)
@@ -42,7 +42,7 @@ def off_lines(fundamental: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarr
 def compared_all(
     a: np.ndarray, da: np.ndarray, b: np.ndarray, db: np.ndarray, fundamental: np.ndarray
 ) -> set[tuple[int, int]]:
-    """The same by its definition: every feature with every one near its line, and some elsewhere."""
+    """Match by definition: every feature with all near its line, and with a sample of the others."""
     everywhere = unit_descriptors(da) @ unit_descriptors(db).T
     similarity = np.where(off_lines(fundamental, a, b) > OPTIONS.guided_px, -1, everywhere)
     elsewhere = np.arange(0, len(b), OPTIONS.guided_step)
@@ -75,8 +75,10 @@ def test_it_finds_what_comparing_all_and_masking_finds(move) -> None:
 
 
 def test_most_of_what_repeats_elsewhere_is_matched_along_the_line() -> None:
-    """Every feature has a twin somewhere, which denies it in the ratio test, unless lines part them: an
-    eighth of the twins takes part in that along lines, too."""
+    """Epipolar lines separate features from their twins, which fail the ratio test everywhere else.
+
+    An eighth of the twins takes part in the ratio test of guided matching, too.
+    """
     a, b, descriptors, fundamental = views(MOVES[0], 300)
     rng = np.random.default_rng(5)
     places = np.concatenate([b, rng.uniform([0, 0], [800, 600], b.shape)])
@@ -89,7 +91,7 @@ def test_most_of_what_repeats_elsewhere_is_matched_along_the_line() -> None:
 
 
 def test_what_is_alike_everywhere_gives_few_matches() -> None:
-    """Bricks of two different walls: on a line, some brick is always much nearer than the next."""
+    """Bricks of two different walls give few matches, though some brick is always nearest on a line."""
     rng = np.random.default_rng(7)
     bricks = rng.gamma(0.5, 40, size=(50, 128))
     a, b = (

@@ -1,4 +1,4 @@
-"""Features and matches of images whose geometry is known exactly."""
+"""Features and matches of images with exactly known geometry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spn_data.matching.putative import MatchOptions, PutativeMatcher, match_desc
 
 @pytest.fixture(scope="module")
 def texture() -> np.ndarray:
-    """Blobs of many sizes (600, 800) uint8."""
+    """Create an image (600, 800) uint8 of blobs of many sizes."""
     rng = np.random.default_rng(3)
     image = np.zeros((600, 800))
     for sigma in (2, 4, 8):
@@ -34,7 +34,7 @@ def test_keypoints_lie_in_colmaps_pixel_frame() -> None:
 
 
 def test_a_reduced_image_gives_keypoints_in_full_size_pixels(texture: np.ndarray) -> None:
-    """Detection at half size lands where detection at full size does, to a fraction of a pixel."""
+    """Keypoints detected at half size agree with those at full size to a fraction of a pixel."""
     full = extract(texture, None, FeatureOptions(max_features=500))
     half = extract(texture, None, FeatureOptions(max_features=500, max_image_size_px=400))
     strong = half.keypoints[half.keypoints[:, 2] > 6, :2]
@@ -63,7 +63,7 @@ def test_an_empty_image_has_no_features() -> None:
 
 
 def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
-    """Against a plain loop over all distances, on descriptors with near doubles."""
+    """Matches equal those of a plain loop over all distances, on descriptors with near duplicates."""
     rng = np.random.default_rng(0)
     a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
     b = np.clip(a[:500] + rng.normal(0, 15, size=(500, 128)), 0, 255).astype(np.uint8)
@@ -88,7 +88,7 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
 
 
 def test_a_comparison_that_grows_ends_in_the_matches_of_all_at_once() -> None:
-    """At every size, also where one image has no more to compare."""
+    """The incremental matcher agrees at every size, even if one image has no more descriptors."""
     rng = np.random.default_rng(5)
     a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
     of_a = np.concatenate([rng.permutation(400), np.arange(50)])  # the last ones a second time
@@ -113,7 +113,7 @@ def test_no_feature_is_matched_twice() -> None:
 def scene_pair(
     rng: np.random.Generator, outliers: int, n: int = 300
 ) -> tuple[Features, Features, Camera]:
-    """Two views of n points in depth, 0.3 px noise, with descriptors that also tie `outliers` wrongly."""
+    """Create two views of n points with 0.3 px noise; the descriptors also give `outliers` false matches."""
     camera = Camera.from_horizontal_fov(800, 600, 70)
     points = rng.uniform([-4, -3, 6], [4, 3, 14], size=(n, 3))
     views = []
@@ -134,7 +134,7 @@ def test_verification_keeps_the_true_matches_and_drops_the_others() -> None:
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
     kept = pair.inliers[:, 0]
     assert (kept >= 90).sum() >= 205
-    assert (kept < 90).sum() <= 8  # those that happen to lie on their epipolar line
+    assert (kept < 90).sum() <= 8  # those that happen to be on their epipolar line
 
 
 def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -> None:
@@ -154,7 +154,7 @@ def test_no_samples_are_drawn_to_find_fewer_inliers_than_verify_a_pair() -> None
 
 
 def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:
-    """The others are not compared: there are fewer matches than all features would give."""
+    """The other features are not compared: there are fewer matches than all of them would give."""
     a, b, camera = scene_pair(np.random.default_rng(3), outliers=1500, n=1500)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
@@ -163,7 +163,7 @@ def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:
 
 
 def test_of_images_that_overlap_the_features_on_wrong_lines_are_not_even_matched() -> None:
-    """A fifth of 1500 lies elsewhere: most are gone before verification, and all true ones stay."""
+    """Most of the outliers, a fifth of 1500, are removed before verification; true matches stay."""
     a, b, camera = scene_pair(np.random.default_rng(4), outliers=300, n=1500)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())

@@ -40,7 +40,7 @@ def point(second, lat="-33.5", lon="-70.25", more=""):
 
 
 def test_dilutions_become_standard_deviations():
-    """Dilution times 2 m range error, shared by two axes, or by three with the vertical 1.5 times."""
+    """Sigma is dilution times a 2 m range error, over two axes or three with a vertical factor of 1.5."""
     np.testing.assert_allclose(sigma_from_dop(hdop=1.0, vdop=1.2), (2**0.5, 2**0.5, 2.4))
     east, north, up = sigma_from_dop(pdop=1.7)
     assert up == pytest.approx(1.5 * east)
@@ -66,7 +66,7 @@ def test_gpx_of_several_segments(tmp_path, version):
 
 
 def test_gpx_with_geoid_heights_is_above_sea_level(tmp_path):
-    """Where each point also states the geoid's height, `ele` is above mean sea level."""
+    """If each point also states the geoid height, `ele` is above mean sea level."""
     more = "<ele>80.0</ele><geoidheight>47.5</geoidheight>"
     t = read_gpx(write(tmp_path, gpx(point("00", more=more), point("01", more=more)), "a.gpx"))
     assert t.abs_reference is HeightReference.AMSL
@@ -107,7 +107,7 @@ def test_unusable_gpx_is_refused(tmp_path, text, message):
 
 
 def test_csv_of_our_own_names(tmp_path):
-    """All columns by their plain names, with a stated height reference and accuracies."""
+    """All columns are read by their plain names, with a height reference and accuracies."""
     text = (
         "time_s,lat,lon,rel_alt_m,abs_alt_m,alt_reference,gimbal_heading,gimbal_pitch,gimbal_roll,"
         "sigma_e,sigma_n,sigma_u\n"
@@ -126,7 +126,7 @@ def test_csv_of_our_own_names(tmp_path):
 
 
 def test_csv_of_airdata(tmp_path):
-    """Airdata's export: milliseconds, feet, dates in UTC, its own names, and recordings marked."""
+    """Airdata's export has milliseconds, feet, UTC dates, its own names and marked recordings."""
     text = (
         "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),"
         "altitude_above_seaLevel(feet),speed(mph),isVideo, compass_heading(degrees),"
@@ -260,7 +260,7 @@ def test_unusable_csv_is_refused(tmp_path, text, message):
 
 
 def video(path, records, codec, *, first_frame=0, box=b""):
-    """A tiny video whose subtitle track of `codec` holds (seconds, text) records; none for None."""
+    """Write a tiny video with a subtitle track of (seconds, text) records; none if `codec` is None."""
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mpeg4", rate=10)
         stream.width = stream.height = 64
@@ -297,13 +297,13 @@ def test_subtitle_track_of_a_video(tmp_path, name, codec):
 
 
 def test_style_boxes_after_the_text_are_cut_off(tmp_path):
-    """What follows the text in an MP4 subtitle sample is binary and no telemetry."""
+    """The binary data after the text in an MP4 subtitle sample is not read as telemetry."""
     path = video(tmp_path / "a.mp4", RECORDS, "mov_text", box=b"\0\0\0\x20styl [latitude: x]")
     assert len(read_subtitles(path)) == 5
 
 
 def test_subtitle_track_counts_from_the_first_frame(tmp_path):
-    """Where the video's first frame is at 0.5 s in the container, a subtitle at 0.6 s is at 0.1 s."""
+    """If the first frame is at 0.5 s in the container, a subtitle at 0.6 s is at 0.1 s."""
     records = [(s + 0.5, text) for s, text in RECORDS]
     t = read_subtitles(video(tmp_path / "a.mkv", records, "subrip", first_frame=5))
     np.testing.assert_allclose(t.time_s, [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-9)
@@ -325,13 +325,13 @@ def test_a_real_file_survives_the_way_through_a_video(tmp_path, shared_data):
 
 
 def test_video_without_subtitles_has_none(tmp_path, shared_data):
-    """None means that there is no subtitle track, and nothing else."""
+    """None is returned only if there is no subtitle track."""
     assert read_subtitles(video(tmp_path / "a.mp4", [], None)) is None
     assert read_subtitles(shared_data / "video" / "gopro-karma.mp4") is None
 
 
 def test_subtitles_of_other_content_are_refused(tmp_path):
-    """A film's subtitles are refused with the path, and so is what is no video."""
+    """Subtitles of a film and files that are not videos are refused with the path."""
     path = video(tmp_path / "a.mp4", [(0.0, "Hello"), (1.0, "Bye")], "mov_text")
     with pytest.raises(InputError, match=r"a.mp4: no subtitle record contains drone telemetry"):
         read_subtitles(path)
@@ -344,7 +344,7 @@ def test_subtitles_of_other_content_are_refused(tmp_path):
 
 
 def test_the_reader_is_chosen_by_name_and_content(tmp_path):
-    """Suffix and content choose the reader, in either case of letters."""
+    """Suffix (in any case) and content choose the reader."""
     srt = "1\n00:00:00,000 --> 00:00:01,000\n" + KEYED.format(1)
     log = "time_s,lat,lon\n0,1,2\n"
     for name, text, kind in (
@@ -371,12 +371,12 @@ def test_the_reader_is_chosen_by_name_and_content(tmp_path):
     ],
 )
 def test_unsupported_files_are_refused(tmp_path, name, message):
-    """What is not supported is refused with what is."""
+    """An unsupported file is refused with a list of what is supported."""
     with pytest.raises(InputError, match=message):
         read_telemetry(tmp_path / name)
 
 
 def test_a_video_without_track_is_refused(tmp_path):
-    """A video that was named as telemetry but has no track says so."""
+    """A video given as telemetry but without a subtitle track is refused."""
     with pytest.raises(InputError, match="has no subtitle track"):
         read_telemetry(video(tmp_path / "a.mp4", [], None))

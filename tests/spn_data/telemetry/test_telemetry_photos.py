@@ -43,7 +43,7 @@ def jpeg(path, *, gps=None, exif=None, main=None, xmp=None, size=(40, 30)):
 
 
 def test_real_photo_of_the_first_pass(shared_data):
-    """A DJI photo without XMP gives its position, lens and the negative altitude as it stands."""
+    """A DJI photo without XMP gives its position, lens and the negative altitude unchanged."""
     photo = read_photo(shared_data / "photos-two-passes" / "DJI_0054.JPG")
     assert (photo.width, photo.height, photo.orientation) == (800, 600, 1)
     assert (photo.make, photo.model) == ("DJI", "FC300S")  # padded with zero bytes in the file
@@ -80,7 +80,7 @@ def test_two_passes_are_one_track_with_a_pause(shared_data):
 
 
 def test_hemispheres_and_clock_with_zone(tmp_path):
-    """South and west are negative; an offset tells UTC; fractions of a second count."""
+    """South and west are negative; an offset gives UTC; fractions of a second are kept."""
     exif = {
         piexif.ExifIFD.DateTimeOriginal: "2024:05:01 12:00:00",
         piexif.ExifIFD.SubSecTimeOriginal: "250",
@@ -106,7 +106,7 @@ def test_hemispheres_and_clock_with_zone(tmp_path):
     ],
 )
 def test_altitude_reference(tmp_path, code, altitude_m, reference):
-    """Odd codes are below zero; only the codes that came with EXIF 3 say sea level for sure."""
+    """Odd codes are below zero; only the codes added in EXIF 3 certainly mean sea level."""
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | {piexif.GPSIFD.GPSAltitudeRef: code}))
     assert (photo.altitude_m, photo.altitude_reference) == (altitude_m, reference)
 
@@ -127,7 +127,7 @@ def test_altitude_reference(tmp_path, code, altitude_m, reference):
     ],
 )  # fmt: skip
 def test_stated_accuracy(tmp_path, gps, xmp, sigma_m):
-    """RTK deviations, accuracies and dilutions (of 2 m range error) become sigma; silence stays NaN."""
+    """RTK deviations, accuracies and dilutions (2 m range error) become sigma; unstated values stay NaN."""
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | gps, xmp=xmp))
     np.testing.assert_allclose(photo.sigma_m, sigma_m, rtol=1e-4, equal_nan=True)
 
@@ -175,7 +175,7 @@ def photo(name, **values) -> PhotoMetadata:
     ],
 )
 def test_photo_times(times, expected, words):
-    """Times count from the first photo; missing or decreasing ones are replaced, and it is said."""
+    """Times count from the first photo; missing or decreasing ones are replaced, with a note."""
     photos = [photo(n, local_s=t) for n, t in zip(("a.jpg", "b.jpg", "c.jpg"), times, strict=True)]
     t = telemetry_from_photos(photos)
     np.testing.assert_allclose(t.time_s, expected)
@@ -210,7 +210,7 @@ def test_mixed_references_are_unknown():
     ],
 )  # fmt: skip
 def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
-    """Damaged tags make no number up and do not stop the photo from being used."""
+    """Damaged tags give no invented value and do not stop the photo from being used."""
     found = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | gps, xmp=xmp))
     assert found.width == 40
     assert math.isnan(found.lat_deg) == bool(gps)
@@ -220,7 +220,7 @@ def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
 
 
 def test_unset_clock_and_strange_orientation(tmp_path):
-    """A clock that was never set is no time, and an orientation that does not exist is 1."""
+    """A clock that was never set gives no time, and an invalid orientation is read as 1."""
     exif = {piexif.ExifIFD.DateTimeOriginal: "0000:00:00 00:00:00"}
     found = read_photo(jpeg(tmp_path / "a.jpg", exif=exif, main={piexif.ImageIFD.Orientation: 77}))
     assert math.isnan(found.local_s)

@@ -13,7 +13,7 @@ from spn_data.telemetry.track import summarize
 NAN = np.nan
 
 # name: records, fixes, then time_s, lat, lon, rel_alt_m, abs_alt_m of the first and of the last record:
-# all as they stand in the files.
+# all copied from the files.
 REAL = {
     "mavic_pro.SRT": (
         (468, 468),
@@ -66,7 +66,7 @@ REAL = {
 
 @pytest.mark.parametrize("name", REAL)
 def test_real_file_gives_its_own_values(shared_data, name):
-    """Counts, and the first and last record, are those that stand in the file."""
+    """Counts and the first and last record are those in the file."""
     (records, fixes), *ends = REAL[name]
     t = read_dji_srt(shared_data / "srt" / name)
     assert (len(t), int(t.has_fix.sum())) == (records, fixes)
@@ -115,7 +115,7 @@ def test_lost_fixes_are_a_gap_with_heights(shared_data):
     ],
 )
 def test_what_a_user_should_know_is_in_the_notes(shared_data, name, words):
-    """Guesses, rounding, repeated fixes, joined recordings and lost records are said."""
+    """Guesses, rounding, repeated fixes, joined recordings and lost records get a note."""
     assert any(words in note for note in read_dji_srt(shared_data / "srt" / name).notes)
 
 
@@ -157,7 +157,7 @@ P4_RTK = (
          (39.906217, 116.391305), 91.2, (NAN, NAN, NAN)),
         ("GPS(39.9,16.4,69.800) BAROMETER:-3.5M", (39.9, 16.4), -3.5, (NAN, NAN, NAN)),
         ("HOME(E: 120.0, S: 20.0)\nGPS(W: 120.5, S: 20.25, 001.01m)", (-20.25, -120.5), NAN, (NAN,) * 3),
-        # HOME settles the order, against the height that stands third.
+        # HOME decides the order, against the height in third place.
         ("HOME(149.0,-20.0)\nGPS(49.5,-20.5,16.5)", (-20.5, 49.5), NAN, (NAN, NAN, NAN)),
         ("[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 1.5 abs_alt: 2.5]",
          (NAN, NAN), 1.5, (NAN, NAN, NAN)),
@@ -165,7 +165,7 @@ P4_RTK = (
     ],
 )  # fmt: skip
 def test_dialect(body, lat_lon, rel_alt_m, gimbal_deg):
-    """Each published way of writing position, height and gimbal is read by what it means."""
+    """Every known way of writing position, height and gimbal angles is read correctly."""
     t = one(body)
     np.testing.assert_allclose(t.lat_lon_deg[0], lat_lon, atol=1e-12, equal_nan=True)
     np.testing.assert_allclose(t.rel_alt_m[0], rel_alt_m, atol=1e-12, equal_nan=True)
@@ -212,7 +212,7 @@ def test_equal_and_stray_times_are_left_out():
 
 
 def test_times_that_start_over_end_the_recording():
-    """Where a second recording is appended, its records are not mixed into the first."""
+    """If a second recording is appended, its records are not mixed into the first."""
     t = times_of([0.0, 1.0, 2.0, 3.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     np.testing.assert_allclose(t.time_s, [0.0, 1.0, 2.0, 3.0])
     assert any("start over at line 18: the 6 records" in note for note in t.notes)
@@ -249,7 +249,7 @@ def test_garbage_among_good_records_is_counted():
 
 
 def test_heights_below_land_are_said():
-    """An absolute height far below any land gets a note, and stays as it is."""
+    """An absolute height far below any land gets a note and is kept."""
     t = one("[latitude: 50.5] [longitude: 8.25] [rel_alt: 5.4 abs_alt: -124.7]")
     assert t.abs_alt_m[0] == -124.7
     assert any("-124.7 m" in note for note in t.notes)
@@ -294,7 +294,7 @@ def test_empty_binary_and_missing_files_are_refused(shared_data, tmp_path):
 
 
 def test_a_hostile_file_takes_no_time():
-    """Long runs of what patterns look for are read in linear time."""
+    """Long inputs that nearly match the patterns are read in linear time."""
     text = record(
         "[latitude: 5.5] [longitude: 8.0] " + "GPS(" * 200_000 + "<a" * 200_000 + "H " * 100_000
     )

@@ -1,4 +1,4 @@
-"""Our own file of a telemetry track, joined parts, and zoom."""
+"""Telemetry track files, joined parts, and zoom."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_parts_of_one_recording_are_joined_and_overlap_is_dropped() -> None:
 
 
 def test_a_change_of_focal_length_or_digital_zoom_shows(shared_data: Path) -> None:
-    """24 mm throughout in a real file; twice that where the record says so, by lens or digitally."""
+    """A real file has 24 mm throughout; optical or digital zoom doubles it if the record says so."""
     real = read_dji_srt(shared_data / "srt" / "air3S.SRT")
     assert np.array_equal(real.zoom, np.full(len(real), 24.0))
     record = "{0}\n00:00:0{0},000 --> 00:00:0{0},900\n[latitude: 1.5] [longitude: 2.5] {1}\n\n"

@@ -1,4 +1,4 @@
-"""Telemetry as a value: interpolation, gaps, ends, angles, summary."""
+"""Telemetry tracks: interpolation, gaps, ends, angles, summary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def track(time_s, **columns) -> Telemetry:
 
 
 def test_at_is_linear_between_records():
-    """Half-way between two records lies half-way between their positions, heights and clocks."""
+    """Half-way between two records, position, height and clock are half-way between theirs."""
     t = track([0.0, 1.0, 2.0], rel_alt_m=[0.0, 4.0, 6.0], utc_s=[100.0, 101.0, 102.0])
     at = t.at(np.array([0.5, 1.25]))
     np.testing.assert_allclose(at.rel_alt_m, [2.0, 4.5])
@@ -38,7 +38,7 @@ def test_at_the_records_own_times_returns_them():
 
 
 def test_no_value_is_made_up_outside_the_neighbouring_records():
-    """Every interpolated value lies between the known values on both sides of its time."""
+    """Every interpolated value is between the known values on both sides of its time."""
     time_s = np.cumsum(RNG.uniform(0.05, 2.0, 100))
     height = RNG.normal(size=100)
     height[RNG.random(100) < 0.3] = np.nan
@@ -56,13 +56,13 @@ def test_no_value_is_made_up_outside_the_neighbouring_records():
 
 
 def test_a_gap_gives_no_position():
-    """Across a gap longer than the limit there is no position, on its edges there is."""
+    """There is no position inside a gap longer than the limit, but there is at its edges."""
     at = track([0.0, 1.0, 2.0, 10.0, 11.0]).at(np.array([1.9, 2.0, 2.1, 6.0, 9.9, 10.0, 10.1]))
     np.testing.assert_array_equal(at.has_fix, [True, True, False, False, False, True, True])
 
 
 def test_records_without_a_fix_are_a_gap_of_the_position_only():
-    """Heights go on through records whose position is unknown."""
+    """Heights are interpolated through records whose position is unknown."""
     time_s = np.arange(8.0)
     lat_lon = np.full((8, 2), 50.0)
     lat_lon[2:6] = np.nan
@@ -72,7 +72,7 @@ def test_records_without_a_fix_are_a_gap_of_the_position_only():
 
 
 def test_edges_stay_sharp_late_in_a_long_flight():
-    """An hour into a flight a time 10 ms beyond the edge of a gap still lies in the gap."""
+    """An hour into a flight a time 10 ms beyond the edge of a gap is still in the gap."""
     at = track([3600.0, 3601.0, 3700.0, 3701.0]).at(np.array([3601.0, 3601.01]))
     np.testing.assert_array_equal(at.has_fix, [True, False])
 
@@ -84,7 +84,7 @@ def test_ends_hold_for_half_an_interval():
 
 
 def test_one_record_is_known_at_its_time_only():
-    """A single record has no interval and holds at its own time alone."""
+    """A single record has no interval and is valid only at its own time."""
     at = track([3.0], rel_alt_m=[9.0]).at(np.array([2.9, 3.0, 3.1]))
     np.testing.assert_array_equal(at.rel_alt_m, [np.nan, 9.0, np.nan])
 
@@ -137,7 +137,7 @@ def test_shifted_and_select_keep_rows_together():
 
 
 def test_a_column_of_the_wrong_length_is_refused():
-    """A column that does not fit the times is a programming error, said with both shapes."""
+    """A column that does not fit the times raises ValueError with both shapes."""
     with pytest.raises(ValueError, match=r"\(2,\), expected \(3,\)"):
         Telemetry.from_columns(np.arange(3.0), rel_alt_m=np.zeros(2))
 
@@ -161,7 +161,7 @@ def test_photos_seconds_apart_are_no_gaps():
 
 
 def test_a_source_without_any_fix_is_one_gap():
-    """Where no record has a fix, all of it is a gap and there is no rate."""
+    """If no record has a fix, the whole track is a gap and there is no rate."""
     summary = summarize(track(np.arange(5.0), lat_lon_deg=np.full((5, 2), np.nan)))
     assert summary.gaps == ((0.0, 4.0),)
     assert np.isnan(summary.rate_hz)
@@ -175,7 +175,7 @@ def test_coordinate_step_is_read_from_the_decimals():
 
 
 def test_increasing_sorts_and_keeps_the_first_of_equal_times():
-    """Records are put in order; of two with one time the first in the file stays; both are said."""
+    """Records are sorted; of two with the same time the first in the file is kept; both get a note."""
     index, notes = time_order(np.array([2.0, 1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(index, [1, 0, 3])
     assert len(notes) == 2
