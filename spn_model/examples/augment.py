@@ -1,8 +1,8 @@
-"""Views of a training image that the same camera, turned and zoomed, would have had; labels stay exact.
+"""Data augmentation: the camera rotated and zoomed, with exact labels, and photometric changes.
 
-A camera that only turns about its centre sees its old image through a homography, whatever the depth:
-nothing is invented, and each pixel goes on showing the same point of the scene. Pixels are COLMAP's
-throughout: the centre of the upper-left pixel is (0.5, 0.5).
+A camera that only rotates about its centre is related to the original image by a homography, whatever the
+depth: nothing is invented, and each pixel still shows the same scene point. Pixels are COLMAP's throughout:
+the centre of the upper-left pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -14,41 +14,47 @@ import numpy as np
 
 from spn_data.geometry.pose import Poses, rotations_from_vectors
 
-# cv2 counts from the centre of the upper-left pixel.
+# OpenCV's origin is the centre of the upper-left pixel.
 _CV2_FROM_COLMAP = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 _COLMAP_FROM_CV2 = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
 class WarpOptions:
-    """How far virtual cameras differ from the real one."""
+    """Limits of the random rotation and zoom of virtual cameras."""
 
-    tilt_deg: float = 20.0  # largest turn about each of the image's axes, to either side
-    roll_deg: float = 20.0  # and about the optical axis
-    zoom_min: float = 0.45  # focal length against the real one
+    tilt_deg: float = 20.0  # largest rotation about each image axis, in both directions
+    roll_deg: float = 20.0  # largest rotation about the optical axis
+    zoom_min: float = 0.45  # ratio of the virtual to the real focal length
     zoom_max: float = 1.35
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometricOptions:
-    """How far the look of a training image is changed."""
+    """Strength of the photometric augmentation of a training image."""
 
     exposure: float = 0.35  # standard deviation of the log of the gain
-    tint: float = 0.05  # the same of each channel alone
+    tint: float = 0.05  # the same for each channel separately
     gamma: float = 0.2  # standard deviation of the log of the exponent
-    blur_share: float = 0.3  # share of images that are blurred along a line, as by motion
-    blur_max_px: float = 7.0  # longest such line
-    noise: float = 6.0  # largest standard deviation of the noise, of 255
-    occlusion_share: float = 0.3  # share of images with a box of one colour
-    occlusion_max: float = 0.3  # its largest side, as a share of the image's
+    blur_share: float = 0.3  # fraction of images with motion blur
+    blur_max_px: float = 7.0  # largest length of the motion blur
+    noise: float = 6.0  # largest standard deviation of the noise, in grey levels of 255
+    occlusion_share: float = 0.3  # fraction of images with an occluding box of one colour
+    occlusion_max: float = 0.3  # largest side of the box, as a fraction of the image's side
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """A virtual camera at a real one's place.
+    """Virtual camera at the centre of a real one.
 
-    rotation : (3, 3), virtual from real camera; source_matrix, matrix : (3, 3), K of the real and of the
-    virtual image; width, height : of the virtual image.
+    Attributes
+    ----------
+    rotation : ndarray, shape (3, 3)
+        Rotation from the real to the virtual camera.
+    source_matrix, matrix : ndarray, shape (3, 3)
+        Intrinsic matrices K of the real and of the virtual image.
+    width, height : int
+        Size of the virtual image.
     """
 
     rotation: np.ndarray
@@ -59,26 +65,26 @@ class Warp:
 
     @property
     def homography(self) -> np.ndarray:
-        """(3, 3), virtual from real pixels."""
+        """Homography (3, 3) from real to virtual pixels."""
         return self.matrix @ self.rotation @ np.linalg.inv(self.source_matrix)
 
     def pixels(self, pixels: np.ndarray) -> np.ndarray:
-        """Where points that lie at real pixels (N, 2) lie in the virtual image; NaN behind its camera."""
+        """Map pixels (N, 2) of the real image into the virtual one; NaN behind the virtual camera."""
         return _mapped(self.homography, pixels)
 
     def source_pixels(self, pixels: np.ndarray) -> np.ndarray:
-        """The way back: (N, 2) pixels of the real image, whether inside it or not."""
+        """Map virtual pixels (N, 2) back to the real image, whether inside it or not."""
         return _mapped(np.linalg.inv(self.homography), pixels)
 
     def pose(self, pose: Poses) -> Poses:
-        """Of the virtual cameras, from the real ones' (N): the same centres."""
+        """Return the poses of the virtual cameras from the real ones (N); the centres are the same."""
         return Poses.from_rotations(pose.centers, self.rotation @ pose.rotations)
 
     def image(self, image: np.ndarray, fill: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
-        """(height, width, 3) uint8 of the virtual camera, `fill` where the real one (H, W, 3) saw nothing.
+        """Render the virtual image (height, width, 3) from the real one (H, W, 3), both uint8.
 
-        Where the image shrinks to less than 0.7 of its size, it is first reduced by two, so that no pixel
-        is passed over.
+        Pixels outside the real image get the colour `fill`. If the image shrinks to less than 0.7 of its
+        size, it is first reduced by two to avoid aliasing.
         """
         homography = self.homography
         middle = np.array([[self.width / 2, self.height / 2]])
@@ -97,7 +103,7 @@ class Warp:
         )
 
     def _scale_at(self, pixel: np.ndarray) -> float:
-        """Virtual pixels per real one at a virtual pixel (1, 2)."""
+        """Return the number of virtual pixels per real pixel at a virtual pixel (1, 2)."""
         corners = self.source_pixels(pixel + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
         across, down = corners[1:] - corners[0]
         return float(np.abs(across[0] * down[1] - across[1] * down[0]) ** -0.5)
@@ -118,10 +124,27 @@ def random_warp(
     zoom: float | None = None,
     target_size: tuple[int, int] | None = None,
 ) -> Warp:
-    """A virtual camera near a real one of K (3, 3) and size (width, height).
+    """Draw a random virtual camera at the centre of a real one.
 
-    zoom : a fixed one, else drawn evenly in its logarithm; target_size : (width, height) of the virtual
-    image, else the real one's. The principal point keeps its place relative to the image's middle.
+    Parameters
+    ----------
+    generator : np.random.Generator
+        Source of randomness.
+    matrix : ndarray, shape (3, 3)
+        Intrinsic matrix K of the real camera.
+    size : tuple of int
+        Width and height of the real image.
+    options : WarpOptions
+        Limits of rotation and zoom.
+    zoom : float, optional
+        Fixed zoom; by default it is drawn uniformly in its logarithm.
+    target_size : tuple of int, optional
+        Width and height of the virtual image; by default those of the real one.
+
+    Returns
+    -------
+    Warp
+        The principal point keeps its position relative to the image's centre.
     """
     tilt, roll = np.deg2rad([options.tilt_deg, options.roll_deg])
     turn = generator.uniform(-1, 1, 3) * [tilt, tilt, roll]
@@ -138,12 +161,27 @@ def random_warp(
 def augment_photometrically(
     image: np.ndarray, generator: np.random.Generator, options: PhotometricOptions
 ) -> np.ndarray:
-    """The same view (H, W, 3) uint8 in other light, blurred, noisy, partly hidden. A new array."""
+    """Change exposure, colour and sharpness of an image, add noise and occlude a part of it.
+
+    Parameters
+    ----------
+    image : ndarray, uint8, shape (H, W, 3)
+        RGB image; not modified.
+    generator : np.random.Generator
+        Source of randomness.
+    options : PhotometricOptions
+        Strength of the changes.
+
+    Returns
+    -------
+    ndarray, uint8, shape (H, W, 3)
+        A new image of the same view.
+    """
     gain = generator.normal(0.0, options.exposure) + generator.normal(0.0, options.tint, 3)
     gamma = np.exp(generator.normal(0.0, options.gamma))
     levels = np.linspace(0, 1, 256)[:, None] ** gamma * np.exp(gain)
     table = np.rint(np.clip(levels * 255, 0, 255)).astype(np.uint8)
-    # cv2 takes a table for each channel as one pixel's channels.
+    # OpenCV takes one table for each channel as the channels of its entries.
     image = cv2.LUT(image, table[:, None, :])
     if generator.random() < options.blur_share:
         image = _blurred(image, generator, options.blur_max_px)
@@ -157,7 +195,7 @@ def augment_photometrically(
 
 
 def _blurred(image: np.ndarray, generator: np.random.Generator, longest_px: float) -> np.ndarray:
-    """Along a line through each pixel; nothing moves."""
+    """Apply motion blur along a random line; the kernel is centred, so that nothing is displaced."""
     half = generator.uniform(0.5, longest_px / 2)
     angle = generator.uniform(0, np.pi)
     reach = int(np.ceil(half)) + 1

@@ -1,4 +1,4 @@
-"""The view that a network learns from a data set."""
+"""Camera view that a network is trained for, as a data set defines it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from spn_model.onboard.view import View
 
 
 def view_of(dataset: Dataset) -> View:
-    """Return the camera, image size and world of a data set. Raises ValueError without training images."""
+    """Return camera, image size and world of a data set.
+
+    Raises ValueError unless its training images have exactly one size.
+    """
     sizes = {g.image_size for g in dataset.groups.values() if g.role is Role.TRAIN} - {None}
     if len(sizes) != 1:
-        raise ValueError(f"training images are of {len(sizes)} sizes")
+        raise ValueError(f"training images have {len(sizes)} different sizes, one is needed")
     info, size = dataset.info, sizes.pop()
     assert size is not None
     return View(

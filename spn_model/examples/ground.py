@@ -1,4 +1,4 @@
-"""Level ground of a scene: what images from above show, between the few points that a map has of it."""
+"""Level ground of a scene, fitted to the few map points on it, which views from above show."""
 
 from __future__ import annotations
 
@@ -7,20 +7,28 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-_CELL = 0.05  # spreads, side of a cell in plan
-_THICK = 0.01  # spreads, to either side of its height: what still lies on it
-_NEAR = 3  # cells around one with a point on the ground that are ground too
-_BETWEEN = 6  # and so many between such cells
-_SHARE = 0.12  # of all cells, at least: all their points lie low, the lowest on it
-_LARGEST = 2000  # cells along a side: a scene is no larger
+_CELL = 0.05  # side of a cell in plan, in spreads of the scene
+_THICK = 0.01  # tolerance above and below the ground height, in spreads
+_NEAR = 3  # radius in cells that a cell with ground points marks as ground
+_BETWEEN = 6  # radius in cells over which gaps between such cells are closed
+_SHARE = 0.12  # smallest fraction of all occupied cells that are flat and at the ground height
+_LARGEST = 2000  # largest number of cells along a side; a larger scene gets no ground
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A level plane, and where in plan it is ground.
+    """Horizontal plane with a mask of where in plan it is ground.
 
-    height, thick : of the world's z, and how far from it a point still lies on it; near : (rows, columns)
-    bool, of square cells along x and y from `corner` (2,) on.
+    Attributes
+    ----------
+    height, thick : float
+        z of the plane in the world, and the distance within which a point still belongs to it.
+    near : ndarray of bool, shape (rows, columns)
+        Square cells along x and y that are ground.
+    corner : ndarray, shape (2,)
+        x and y of the first cell's corner.
+    cell : float
+        Side of a cell.
     """
 
     height: float
@@ -30,11 +38,24 @@ class Ground:
     cell: float
 
     def is_at_or_below(self, xyz: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) that lie no higher than on it."""
+        """Return which points (N, 3) are on the ground or below it, (N,) bool."""
         return xyz[:, 2] < self.height + self.thick
 
     def intersect(self, center: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """(N,) lengths, in rays (N, 3) of the world, after which they meet it from above; NaN where not."""
+        """Intersect rays from a point above with the ground.
+
+        Parameters
+        ----------
+        center : ndarray, shape (3,)
+            Origin of the rays.
+        rays : ndarray, shape (N, 3)
+            Directions in the world.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Ray parameters of the intersections, in multiples of the directions; NaN without one.
+        """
         rows, columns = self.near.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             length = (self.height - center[2]) / rays[:, 2]
@@ -45,17 +66,25 @@ class Ground:
         return np.where(inside & self.near[y, x], length, np.nan)
 
     def samples(self) -> np.ndarray:
-        """(N, 3) points of it, one a cell."""
+        """Return one point on the ground for each of its cells, (N, 3)."""
         y, x = np.nonzero(self.near)
         plan = (np.column_stack([x, y]) + 0.5) * self.cell + self.corner
         return np.column_stack([plan, np.full(len(plan), self.height)])
 
 
 def fit_level_ground(xyz: np.ndarray, spread: float) -> Ground | None:
-    """The ground of a scene whose z points up, from its map points (N, 3); None where it has no level one.
+    """Fit the level ground of a scene whose z points up, from its map points (N, 3).
 
-    In each cell in plan the lowest point counts, where none lies clearly higher: a facade has points at all
-    heights. The ground is the height at which most of them lie, and a clear share of all cells does.
+    Returns None if the scene has no level ground. Each cell in plan contributes its lowest point, unless it
+    also has clearly higher points: a facade has points at all heights. The ground is the height shared by
+    most of these lowest points, if they make up a sufficient fraction of all cells.
+
+    Parameters
+    ----------
+    xyz : ndarray, shape (N, 3)
+        Map points.
+    spread : float
+        Spread of the scene; all tolerances are fractions of it.
     """
     cell, thick = _CELL * spread, _THICK * spread
     corner = xyz[:, :2].min(axis=0) - (_BETWEEN + 1) * cell

@@ -1,4 +1,4 @@
-"""Rendered images of places where no image was taken, which a training never draws: their poses are exact."""
+"""Rendered novel views that training never draws, for validation; their poses are exact."""
 
 from __future__ import annotations
 
@@ -12,10 +12,18 @@ from spn_data.geometry.pose import Poses
 
 @dataclass(frozen=True, eq=False)
 class HeldOutViews:
-    """Frames to judge a network by, beside those of a data set.
+    """Validation frames rendered from a data set, in addition to its own.
 
-    intrinsics (N, 3, 3) : of `image`'s; small : images (h, w, 3) uint8 RGB, which are `enlarged` times
-    smaller than the data's, as the network sees them.
+    Attributes
+    ----------
+    poses : Poses
+        N exact poses.
+    intrinsics : ndarray, shape (N, 3, 3)
+        Intrinsic matrices K of the images that `image` returns.
+    small : sequence of ndarray, uint8, shape (h, w, 3)
+        RGB images as the network sees them, `enlarged` times smaller than the data set's.
+    enlarged : int
+        Factor between the two sizes.
     """
 
     poses: Poses
@@ -24,5 +32,8 @@ class HeldOutViews:
     enlarged: int
 
     def image(self, row: int) -> np.ndarray:
-        """(H, W, 3) of the data's size: blocks of one colour, which the network reduces to `small`."""
+        """Return an image (H, W, 3) of the data set's size.
+
+        Its pixels are blocks of one colour, which the network reduces to `small` again.
+        """
         return self.small[row].repeat(self.enlarged, axis=0).repeat(self.enlarged, axis=1)

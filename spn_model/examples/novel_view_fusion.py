@@ -1,4 +1,4 @@
-"""Training images from places where no flight was: what several images show, seen by another camera."""
+"""Novel views for training: several images fused into the view of a camera where none was flown."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_cente
 from spn_model.examples.source_images import Occluders, SourceImages, projected
 from spn_model.examples.training_set import TrainingSet
 
-_SOURCES = 16  # images that a view is made of, at most
-_MARGIN_PX = 40.0  # around a view: map points there hold surfaces that reach into it
-_HIDING_PX = 12  # side of the cells in which a map point hides what lies behind it
-_HIDDEN = 1.25  # ratio of depths to the nearest point around, from which a point is hidden
-_BEFORE_PX = 4  # around a map point that lies before the ground, which is not drawn there
-_SAME = (0.9, 1.08)  # ratio of depths of one surface, as a source and as the view has it
-_STRANGE = 2.0  # times by which a colour differs from two others, more than they do from each other
-_STRANGE_LEVELS = 20.0  # and by so many grey levels more
-_ALIKE = 40.0  # grey levels by which two sources of the same ground may differ
-_BLURRED = 0.1  # a source that shows less of a pixel shows nothing
-_GOOD = 0.6  # one that shows so much is enough for a surface that it has too, three for others
-_MOST_REDUCED = 3  # halvings of a source's image, where it is finer than the view
+_SOURCES = 16  # largest number of source images of a view
+_MARGIN_PX = 40.0  # margin around a view: map points there support surfaces that reach into it
+_HIDING_PX = 12  # side of the cells in which a map point occludes points behind it
+_HIDDEN = 1.25  # depth ratio to the nearest point around, above which a point is occluded
+_BEFORE_PX = 4  # radius around a map point in front of the ground where no ground is drawn
+_SAME = (0.9, 1.08)  # depth ratios for which source and view show the same surface
+# A colour is an outlier if it differs from two others this many times more than these differ,
+_STRANGE = 2.0
+_STRANGE_LEVELS = 20.0  # plus so many grey levels.
+_ALIKE = 40.0  # largest difference in grey levels between two sources of the same ground
+_BLURRED = 0.1  # quality below which a source is not used for a pixel
+_GOOD = 0.6  # quality from which one source suffices for a confirmed surface, three for others
+_MOST_REDUCED = 3  # largest number of halvings of a source image finer than the view
 
 
 def fused_view(
@@ -39,13 +40,38 @@ def fused_view(
     fill: tuple[int, int, int],
     options: SurfaceOptions,
 ) -> tuple[np.ndarray, Surface]:
-    """The image (h, w, 3) and the surface, one cell a pixel, that a camera at a pose (1,) would see.
+    """Render image and surface that a camera at a new pose would see, from several training images.
 
-    matrix : its K (3, 3) for images of the data's size, which are made `shrink` times smaller. surface_of :
-    a training image's own, by its row. First the surface: between the map points that the best sources see,
-    and on level ground; then the colour of each of its pixels, from the source that shows it best and has
-    nothing before it. A surface counts where a source has it too. What no source shows is `fill`, and
-    unknown on the surface.
+    First the surface is built, from triangles between the map points that the best sources see and from
+    level ground. Then each of its pixels is coloured from the source that shows it best without an occluder
+    in front. A triangle counts only where a source's own surface contains it too, the ground also where
+    that is unknown and sources agree. Pixels that no source shows get the colour `fill` and are unknown on
+    the surface.
+
+    Parameters
+    ----------
+    data : TrainingSet
+        Training images.
+    sources : SourceImages
+        Which of them can be used, and what they see.
+    surface_of : callable
+        Returns the surface of a training image by its row.
+    pose : Poses
+        One pose, of the new camera.
+    matrix : ndarray, shape (3, 3)
+        Intrinsic matrix K for images of the data set's size.
+    shrink : int
+        Factor by which the rendered view is smaller than the data set's images.
+    fill : tuple of int
+        RGB colour of unknown pixels.
+    options : SurfaceOptions
+        Limits of the triangles.
+
+    Returns
+    -------
+    image : ndarray, uint8, shape (h, w, 3)
+    surface : Surface
+        With one cell for each pixel of the image.
     """
     chosen = sources.best(pose, matrix, data.size, _SOURCES)
     points = _points(data, sources, chosen, pose, matrix)
@@ -62,7 +88,7 @@ def fused_view(
     if ground is not None:
         hypotheses.append((_ground_depth(ground, points, pose, small, data.size, shrink), False))
     for inverse, confirmed in hypotheses:
-        # Its own normals: where two surfaces meet, neither has the other's.
+        # Normals of this hypothesis alone, so that none are mixed where two surfaces meet.
         normals = _normals(inverse, small)
         inverse = np.where(np.isnan(seen.inverse_depth), inverse, np.nan)
         y, x = np.nonzero(np.isfinite(inverse))
@@ -89,12 +115,13 @@ def _painted(
     shrink: int,
     confirmed: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) of points (N, 3) of surfaces with normals (N, 3), and which are shown (N,).
+    """Colour points (N, 3) of surfaces with normals (N, 3); return colours (N, 3) and which are shown (N,).
 
-    confirmed : only where the source's own surface has the point too; else also where it is unknown.
+    If `confirmed`, a point is accepted only if the source's own surface contains it; otherwise also if that
+    is unknown there.
     """
-    toward = xyz - pose.centers[0]
-    distance = np.sqrt(_dot(toward, toward))
+    view_ray = xyz - pose.centers[0]
+    distance = np.sqrt(_dot(view_ray, view_ray))
     values = np.zeros((len(xyz), max(len(chosen), 3)), np.float32)
     colours = np.zeros((len(xyz), max(len(chosen), 3), 3), np.uint8)
     left, good = np.arange(len(xyz)), np.zeros(len(xyz), np.int64)
@@ -113,17 +140,17 @@ def _painted(
         if valid is not None:
             shown &= valid[at[:, 1].astype(np.int64), at[:, 0].astype(np.int64)]
         index, at = index[shown], at[shown]
-        there = xyz[index] - source.centers[0]
-        length = np.sqrt(_dot(there, there))
-        facing = np.abs(_dot(there, normal[index])) / length
-        finer = np.sqrt(facing) * distance[index] / length
-        alike = _dot(there, toward[index]) / (length * distance[index])
-        value = np.minimum(finer, 1) * np.maximum(alike, 0.05)
+        source_ray = xyz[index] - source.centers[0]
+        length = np.sqrt(_dot(source_ray, source_ray))
+        facing = np.abs(_dot(source_ray, normal[index])) / length
+        resolution = np.sqrt(facing) * distance[index] / length
+        alignment = _dot(source_ray, view_ray[index]) / (length * distance[index])
+        value = np.minimum(resolution, 1) * np.maximum(alignment, 0.05)
         take = value > _BLURRED
         if take.any():
             index, at = index[take], at[take]
             values[index, n] = value[take]
-            reduced = shrink * float(np.median(finer[take]))
+            reduced = shrink * float(np.median(resolution[take]))
             colours[index, n] = _colours(data.image(row), at, reduced)
             good[index] += value[take] > _GOOD
             left = left[good[left] < (1 if confirmed else 3)]
@@ -136,12 +163,13 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _agreed(values: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) of colours (N, S, 3) that of the largest value (N, S), unless the two next ones deny it.
+    """Select for each point the colour of the largest value, unless the next two contradict it.
 
-    And (N,) bool: whether another one is like it.
+    Takes values (N, S) and colours (N, S, 3), returns colours (N, 3) and (N,) bool: whether another source
+    has a similar colour.
 
-    What hides a surface from a source without having map points is painted onto it; other sources, which
-    look from elsewhere, are not misled by it.
+    An occluder without map points is painted onto the surface behind it; other sources, which look from
+    elsewhere, do not show it there.
     """
     every = np.arange(len(values))
     best = np.argpartition(-values, 2, axis=1)[:, :3]
@@ -162,7 +190,7 @@ def _agreed(values: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.nda
 def _points(
     data: TrainingSet, sources: SourceImages, chosen: list[int], pose: Poses, matrix: np.ndarray
 ) -> FramePoints:
-    """Map points of the chosen sources that a camera would see, in and around its image."""
+    """Return the map points of the chosen sources that a camera would see, in and around its image."""
     points = [data.points(int(sources.rows[k])) for k in chosen]
     xyz, ids = np.empty((0, 3)), np.empty(0, np.int64)
     if points:
@@ -181,7 +209,7 @@ def _ground_depth(
     size: tuple[int, int],
     shrink: int,
 ) -> np.ndarray:
-    """(h, w) float32 inverse depth of the ground, as a small image of K `small` sees it."""
+    """Return the inverse depth (h, w) float32 of the ground in a small image whose K is `small`."""
     columns, rows = (side // shrink for side in size)
     pixels = cell_centers(columns, rows, 0.5, 1.0)
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(small).T
@@ -199,7 +227,7 @@ def _ground_depth(
 
 
 def _hidden(at: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(N,) bool: points at pixels (N, 2) with another one near them in the image and clearly before them."""
+    """Return which points at pixels (N, 2) are occluded by a clearly nearer one around them, (N,) bool."""
     cell = np.floor((at + _MARGIN_PX) / _HIDING_PX).astype(np.int64)
     columns, rows = (int(side + 2 * _MARGIN_PX) // _HIDING_PX + 1 for side in size)
     nearest = np.full(rows * columns, 1e30, np.float32)
@@ -210,7 +238,7 @@ def _hidden(at: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> np.ndar
 
 
 def _normals(inverse: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """(h, w, 3) normals of length 1 in the camera; along the ray where it is not known on both sides."""
+    """Return unit normals (h, w, 3) in the camera; along the ray where neighbours are unknown."""
     rows, columns = inverse.shape
     rays = np.concatenate([cell_centers(columns, rows, 0.5, 1.0), np.ones((rows * columns, 1))], 1)
     rays = (rays @ np.linalg.inv(matrix).T).reshape(rows, columns, 3)
@@ -223,12 +251,12 @@ def _normals(inverse: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def _colours(image: np.ndarray, at: np.ndarray, finer: float) -> np.ndarray:
-    """(N, 3) of an image at its pixels (N, 2); first reduced where it is finer than what is made of it."""
+    """Sample colours (N, 3) at pixels (N, 2) of an image, first halved while it is finer."""
     by = 2 ** int(np.clip(np.round(np.log2(finer)), 0, _MOST_REDUCED))
     if by > 1:
         size = (image.shape[1] // by, image.shape[0] // by)
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # cv2 counts from the centre of the upper-left pixel, and takes maps of less than 32767 rows.
+    # OpenCV's origin is the centre of the upper-left pixel, and maps need fewer than 32767 rows.
     maps = (at / by - 0.5).astype(np.float32)
     side = int(np.ceil(np.sqrt(len(maps))))
     maps = np.resize(maps, (side, side, 2))

@@ -1,4 +1,4 @@
-"""Places where no flight was, and a training image moved there along with the surface that it shows."""
+"""Poses where none was flown, and training images warped there together with their surfaces."""
 
 from __future__ import annotations
 
@@ -10,37 +10,56 @@ import numpy as np
 from spn_data.geometry.pose import Poses, rotations_from_vectors
 from spn_model.examples.point_targets import Surface, cell_centers
 
-_NEAREST = 0.5  # depth, in metres, before which nothing is drawn
+_NEAREST = 0.5  # near clipping depth, in metres
 _STEEP_DEG = (
     30.0,
     90.0,
-)  # below level that a high view looks: places beside training images show the rest
-_PITCH_DEG = 5.0  # around a drawn pitch: places that are looked at alike
-_SAME_SURFACE = 1.05  # ratio of depths up to which two samples of a pixel are mixed
-_SEAM_PX = 6.0  # by more, what neighbouring cells show lies on different surfaces
+)  # range of pitches below the horizon of overhead views; nearby views cover the rest
+_PITCH_DEG = 5.0  # tolerance around a drawn pitch within which scene points are eligible
+_SAME_SURFACE = 1.05  # largest depth ratio of two samples of a pixel that are blended
+_SEAM_PX = 6.0  # neighbouring cells whose source pixels differ by more are on different surfaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class NovelViewOptions:
-    """Where virtual cameras stand, against the real one."""
+    """Range of the poses of virtual cameras relative to the real one."""
 
-    rise_m: float = 11.0  # largest, evenly from 0
-    side_m: float = 4.0  # largest level move along each axis, to either side
-    height_m: float = 13.0  # of a high place above the highest training image, at most
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, of length 1
+    rise_m: float = 11.0  # largest rise, drawn uniformly from 0
+    side_m: float = 4.0  # largest horizontal shift along each axis, in both directions
+    height_m: float = 13.0  # largest height of an overhead view above the highest training image
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit vector in the world
 
 
 def nearby_pose(generator: np.random.Generator, seen: Surface, options: NovelViewOptions) -> Poses:
-    """(1,) pose of a camera that rose and moved, and turned the shortest way to keep its view in sight.
+    """Draw a pose above and to the side of a training image that keeps its view in sight.
 
-    Raises ValueError where nothing of the surface is known.
+    The camera rises, shifts and then rotates by the smallest angle.
+
+    Parameters
+    ----------
+    generator : np.random.Generator
+        Source of randomness.
+    seen : Surface
+        Surface that the training image shows.
+    options : NovelViewOptions
+        Range of the shifts.
+
+    Returns
+    -------
+    Poses
+        One pose.
+
+    Raises
+    ------
+    ValueError
+        If no part of the surface is known.
     """
     xyz = seen.xyz(_pixels(seen))
     xyz = xyz[np.isfinite(xyz[:, 0])]
     if not len(xyz):
-        raise ValueError("nothing is known of what the image shows")
+        raise ValueError("the surface that the image shows is unknown")
     center, rotation = seen.pose.centers[0], seen.pose.rotations[0]
-    # The sky and distant hills would draw the view away from the scene.
+    # Without this limit, the sky and distant hills would pull the view away from the scene.
     depth = (xyz - center) @ rotation[2]
     aim = np.median(xyz[depth < 3 * np.median(depth)], axis=0)
     up = np.array(options.up)
@@ -60,12 +79,32 @@ def overhead_pose(
     scene: np.ndarray,
     options: NovelViewOptions,
 ) -> Poses:
-    """(1,) pose of a level camera above the scene, which looks down at one of its places (P, 3).
+    """Draw a pose of a level camera above the scene, looking down at one of its points.
 
-    It stands beside one of the training images' centers (N, 3), as high as half of them at least, and looks
-    down by 30 degrees as often as straight down or anything between, as far as the scene has places there.
-    z is up.
-    Raises ValueError where nothing of the scene lies below.
+    The camera is near one of the training images and at least as high as half of them. Its pitch is drawn
+    uniformly from 30 degrees below the horizon to straight down, as far as the scene has points in that
+    direction. z is up.
+
+    Parameters
+    ----------
+    generator : np.random.Generator
+        Source of randomness.
+    centers : ndarray, shape (N, 3)
+        Camera centres of the training images.
+    scene : ndarray, shape (P, 3)
+        Points of the scene.
+    options : NovelViewOptions
+        Range of the shifts.
+
+    Returns
+    -------
+    Poses
+        One pose.
+
+    Raises
+    ------
+    ValueError
+        If no part of the scene is below the drawn position.
     """
     center = centers[generator.integers(len(centers))].copy()
     center[:2] += generator.uniform(-1, 1, 2) * options.side_m
@@ -74,13 +113,13 @@ def overhead_pose(
     toward = scene - center
     toward = toward[toward[:, 2] < 0]
     if not len(toward):
-        raise ValueError("nothing of the scene lies below its training images")
+        raise ValueError("no part of the scene is below its training images")
     pitch = np.degrees(np.arctan2(-toward[:, 2], np.hypot(toward[:, 0], toward[:, 1])))
     off = np.abs(pitch - generator.uniform(*_STEEP_DEG))
     toward = toward[off <= max(_PITCH_DEG, off.min())]
     forward = toward[generator.integers(len(toward))]
     forward = forward / np.linalg.norm(forward)
-    # Straight down there is no level direction to the right but by chance.
+    # Looking straight down, the heading is undetermined: use a random one.
     azimuth = generator.uniform(0, 2 * np.pi)
     level = np.hypot(forward[0], forward[1])
     if level > 1e-6:
@@ -93,10 +132,26 @@ def overhead_pose(
 def warp_to_pose(
     image: np.ndarray, seen: Surface, pose: Poses, fill: tuple[int, int, int]
 ) -> tuple[np.ndarray, Surface]:
-    """The image (H, W, 3) and the surface as a camera of the same K at another pose (1,) would see them.
+    """Render image and surface as a camera with the same K would see them at another pose.
 
-    What the image does not show is `fill`, and unknown on the surface. Samples are drawn in the order of
-    their depth on the surface's own grid; colours then come from the image at its full resolution.
+    Samples are splatted in depth order on the surface's own grid; colours are then taken from the image at
+    its full resolution. What the image does not show gets the colour `fill` and is unknown on the surface.
+
+    Parameters
+    ----------
+    image : ndarray, uint8, shape (H, W, 3)
+        Training image.
+    seen : Surface
+        Surface that it shows.
+    pose : Poses
+        One pose, of the new camera.
+    fill : tuple of int
+        RGB colour of unknown pixels.
+
+    Returns
+    -------
+    image : ndarray, uint8, shape (H, W, 3)
+    surface : Surface
     """
     step, (rows, columns) = seen.step_px, seen.inverse_depth.shape
     source = _pixels(seen)
@@ -124,7 +179,7 @@ def _pixels(seen: Surface) -> np.ndarray:
 
 
 def _within(at: np.ndarray, low: int, columns: int, rows: int) -> np.ndarray:
-    """(N,) bool: places (N, 2) above `low` and below the grid's size; axis by axis, for it is done often."""
+    """Return which positions (N, 2) are above `low` and below the grid's size; by axis, for speed."""
     x, y = at[:, 0], at[:, 1]
     return (x > low) & (x < columns) & (y > low) & (y < rows)
 
@@ -132,9 +187,10 @@ def _within(at: np.ndarray, low: int, columns: int, rows: int) -> np.ndarray:
 def _splat(
     at: np.ndarray, depth: np.ndarray, values: np.ndarray, columns: int, rows: int
 ) -> np.ndarray:
-    """(rows * columns, V + 1) sums of values (N, V) and of weights, of the nearest surface at each cell.
+    """Splat samples onto a grid; return sums (rows * columns, V + 1) of values (N, V) and of weights.
 
-    Each sample goes to the four cells around its place `at` (N, 2), by bilinear weights.
+    Each sample goes to the four cells around its position `at` (N, 2) with bilinear weights; only samples
+    of the nearest surface at a cell count.
     """
     corner = np.floor(at)
     targets = []
@@ -160,7 +216,7 @@ def _splat(
 def _colours(
     image: np.ndarray, source: np.ndarray, shown: np.ndarray, fill: tuple[int, int, int]
 ) -> np.ndarray:
-    """(H, W, 3) from the image at source pixels (h, w, 2), smooth within a surface, hard at its edge."""
+    """Sample the image at source pixels (h, w, 2), interpolated within a surface, nearest at its edges."""
     size = (image.shape[1], image.shape[0])
     source = source.astype(np.float32)
     near = cv2.resize(source, size, interpolation=cv2.INTER_NEAREST)
@@ -169,7 +225,7 @@ def _colours(
     inner = cv2.resize(inner, size, interpolation=cv2.INTER_NEAREST) != 0
     apart = np.abs(smooth - near)
     inner &= (apart[..., 0] < _SEAM_PX) & (apart[..., 1] < _SEAM_PX)
-    # cv2 counts from the centre of the upper-left pixel.
+    # OpenCV's origin is the centre of the upper-left pixel.
     maps = np.where(inner[..., None], smooth, near) - np.float32(0.5)
     moved = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     moved[cv2.resize(shown.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0] = fill

@@ -1,4 +1,4 @@
-"""What a scene-coordinate network learns from: for each cell of an image, the map's surface that it shows."""
+"""Targets of a scene-coordinate network: for each cell of an image the map surface that it shows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spn_data.geometry.pose import Poses
 
 
 def cell_centers(columns: int, rows: int, first_px: float, stride_px: float) -> np.ndarray:
-    """(rows * columns, 2) pixels of the cells' centres, row by row."""
+    """Return the pixels of the cell centres, (rows * columns, 2), row by row."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     return np.stack([x, y], axis=-1).reshape(-1, 2) * stride_px + first_px
 
@@ -25,10 +25,25 @@ def cell_targets(
     first_px: float,
     stride_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each cell the map point that lies nearest to its centre: targets (3, h, w) float32, known (h, w).
+    """Return for each cell the map point nearest to its centre.
 
-    pixels (N, 2) : of points xyz (N, 3), NaN where not in view; grid : (columns, rows). A target is 0 where
-    no point falls into the cell.
+    Parameters
+    ----------
+    pixels : ndarray, shape (N, 2)
+        Pixels of the points; NaN if not in view.
+    xyz : ndarray, shape (N, 3)
+        Points.
+    grid : tuple of int
+        Columns and rows.
+    first_px, stride_px : float
+        Centre of the first cell, and distance between cells.
+
+    Returns
+    -------
+    targets : ndarray, float32, shape (3, h, w)
+        0 if no point falls into the cell.
+    known : ndarray of bool, shape (h, w)
+        Cells with a point.
     """
     columns, rows = grid
     at = (pixels - first_px) / stride_px
@@ -36,7 +51,7 @@ def cell_targets(
     inside = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1)
     off = np.abs(at[inside] - cell[inside]).max(axis=1)
     index = cell[inside].astype(np.int64) @ [1, columns]
-    # Of several writes to one cell the last stays.
+    # If several points fall into one cell, the last one written wins: the nearest to its centre.
     order = np.argsort(-off, kind="stable")
     targets = np.zeros((rows * columns, 3), np.float32)
     known = np.zeros(rows * columns, bool)
@@ -47,21 +62,29 @@ def cell_targets(
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceOptions:
-    """Which gaps between map points are taken for one surface."""
+    """Limits of triangles between map points that count as one surface."""
 
-    longest_px: float = 48.0  # side of a triangle of neighbouring points
-    depth_ratio: float = 1.35  # of its farthest to its nearest corner
-    ground_px: float = 96.0  # the same of a level triangle: the ground is seen at a flat angle
-    level_m: float = 0.2  # largest difference in height of its corners; 0 where up is not known
-    step_px: int = 2  # of the grid on which surfaces are stored
+    longest_px: float = 48.0  # longest side of a triangle of neighbouring points
+    depth_ratio: float = 1.35  # largest depth ratio of its farthest to its nearest vertex
+    ground_px: float = 96.0  # longest side of a level triangle: ground is seen at grazing angles
+    level_m: float = 0.2  # largest height difference of a level triangle; 0 if up is unknown
+    step_px: int = 2  # step of the grid on which surfaces are stored
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What one image shows between its map points.
+    """Surface that an image shows, interpolated between its map points.
 
-    inverse_depth : (h, w) float32 per metre along the optical axis, at pixels (step/2 + k step), NaN where
-    unknown; pose : (1,); matrix : (3, 3), K.
+    Attributes
+    ----------
+    inverse_depth : ndarray, float32, shape (h, w)
+        Inverse depth in 1/m along the optical axis, at pixels (step/2 + k step); NaN if unknown.
+    step_px : int
+        Step of the grid.
+    pose : Poses
+        One pose, of the image.
+    matrix : ndarray, shape (3, 3)
+        Intrinsic matrix K.
     """
 
     inverse_depth: np.ndarray
@@ -70,7 +93,7 @@ class Surface:
     matrix: np.ndarray
 
     def at(self, pixels: np.ndarray) -> np.ndarray:
-        """(N,) inverse depth at pixels (N, 2); NaN outside and where it is unknown."""
+        """Return the inverse depth (N,) at pixels (N, 2); NaN outside the image and where unknown."""
         rows, columns = self.inverse_depth.shape
         with np.errstate(invalid="ignore"):
             cell = np.floor(pixels / self.step_px)
@@ -80,7 +103,7 @@ class Surface:
         return np.where(inside, self.inverse_depth[y, x], np.nan)
 
     def xyz(self, pixels: np.ndarray) -> np.ndarray:
-        """(N, 3) points of the world that pixels (N, 2) show; NaN outside and where it is unknown."""
+        """Return the world points (N, 3) at pixels (N, 2); NaN outside the image and where unknown."""
         inverse = self.at(pixels)
         rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
         rays = rays @ np.linalg.inv(self.matrix).T
@@ -94,10 +117,30 @@ def surface(
     size: tuple[int, int],
     options: SurfaceOptions,
 ) -> Surface:
-    """Triangles between the map points that an image of size (width, height) sees.
+    """Interpolate the surface that an image shows, from triangles between its map points.
 
-    Inverse depth is linear in the pixels of a plane: on flat ground and facades it is exact. Triangles that
-    are long or bridge a jump in depth are left out; without three points there is no surface.
+    Parameters
+    ----------
+    points : FramePoints
+        Map points that the image sees.
+    pose : Poses
+        One pose, of the image.
+    matrix : ndarray, shape (3, 3)
+        Intrinsic matrix K.
+    size : tuple of int
+        Width and height of the image.
+    options : SurfaceOptions
+        Limits of the triangles.
+
+    Returns
+    -------
+    Surface
+
+    Notes
+    -----
+    Inverse depth is linear in the pixels of a plane, so that the surface is exact on flat ground and
+    facades. Triangles that are long or bridge a depth discontinuity are left out; with fewer than three
+    points there is no surface.
     """
     width, height = size
     columns, rows = width // options.step_px, height // options.step_px
@@ -107,7 +150,7 @@ def surface(
     corners, values = points.pixels[ahead].astype(np.float64), 1 / depth[ahead]
     try:
         mesh = Delaunay(corners)
-    except (QhullError, ValueError):  # fewer than three, or all on one line
+    except (QhullError, ValueError):  # fewer than three points, or all collinear
         return Surface(
             inverse.reshape(rows, columns).astype(np.float32), options.step_px, pose, matrix
         )

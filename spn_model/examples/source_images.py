@@ -1,4 +1,4 @@
-"""Which training images show best what a camera at another place would see."""
+"""Selection of the training images that best show what a camera at a new pose would see."""
 
 from __future__ import annotations
 
@@ -11,22 +11,30 @@ from spn_data.geometry.pose import Poses
 from spn_model.examples.ground import Ground, fit_level_ground
 from spn_model.examples.training_set import TrainingSet
 
-_MOST_IMAGES = 600  # that views are made of; neighbouring frames of a video show the same
-_VOXEL = 0.05  # spreads, side of what counts as one place of the scene
-_FINE = 0.005  # spreads, between map points that hide what lies behind them
-_APART = 0.05  # spreads, between sources of one view that look the same way
-_SAME_WAY = 0.9  # cosine between their axes
-_OCCLUDER_PX = 6  # in a source a map point hides what lies behind it, so far around it at least
-_CLEARLY = 0.93  # ratio of depths below which a point lies before another
-_NEAREST = 0.1  # depth, in metres, before which nothing is seen
-_GRID = (16, 9)  # parts of a view that count alike
-_SEEN = 0.6  # by which a place is done with once a source shows it: others are to confirm it
-_WORTH = 0.005  # share of a view that one source more has to add
+_MOST_IMAGES = 600  # largest number of source images; neighbouring video frames show the same
+_VOXEL = 0.05  # side of a voxel that counts as one scene sample, in spreads of the scene
+_FINE = 0.005  # grid on which occluding map points are thinned, in spreads
+_APART = 0.05  # smallest distance between sources of one view with the same direction, in spreads
+_SAME_WAY = 0.9  # cosine between optical axes from which two directions count as the same
+_OCCLUDER_PX = 6  # cell size in a source: a map point occludes at least this far around it
+_CLEARLY = 0.93  # depth ratio below which a point is in front of another
+_NEAREST = 0.1  # near clipping depth, in metres
+_GRID = (16, 9)  # parts of a view, which are weighted equally
+_SEEN = 0.6  # loss of a sample's weight once a source shows it; the rest asks for confirmation
+_WORTH = 0.005  # smallest fraction of a view that another source must add
 
 
 @dataclass(frozen=True, eq=False)
 class Occluders:
-    """Depths (rows, columns) of the nearest map points around cells of one image, of cell_px."""
+    """Depth map of the nearest map points of one image.
+
+    Attributes
+    ----------
+    depth : ndarray, shape (rows, columns)
+        Smallest depth around each cell.
+    cell_px : int
+        Side of a cell.
+    """
 
     depth: np.ndarray
     cell_px: int
@@ -35,7 +43,7 @@ class Occluders:
     def from_points(
         cls, pixels: np.ndarray, depth: np.ndarray, size: tuple[int, int], cell_px: int
     ) -> Occluders:
-        """From points at pixels (N, 2) of an image of a size, at depths (N,); each counts for 3 x 3 cells."""
+        """Build the map from points at pixels (N, 2) with depths (N,); each point covers 3 x 3 cells."""
         columns, rows = (-(-side // cell_px) for side in size)
         cell = np.floor(pixels / cell_px).astype(np.int64)
         inside = (cell >= 0).all(axis=1) & (cell < [columns, rows]).all(axis=1) & (depth > 0)
@@ -45,7 +53,7 @@ class Occluders:
         return cls(cv2.erode(nearest.reshape(rows, columns), np.ones((3, 3), np.uint8)), cell_px)
 
     def hide(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether what lies at pixels (N, 2) of the image, at depths (N,), has one before it."""
+        """Return which points at pixels (N, 2) and depths (N,) have an occluder in front, (N,) bool."""
         x, y = (pixels / self.cell_px).astype(np.int64).T
         return self.depth[y, x] < _CLEARLY * depth
 
@@ -53,8 +61,8 @@ class Occluders:
 def projected(
     xyz: np.ndarray, pose: Poses, matrix: np.ndarray, size: tuple[int, int], margin: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (K,) of the points (N, 3) that lie in an image, with their pixels (K, 2) and depths (K,)."""
-    # Row by row of the matrix: this is done for every pixel of a view and every source.
+    """Project points (N, 3); return indices (K,), pixels (K, 2) and depths (K,) of those in the image."""
+    # Compute by coordinates, for speed: this runs for every pixel of a view and every source.
     x, y, depth = (matrix @ pose.rotations[0]) @ (xyz - pose.centers[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = x / depth, y / depth
@@ -65,10 +73,20 @@ def projected(
 
 
 class SourceImages:
-    """Training images as sources of views.
+    """Training images from which novel views are rendered, and what they see.
 
-    rows (S,) : which images; ground : None where there is none, or up is not known; occluders : of each
-    source; samples (P, 3) : places of the scene, of which is known who sees them, and how well.
+    Attributes
+    ----------
+    rows : ndarray, shape (S,)
+        Rows of the images in the training set.
+    centers : ndarray, shape (S, 3)
+        Their camera centres.
+    ground : Ground or None
+        Level ground; None if there is none or up is unknown.
+    occluders : list of Occluders
+        One for each source.
+    samples : ndarray, shape (P, 3)
+        Sample points of the scene, for which it is known which sources see them and how well.
     """
 
     def __init__(self, data: TrainingSet, center: np.ndarray, spread: float, far: float):
@@ -86,7 +104,7 @@ class SourceImages:
         self._axes = data.poses.rotations[self.rows, 2]
         self._apart = _APART * spread
         self.occluders = self._all_occluders(data, xyz, _FINE * spread)
-        # Places of the scene: one for each voxel with map points, and for each cell of the ground.
+        # Samples of the scene: one for each voxel with map points and one for each cell of the ground.
         voxel = np.floor((xyz - center) / (_VOXEL * spread)).astype(np.int64)
         _, first, place = np.unique(
             voxel @ np.array([1, 1 << 20, 1 << 40]), return_index=True, return_inverse=True
@@ -102,9 +120,9 @@ class SourceImages:
         self._toward = (toward / distance[:, None]).astype(np.float32)
 
     def _all_occluders(self, data: TrainingSet, xyz: np.ndarray, step: float) -> list[Occluders]:
-        """Of all sources, from all map points (N, 3): one image has few on what is smooth."""
+        """Return the occluders of all sources from all map points: one image has few on smooth surfaces."""
         hiding = np.unique(np.round(xyz / step).astype(np.int64), axis=0) * step
-        # The ground hides nothing, and at a flat angle its nearer parts lie close below the farther ones.
+        # The ground occludes nothing, and at grazing angles its near parts project close below its far ones.
         if self.ground is not None:
             hiding = hiding[~self.ground.is_at_or_below(hiding)]
         made = []
@@ -115,7 +133,7 @@ class SourceImages:
         return made
 
     def _see_ground(self, data: TrainingSet, ground: Ground) -> np.ndarray:
-        """Adds the ground's cells to what the sources see; the sines of the angles at which they do."""
+        """Add the ground's cells to the samples that sources see; return the sines of the viewing angles."""
         cells = ground.samples()
         sources, places, sines = [self._source], [self._place], [np.empty(0)]
         for k, row in enumerate(self.rows):
@@ -131,9 +149,26 @@ class SourceImages:
         return np.concatenate(sines)
 
     def best(self, pose: Poses, matrix: np.ndarray, size: tuple[int, int], count: int) -> list[int]:
-        """Up to `count` indices of sources, which together show most of what a camera would see.
+        """Select up to `count` sources that together show most of what a camera would see.
 
-        Each part of the view counts alike; a source by how finely it shows it, and from how like a direction.
+        All parts of the view have equal weight; a source is rated by its resolution of a sample and by the
+        similarity of its viewing direction.
+
+        Parameters
+        ----------
+        pose : Poses
+            One pose, of the camera.
+        matrix : ndarray, shape (3, 3)
+            Intrinsic matrix K.
+        size : tuple of int
+            Width and height of the image.
+        count : int
+            Largest number of sources.
+
+        Returns
+        -------
+        list of int
+            Indices into `rows`.
         """
         index, pixels, _ = projected(self.samples, pose, matrix, size)
         if not len(index):
@@ -159,7 +194,7 @@ class SourceImages:
             if total[best] < _WORTH:
                 break
             chosen.append(best)
-            # Neighbouring frames are misled by the same things: they confirm nothing.
+            # Neighbouring frames share the same errors, so that they do not confirm each other.
             near = np.linalg.norm(self.centers - self.centers[best], axis=1) < self._apart
             taken |= near & (self._axes @ self._axes[best] > _SAME_WAY)
             mine = source == best

@@ -1,4 +1,4 @@
-"""The images and labels of groups of dataset.h5, at hand for training."""
+"""Images and labels of groups of dataset.h5, kept in memory for training."""
 
 from __future__ import annotations
 
@@ -9,16 +9,41 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 
-MEMORY_BYTES = 2_000_000_000  # of decoded images that are kept
+MEMORY_BYTES = 2_000_000_000  # largest size of the decoded images kept in memory
 
 
 class TrainingSet:
-    """Groups of role "train", and of role "validation" where these are learnt too, one after the other: rows
-    k, images of one size, exact poses, map points.
+    """Training frames of one or more groups, concatenated: images of one size, exact poses and map points.
 
-    poses : N; intrinsics : (N, 3, 3); size : (width, height); up_is_known : z points up. Images are kept in
-    memory as far as memory_bytes reaches, and read from the file beyond it. Raises InputError where nothing
-    can be trained on.
+    Groups have the role "train", or "validation" if these frames are trained on too. Images are kept in
+    memory up to `memory_bytes` and read from the file beyond it.
+
+    Parameters
+    ----------
+    *groups : DatasetGroup
+        Groups to concatenate.
+    memory_bytes : int
+        Largest size of the images kept in memory.
+    up_is_known : bool
+        Whether z points up in the world.
+
+    Attributes
+    ----------
+    poses : Poses
+        N poses.
+    intrinsics : ndarray, shape (N, 3, 3)
+        Intrinsic matrices K.
+    size : tuple of int
+        Width and height of the images.
+    up_is_known : bool
+        Whether z points up in the world.
+    has_points : bool
+        Whether map points are available for training.
+
+    Raises
+    ------
+    InputError
+        If a group is empty, has no images, or the image sizes differ.
     """
 
     def __init__(
@@ -36,8 +61,8 @@ class TrainingSet:
                 )
             if group.image_size != groups[0].image_size:
                 raise InputError(
-                    f"images of {group.name} are of another size than those of {groups[0].name}: both "
-                    "cannot be trained on together"
+                    f"images of {group.name} and {groups[0].name} have different sizes: they cannot be "
+                    "trained on together"
                 )
         self._rows = [(group, k) for group in groups for k in range(len(group))]
         self.up_is_known = up_is_known
@@ -57,23 +82,23 @@ class TrainingSet:
         return len(self._rows)
 
     def image(self, row: int) -> np.ndarray:
-        """(H, W, 3) uint8 RGB; not to be written to."""
+        """Return an image (H, W, 3) uint8 RGB, which must not be modified."""
         if row < len(self._images):
             return self._images[row]
         group, k = self._rows[row]
         return group.image(k)
 
     def valid(self, row: int) -> np.ndarray | None:
-        """(H, W) bool: pixels that show the scene; None where all of them do."""
+        """Return a mask (H, W) bool of pixels that show the scene; None if all of them do."""
         return None if self._valid is None else self._valid[row]
 
     def points(self, row: int) -> FramePoints:
-        """Map points that the image sees. Raises InputError where the data set has none to learn from."""
+        """Return the map points that an image sees. Raises InputError if there are none for training."""
         if not self.has_points:
-            raise InputError("the data set holds no points for training")
+            raise InputError("the data set has no map points for training")
         return self._points[row]
 
 
 def _points_to_train_on(group: DatasetGroup, row: int) -> FramePoints:
-    """Of validation frames all points: they were made of images that are learnt with them."""
+    """Return the points to train on: all points of a validation frame, whose images are used too."""
     return group.points(row) if group.role is Role.VALIDATION else group.training_points(row)

@@ -1,0 +1,1 @@
+"""Pose models: each kind of network with its training examples, loss and decoding, and checkpoints."""

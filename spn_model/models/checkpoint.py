@@ -1,4 +1,4 @@
-"""A trained network in one file: weights, what makes them a member, and the world that it tells poses in."""
+"""Checkpoints: a trained pose model in one file, with its weights, options, camera view and world."""
 
 from __future__ import annotations
 
@@ -23,12 +23,22 @@ from spn_model.onboard.view import View
 FORMAT = "squeezeposenet-checkpoint"
 VERSION = 1
 _MAX_BYTES = 8 * 10**9
-_MAX_DOCUMENT = 2_000_000  # characters of JSON
+_MAX_DOCUMENT = 2_000_000  # largest length of the JSON document, in characters
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A member with its weights, in eval mode; what it sees; facts of its training, plain values."""
+    """Pose model read from a file.
+
+    Attributes
+    ----------
+    model : PoseModel
+        With its weights, in eval mode.
+    view : View
+        Camera and world that it was trained for.
+    facts : dict
+        Facts of its training, as plain values.
+    """
 
     model: PoseModel
     view: View
@@ -36,7 +46,7 @@ class Checkpoint:
 
 
 def save(path: Path, model: PoseModel, view: View, facts: Mapping[str, Any]) -> None:
-    """Write whole, in place of what stood there. Raises StageError where the disk does not take it."""
+    """Write a checkpoint atomically, replacing an existing one. Raises StageError if it cannot be written."""
     document = {
         "kind": model.kind,
         "options": model.options,
@@ -47,49 +57,97 @@ def save(path: Path, model: PoseModel, view: View, facts: Mapping[str, Any]) -> 
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
-    """Raises InputError where there is no such file, FormatError where it is no checkpoint, one of a newer
-    version, damaged, or does not hold what its own network needs."""
+    """Read a checkpoint.
+
+    Parameters
+    ----------
+    path : Path
+        File written by `save`.
+    device : str or torch.device
+        Device to put the network on.
+
+    Returns
+    -------
+    Checkpoint
+
+    Raises
+    ------
+    InputError
+        If the file does not exist.
+    FormatError
+        If it is not a checkpoint, is of another version, is damaged, or its tensors do not match its
+        network.
+    """
     tensors, document = read_tensors(path, FORMAT)
     try:
         kind, options, facts = document["kind"], document["options"], document["facts"]
         view = View.from_json(document["view"])
         if not (isinstance(kind, str) and isinstance(options, dict) and isinstance(facts, dict)):
-            raise TypeError("kind, options or facts are not what is written there")
+            raise TypeError("kind, options or facts have a wrong type")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FormatError(f"{path}: is a damaged checkpoint ({error!r})") from error
+        raise FormatError(f"{path}: damaged checkpoint ({error!r})") from error
     try:
         model = make(kind, options)
     except InputError as error:
-        raise FormatError(f"{path}: this program cannot make its network: {error}") from error
+        raise FormatError(f"{path}: this version cannot build its network: {error}") from error
     set_state(model.network, tensors, path)
     model.network.to(device).eval()
     return Checkpoint(model, view, facts)
 
 
 def set_state(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Load a whole state. Raises FormatError, before anything is changed, where it is another network's."""
+    """Load a complete state into a network.
+
+    Parameters
+    ----------
+    network : nn.Module
+        Network to load into.
+    tensors : mapping of str to Tensor
+        Its parameters and buffers by name.
+    path : Path
+        File they come from, for messages.
+
+    Raises
+    ------
+    FormatError
+        If the tensors belong to another network; nothing is changed then.
+    """
     own = network.state_dict()
     for name, target in own.items():
         if name not in tensors:
-            raise FormatError(f"{path}: is of another network: it holds no {name!r}")
-        found = tensors[name]
-        if found.shape != target.shape or found.dtype != target.dtype:
+            raise FormatError(f"{path}: belongs to another network: {name!r} is missing")
+        tensor = tensors[name]
+        if tensor.shape != target.shape or tensor.dtype != target.dtype:
             raise FormatError(
-                f"{path}: is of another network: {name!r} is {_kind_of(found)}, "
-                f"{_kind_of(target)} is needed"
+                f"{path}: belongs to another network: {name!r} is {_shape_and_type(tensor)}, "
+                f"needs to be {_shape_and_type(target)}"
             )
     foreign = [name for name in tensors if name not in own]
     if foreign:
-        raise FormatError(f"{path}: is of another network, which has {foreign[0]!r}")
+        raise FormatError(f"{path}: belongs to another network: unexpected {foreign[0]!r}")
     network.load_state_dict(dict(tensors))
 
 
 def write_tensors(
     path: Path, form: str, tensors: Mapping[str, Tensor], document: Mapping[str, Any]
 ) -> None:
-    """A safetensors file with a JSON document in its header; see `atomic_writer`.
+    """Write a safetensors file atomically, with a JSON document in its header.
 
-    Numbers of the document that are not finite are written as null.
+    Parameters
+    ----------
+    path : Path
+        File to write; its folder is created.
+    form : str
+        Name of the format.
+    tensors : mapping of str to Tensor
+        Tensors by name.
+    document : mapping
+        Plain values; numbers that are not finite are written as null.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be written.
     """
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     text = json.dumps(finite(document), sort_keys=True, allow_nan=False)
@@ -100,40 +158,56 @@ def write_tensors(
 
 
 def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `write_tensors` wrote in this format.
+    """Read tensors and document from a file that `write_tensors` wrote.
 
-    Raises InputError where there is no such file, FormatError where it is another, of a newer version,
-    damaged, or holds weights that are not finite.
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    form : str
+        Name of the format that it needs to have.
+
+    Returns
+    -------
+    tensors : dict of str to Tensor
+    document : dict
+
+    Raises
+    ------
+    InputError
+        If the file does not exist.
+    FormatError
+        If it has another format or version, is damaged, or holds weights that are not finite.
     """
     if not path.is_file():
-        raise InputError("does not exist" if not path.exists() else "is no file", path=path)
+        raise InputError("does not exist" if not path.exists() else "is not a file", path=path)
     if path.stat().st_size > _MAX_BYTES:
-        raise FormatError(f"{path}: is larger than {_MAX_BYTES / 1e9:.0f} GB: no checkpoint")
+        raise FormatError(f"{path}: is larger than {_MAX_BYTES / 1e9:.0f} GB: not a checkpoint")
     try:
         with safe_open(path, "pt") as file:
             header = file.metadata() or {}
             if header.get("format") != form:
-                raise FormatError(f"{path}: is no {form.rpartition('-')[2]} of this program")
+                raise FormatError(f"{path}: is not a {form.rpartition('-')[2]} of this program")
             if header.get("version") != str(VERSION):
                 raise FormatError(
-                    f"{path}: is of format {header.get('version')}, this program reads {VERSION}; "
-                    "train anew, or update the program"
+                    f"{path}: has format version {header.get('version')}, this program reads {VERSION}; "
+                    "train again, or update the program"
                 )
             text = header.get("document", "")
             if len(text) > _MAX_DOCUMENT:
                 raise ValueError(f"a document of {len(text)} characters")
             document = json.loads(text)
             if not isinstance(document, dict):
-                raise TypeError("its document is no object")
+                raise TypeError("its document is not an object")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, RuntimeError, ValueError, TypeError, RecursionError) as error:
-        raise FormatError(f"{path}: is no checkpoint, or damaged ({error})") from error
+        raise FormatError(f"{path}: is not a checkpoint, or damaged ({error})") from error
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise FormatError(f"{path}: {name!r} holds values that are not finite; train anew")
+            raise FormatError(f"{path}: {name!r} has values that are not finite; train again")
     return tensors, document
 
 
-def _kind_of(tensor: Tensor) -> str:
+def _shape_and_type(tensor: Tensor) -> str:
     shape = " x ".join(map(str, tensor.shape)) or "a single value"
     return f"{shape} of {str(tensor.dtype).removeprefix('torch.')}"

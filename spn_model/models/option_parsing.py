@@ -1,4 +1,4 @@
-"""Options that a recipe or a checkpoint gives by name, as a dataclass."""
+"""Parsing of options from a recipe or a checkpoint into a dataclass."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ _T = TypeVar("_T")
 
 
 def from_mapping(kind: type[_T], given: Mapping[str, Any], where: str) -> _T:
-    """A dataclass of numbers, bools and texts with defaults, from values by the names of its fields.
+    """Build a dataclass of numbers, bools and strings from values by the names of its fields.
 
-    A whole number is taken for a float, nothing else is converted. Raises InputError for an unknown name, a
-    value of another type, and a number that is not finite; where : the beginning of its message.
+    All fields need defaults, which define their types. An int is accepted for a float; nothing else is
+    converted. `where` starts the messages. Raises InputError for an unknown name, a value of another type
+    or one that is not finite.
     """
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for name, value in given.items():
         if name not in defaults:
-            raise InputError(f"{where}: {name!r} is not known; known are {', '.join(defaults)}")
+            raise InputError(f"{where}: unknown option {name!r}; options are {', '.join(defaults)}")
         wanted = type(defaults[name])
         if wanted is float and type(value) is int:
             value = float(value)

@@ -1,4 +1,4 @@
-"""What training, evaluation and export know of a kind of network, and nothing more."""
+"""Interface of pose models, all that training, evaluation and export know about a kind of network."""
 
 from __future__ import annotations
 
@@ -15,14 +15,23 @@ from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
 
 Batch = dict[str, Tensor]
-UNKNOWN_COUNT = 10**12  # of images, where it is not known how many are drawn
+UNKNOWN_COUNT = 10**12  # number of images of a stage, if not known in advance
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimates:
-    """Of N images: poses, NaN where none was found; covariance (N, 6, 6) over the centre in the world's unit
-    and a rotation vector v in the camera frame, R_true = exp(v) R, NaN where unknown; reasons : (N,) str,
-    empty where there is a pose."""
+    """Estimated poses of N images.
+
+    Attributes
+    ----------
+    poses : Poses
+        N poses, NaN if none was found.
+    covariance : ndarray, shape (N, 6, 6)
+        Covariance of the centre in the world's unit and of a rotation vector v in the camera frame,
+        R_true = exp(v) R; NaN if unknown.
+    reasons : ndarray of str, shape (N,)
+        Why there is no pose; empty if there is one.
+    """
 
     poses: Poses
     covariance: np.ndarray
@@ -30,7 +39,7 @@ class PoseEstimates:
 
     @classmethod
     def concatenate(cls, parts: Sequence[PoseEstimates]) -> PoseEstimates:
-        """One after the other; one part at least."""
+        """Concatenate at least one set of estimates."""
         return cls(
             Poses.concatenate(part.poses for part in parts),
             np.concatenate([part.covariance for part in parts]),
@@ -39,14 +48,22 @@ class PoseEstimates:
 
 
 class PoseModel(ABC):
-    """A network with all that makes a pose of its output: targets, loss, augmentation, decoding.
+    """Network plus what turns its output into a pose: targets, loss, data augmentation and decoding.
 
-    kind : as recipes and checkpoints have it. network : everything learnt or measured on training images is
-    in its parameters and buffers, so that its state is the whole member. options : JSON-able, what `make`
-    needs to build the member anew. any_camera : poses are right for images of any K; else only for those of
-    the camera that it was trained on. has_parts : a batch may be computed in parts, in several threads; not
-    where layers draw at random, or keep statistics of a whole batch. bfloat16 : `loss` runs the network in
-    it; set by who trains.
+    Attributes
+    ----------
+    kind : str
+        Name used in recipes and checkpoints.
+    any_camera : bool
+        Whether poses are valid for images of any K; otherwise only for the camera of the training images.
+    has_parts : bool
+        Whether a batch may be split into parts computed in several threads. Not the case if layers draw
+        random numbers or keep statistics of a whole batch.
+    network : nn.Module
+        Its parameters and buffers hold everything learnt or measured on training images, so that its state
+        is the complete state of the model.
+    bfloat16 : bool
+        Whether `loss` runs the network in bfloat16; set by the training loop.
     """
 
     kind: ClassVar[str]
@@ -58,7 +75,7 @@ class PoseModel(ABC):
     @property
     @abstractmethod
     def options(self) -> dict[str, Any]:
-        """Options of the network and of the member, by name; plain values."""
+        """Options of network and model by name, as plain values from which `make` builds the same model."""
 
     @property
     @abstractmethod
@@ -67,54 +84,86 @@ class PoseModel(ABC):
 
     @abstractmethod
     def load_pretrained(self, weights: str) -> None:
-        """Start from published weights: a name of `spn_model.pretrained.weights` or a file."""
+        """Load published weights, given by a name of `spn_model.pretrained.weights` or a file."""
 
     @abstractmethod
     def fit(self, data: TrainingSet) -> None:
-        """Before the first step: what is measured on training images, as the centre of targets.
+        """Measure on the training images what is needed before the first step, such as the centre of targets.
 
-        Once more before a stage that has another data set; what was learnt on the first is kept.
+        Called again before a stage that uses another data set; what was learnt on the first one is kept.
         """
 
     @abstractmethod
     def begin_stage(
         self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
-        """Freeze and thaw, choose loss and augmentation, as the options of a recipe's stage say.
+        """Freeze layers and select loss and augmentation by the options of a recipe's stage.
 
-        images : that the stage will draw, about; a short one makes less in advance.
-        Raises InputError for an option or a value that this kind does not know.
+        Parameters
+        ----------
+        stage : mapping
+            Options of the stage.
+        data : TrainingSet
+            Images that it trains on.
+        images : int
+            Approximate number of images that the stage will draw; a short stage prepares less in advance.
+
+        Raises
+        ------
+        InputError
+            If an option or value is not known.
         """
 
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Of what the stage trains: "name", "params" (list), "rate" (factor of the stage's)."""
+        """Return what the stage trains, as groups with "name", "params" (list) and "rate".
+
+        "rate" is the factor of the stage's learning rate.
+        """
 
     @abstractmethod
     def batch(
         self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
     ) -> Batch:
-        """CPU tensors of one step, from rows (B,) of the training images, augmented.
+        """Make the CPU tensors of one step from training images, with augmentation.
 
-        A pure function of its arguments and of the stage: it may run ahead, in another thread. progress :
-        share of the stage that is done, 0 to 1. The number of images may differ from B where their size does.
+        A pure function of its arguments and the stage, so that batches can be prefetched in other threads.
+
+        Parameters
+        ----------
+        data : TrainingSet
+            Training images.
+        rows : ndarray of int, shape (B,)
+            Images to use. The batch can have a different number of images if their size varies.
+        generator : np.random.Generator
+            Source of randomness.
+        progress : float
+            Fraction of the stage that is done, 0 to 1.
         """
 
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss to descend, and detached figures for the log; the network is in training mode."""
+        """Return the loss to minimise and detached metrics for the log; the network is in training mode."""
 
     @abstractmethod
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
-        """Poses of images (B, H, W, 3) uint8 RGB without distortion, K (B, 3, 3). In eval mode."""
+        """Estimate the poses of images, in eval mode.
+
+        Parameters
+        ----------
+        images : ndarray, uint8, shape (B, H, W, 3)
+            Undistorted RGB images.
+        intrinsics : ndarray, shape (B, 3, 3)
+            Intrinsic matrices K.
+        """
 
     def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
-        """Up to `count` images like those that the stage renders of its data, none of which it ever draws.
+        """Render up to `count` novel views like those of the stage that the stage never draws.
 
-        None where the stage renders none.
+        Returns None if the stage renders no views.
         """
         return None
 
     @abstractmethod
     def set_covariance_scale(self, factor: float) -> None:
-        """Multiply the covariances of all later estimates by a factor; kept in the network's state."""
+        """Multiply the covariances of all later estimates by a factor, kept in the network's state."""

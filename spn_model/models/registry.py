@@ -1,4 +1,4 @@
-"""Kinds of networks by name, as recipes and checkpoints have them."""
+"""Kinds of pose models by the names that recipes and checkpoints use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from spn_data.errors import InputError
 from spn_model.models.pose_model import PoseModel
 
-# Imported when they are asked for: one kind does not need what another does.
+# Imported on demand, so that one kind does not load the dependencies of another.
 KINDS = {
     "regression": ("spn_model.models.regression", "RegressionModel"),
     "scene-coordinates": ("spn_model.models.scene_coordinates", "SceneCoordinatesModel"),
@@ -17,9 +17,24 @@ KINDS = {
 
 
 def make(kind: str, options: Mapping[str, Any], *, seed: int = 0) -> PoseModel:
-    """A member with weights drawn from a seed. Raises InputError for a kind or an option that there isn't."""
+    """Build a pose model with random weights.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `KINDS`.
+    options : mapping
+        Options of the model, by name.
+    seed : int
+        Random seed of the weights.
+
+    Raises
+    ------
+    InputError
+        If the kind or an option is not known.
+    """
     if kind not in KINDS:
-        raise InputError(f"there is no kind of network {kind!r}; there are {', '.join(KINDS)}")
+        raise InputError(f"unknown kind of network {kind!r}; choose one of {', '.join(KINDS)}")
     module, name = KINDS[kind]
     model: PoseModel = getattr(import_module(module), name).make(options, seed)
     return model

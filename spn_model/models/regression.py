@@ -1,4 +1,4 @@
-"""Pose regressors as a member: the paper's SqueezePoseNet, VGG16 and PoseNet, from images to poses."""
+"""Pose model of the pose regressors: the paper's SqueezePoseNet, VGG16 and PoseNet."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from spn_model.pretrained.tensors import load_pretrained, read_tensors
 _MEASURED = (
     64  # training images, spread evenly, on which batch normalisation starts as the identity
 )
-_AT_ONCE = 8  # images
+_AT_ONCE = 8  # batch size of inference
 _CACHE_BYTES = 4_000_000_000
 
 
 class RegressionModel(PoseModel):
-    """Answers with a pose at once; learns the poses of training images, whose cameras are turned about.
+    """Pose model that regresses the pose directly, trained on images of rotated cameras.
 
-    Fixed options, in `make`: those of RegressionOptions, and network_options, of `networks.registry`. Of a
-    stage: StageOptions.
+    The options of `make` are those of `RegressionOptions` plus `network_options`, the options of the
+    architecture in `networks.registry`. The options of a stage are those of `RegressionStageOptions`.
     """
 
     kind: ClassVar[str] = "regression"
@@ -61,7 +61,7 @@ class RegressionModel(PoseModel):
 
     @classmethod
     def make(cls, options: Mapping[str, Any], seed: int = 0) -> RegressionModel:
-        """With weights drawn by the seed. Raises InputError for an option or a value that there isn't."""
+        """Build the model with random weights. Raises InputError for an unknown option or a wrong value."""
         own = dict(options)
         of_network = own.pop("network_options", {})
         if not isinstance(of_network, Mapping):
@@ -75,6 +75,7 @@ class RegressionModel(PoseModel):
 
     @property
     def options(self) -> dict[str, Any]:
+        """Options of network and model by name."""
         return {
             "network": self._options.network,
             "network_options": options_of(self.network.regressor),
@@ -83,17 +84,19 @@ class RegressionModel(PoseModel):
 
     @property
     def weights_name(self) -> str:
+        """Name of the published weights that the trunk starts from."""
         return self.network.regressor.weights_name
 
     def load_pretrained(self, weights_name: str) -> None:
+        """Load published weights into the trunk, by name or file."""
         path = Path(weights.find(weights_name))
         load_pretrained(self.network.regressor, read_tensors(path), path)
 
     def fit(self, data: TrainingSet) -> None:
-        """Centre and spread of the poses; on the first data set of a network's life also how it starts.
+        """Measure the targets on the poses; for a new network also initialise normalisations and heads.
 
-        Inserted batch normalisations become the identity, and heads `q` begin at the mean orientation. A
-        network that was trained before keeps what it has learnt, and aims at the poses of this data set.
+        Inserted batch normalisations become the identity, and the heads `q` start at the mean orientation.
+        A network that was trained before keeps its weights and gets the targets of this data set.
         """
         self._check_size(*input_size(*data.size, self._options.width))
         network = self.network
@@ -108,15 +111,16 @@ class RegressionModel(PoseModel):
     def begin_stage(
         self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
+        """Freeze layers, set the loss and fill the feature cache; see `PoseModel.begin_stage`."""
         chosen = from_mapping(RegressionStageOptions, stage, f"stage of {self.kind}")
         if chosen.loss == "reprojection" and not data.has_points:
             raise InputError(
-                "the loss reprojection needs map points, and the data set holds none to learn from; "
-                "choose beta or learned"
+                "the loss reprojection needs map points, and the data set has none for training; "
+                "choose the loss beta or learned"
             )
         if chosen.warp is not None and not np.isfinite(data.intrinsics).all():
             raise InputError(
-                "the camera of some training images is not known: they cannot be turned about; "
+                "the camera of some training images is unknown, so they cannot be rotated; "
                 "set tilt_deg and roll_deg to 0"
             )
         self._stage, self._cache = chosen, None
@@ -132,7 +136,10 @@ class RegressionModel(PoseModel):
             self._cache = self._cached(data, chosen.cached_features)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The weights of the losses do not decay: decay would pull them to weights of one."""
+        """Return the groups to train.
+
+        Loss weights have no weight decay, which would pull them to weights of one.
+        """
         of = self.network.regressor.parameter_groups()
         groups: list[dict[str, Any]] = [
             {"name": "added", "params": of["added"], "rate": 1.0},
@@ -154,10 +161,11 @@ class RegressionModel(PoseModel):
     def batch(
         self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
     ) -> Batch:
-        """images (B, h, w, 3) uint8, or features0 and so on (B, ...) where cached; x (B, 3), q (B, 4).
+        """Make a batch of images (B, h, w, 3) uint8 with x (B, 3) and q (B, 4).
 
-        For the reprojection error also points (B, P, 3) relative to the targets' centre, seen (B, P) and
-        matrices (B, 3, 3), K of the data set's images.
+        Cached features0, features1, ... (B, ...) replace the images if there are any. For the reprojection
+        error there are also points (B, P, 3) relative to the targets' centre, seen (B, P) and matrices (B,
+        3, 3), the K of the data set's images.
         """
         batch: Batch = {}
         if self._cache is not None:
@@ -177,9 +185,10 @@ class RegressionModel(PoseModel):
         return batch
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """That of the stage, and the likelihood of its errors, whose gradient stays with `uncertainty`.
+        """Return the pose loss plus the negative log-likelihood, whose gradient stays within `uncertainty`.
 
-        Figures: medians of the distance in the world's unit and of the angle in degrees; the likelihood.
+        The metrics are the median distance in the world's unit, the median angle in degrees and the
+        negative log-likelihood ("likelihood").
         """
         outputs = self.network.outputs(self._features(batch))
         weights_ = self.network.regressor.estimate_weights
@@ -201,17 +210,20 @@ class RegressionModel(PoseModel):
 
     @torch.inference_mode()
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
-        """As `Member.estimate`. K is not used: images must be of the training images' camera."""
+        """Estimate poses as `PoseModel.estimate` does.
+
+        K is not used: images must come from the camera of the training images.
+        """
         return self.read_out(*self._answers(images))
 
     def read_out(self, x: np.ndarray, q: np.ndarray, log_std: np.ndarray) -> PoseEstimates:
-        """Poses from what the network gives of N images: x (N, 3), q (N, 4), log_std (N, 6)."""
+        """Convert network outputs of N images, x (N, 3), q (N, 4) and log_std (N, 6), to poses."""
         poses = self.network.targets.decode(x, q)
         covariance = np.full((len(x), 6, 6), np.nan)
-        found = np.isfinite(poses.centers[:, 0])
-        variance = np.exp(2 * log_std[found].astype(np.float64))
-        covariance[found] = variance[:, :, None] * np.eye(6)
-        reasons = np.where(found, "", "the network's answer is no pose")
+        valid = np.isfinite(poses.centers[:, 0])
+        variance = np.exp(2 * log_std[valid].astype(np.float64))
+        covariance[valid] = variance[:, :, None] * np.eye(6)
+        reasons = np.where(valid, "", "the network's answer is no pose")
         return PoseEstimates(poses, covariance, reasons)
 
     @property
@@ -220,11 +232,11 @@ class RegressionModel(PoseModel):
         return float(self.network.covariance_scale)
 
     def set_covariance_scale(self, factor: float) -> None:
-        """Multiply it: covariances of later estimates are larger by the factor."""
+        """Multiply the covariances of later estimates by a factor."""
         self.network.covariance_scale.mul_(factor)
 
     def normalised(self, images: Tensor) -> Tensor:
-        """(B, 3, h, w) of images (B, h, w, 3) uint8, as ImageNet's."""
+        """Return images (B, h, w, 3) uint8 as (B, 3, h, w), normalised with ImageNet's mean and deviation."""
         rgb = images.permute(0, 3, 1, 2).float() / 255
         mean, std = (torch.tensor(v, device=rgb.device)[:, None, None] for v in (MEAN, STD))
         return (rgb - mean) / std
@@ -244,14 +256,14 @@ class RegressionModel(PoseModel):
         return tuple(batch[name] for name in batch if name.startswith("features"))
 
     def _trunk(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Features, float32, of images (B, h, w, 3) uint8, computed as training does."""
+        """Compute float32 features of images (B, h, w, 3) uint8 in the precision of training."""
         kind = images.device.type
         with torch.autocast(kind, torch.bfloat16, enabled=self.bfloat16):
             features = self.network.regressor.trunk(self.normalised(images))
         return tuple(part.float() for part in features)
 
     def _answers(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the network gives in eval mode, in float32: x (N, 3), q (N, 4), log_std (N, 6)."""
+        """Run the network in eval mode and float32; return x (N, 3), q (N, 4) and log_std (N, 6)."""
         network = self.network
         parts = [np.zeros((0, 13), np.float32)]
         for start in range(0, len(images), _AT_ONCE):
@@ -267,7 +279,7 @@ class RegressionModel(PoseModel):
     def _examples(
         self, data: TrainingSet, wanted: Iterable[tuple[int, np.random.Generator]]
     ) -> tuple[np.ndarray, Poses]:
-        """Images (B, h, w, 3) uint8 and poses of rows of the training set, varied as the stage says."""
+        """Return augmented images (B, h, w, 3) uint8 and poses of training rows."""
         made = [
             augmented_example(data, int(row), self._options.width, self._stage, generator)
             for row, generator in wanted
@@ -276,10 +288,10 @@ class RegressionModel(PoseModel):
 
     @torch.no_grad()
     def _cached(self, data: TrainingSet, variants: int) -> FeatureCache:
-        """Features of variants of every image, the same in every run: drawn by row and variant alone."""
+        """Compute features of augmented variants of every image; they depend on row and variant only."""
         network, was_training = self.network, self.network.training
-        network.train()  # the auxiliary estimates exist in training mode alone; the trunk is frozen
-        found: list[list[np.ndarray]] = []
+        network.train()  # auxiliary features exist in training mode only; the trunk is frozen
+        computed: list[list[np.ndarray]] = []
         poses = []
         wanted = [(row, variant) for row in range(len(data)) for variant in range(variants)]
         for start in range(0, len(wanted), _AT_ONCE):
@@ -291,13 +303,13 @@ class RegressionModel(PoseModel):
             size = sum(part[0].nbytes for part in features) * len(wanted)
             if size > _CACHE_BYTES:
                 raise InputError(
-                    f"cached_features is {variants}: that takes {size / 1e9:.1f} GB of memory, "
+                    f"cached_features is {variants}: this takes {size / 1e9:.1f} GB of memory, at most "
                     f"{_CACHE_BYTES / 1e9:.0f} GB are allowed"
                 )
-            found.append([part.cpu().numpy() for part in features])
+            computed.append([part.cpu().numpy() for part in features])
             poses.append(some)
         network.train(was_training)
-        joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        joined = (np.concatenate(parts) for parts in zip(*computed, strict=True))
         by_row = tuple(part.reshape(len(data), variants, *part.shape[1:]) for part in joined)
         return FeatureCache(by_row, Poses.concatenate(poses))
 
@@ -316,6 +328,6 @@ class RegressionModel(PoseModel):
         smallest = self.network.regressor.min_side_px
         if min(width, height) < smallest:
             raise InputError(
-                f"images of {width} x {height} are too small: {self._options.network} needs {smallest} px "
-                "a side"
+                f"images of {width} x {height} are too small: {self._options.network} needs at least "
+                f"{smallest} px a side"
             )

@@ -1,4 +1,4 @@
-"""What a pose regressor learns from: training images with their cameras turned about, and their labels."""
+"""Training examples of a pose regressor: images of rotated cameras and their exact poses."""
 
 from __future__ import annotations
 
@@ -14,14 +14,25 @@ from spn_model.models.regression_options import RegressionStageOptions
 
 
 def input_size(width: int, height: int, wanted_width: int) -> tuple[int, int]:
-    """(width, height) that a network is given of an image; wanted_width 0: as it is."""
+    """Return the network's input size (width, height) for an image.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image.
+    wanted_width : int
+        Width of the input, which keeps the aspect ratio; 0 for the image's own size.
+    """
     if not wanted_width:
         return width, height
     return wanted_width, max(1, round(height * wanted_width / width))
 
 
 def resized(image: np.ndarray, wanted_width: int) -> np.ndarray:
-    """(h, w, 3) uint8 of that width, from (H, W, 3); every pixel counts where it shrinks."""
+    """Resize an image (H, W, 3) uint8 to a width; 0 keeps its size.
+
+    Pixels are averaged by area if the image shrinks.
+    """
     height, width = image.shape[:2]
     size = input_size(width, height, wanted_width)
     if size == (width, height):
@@ -37,10 +48,10 @@ def augmented_example(
     options: RegressionStageOptions,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, Poses]:
-    """A training image (h, w, 3) uint8, varied, and its pose, exactly (1).
+    """Return an augmented training image (h, w, 3) uint8 and its exact pose.
 
-    A turned camera has the K of the real one: nothing is zoomed, for a regressor takes a nearer view for a
-    nearer place. What the real camera did not see is black.
+    The rotated camera keeps the K of the real one; it is not zoomed, because a regressor mistakes a zoomed
+    view for a closer position. Pixels outside the real image are black.
     """
     image, pose = resized(data.image(row), wanted_width), data.poses[row : row + 1]
     if options.warp is not None:
@@ -61,9 +72,9 @@ def visible_points(
     count: int,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Map points (B, count, 3) that the images of rows (B,) see from poses (B), and which are any (B, count).
+    """Return map points (B, count, 3) seen from poses (B), and a mask (B, count) of the valid ones.
 
-    Those of the image, drawn evenly, that the turned camera still has in view.
+    They are drawn uniformly from the points of each image that the rotated camera still has in view.
     """
     xyz, seen = np.zeros((len(rows), count, 3)), np.zeros((len(rows), count), bool)
     for k, row in enumerate(rows):
@@ -80,9 +91,13 @@ def visible_points(
 
 @dataclass(frozen=True, eq=False)
 class FeatureCache:
-    """What a frozen trunk makes of variants of every image.
+    """Features that a frozen trunk computes from K augmented variants of every image.
 
-    features : each (N, K, ...) float32; poses : N * K, row after row.
+    Attributes
+    ----------
+    features : tuple of ndarray, float32, shape (N, K, ...)
+    poses : Poses
+        N * K poses, row by row.
     """
 
     features: tuple[np.ndarray, ...]
@@ -91,7 +106,7 @@ class FeatureCache:
     def draw(
         self, rows: np.ndarray, generator: np.random.Generator
     ) -> tuple[list[np.ndarray], Poses]:
-        """Features, each (B, ...), and poses of a variant of each of rows (B,)."""
+        """Draw a variant of each row (B,); return features, each (B, ...), and poses."""
         variants = self.features[0].shape[1]
         chosen = generator.integers(variants, size=len(rows))
         return [part[rows, chosen] for part in self.features], self.poses[rows * variants + chosen]

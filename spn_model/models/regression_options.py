@@ -1,4 +1,4 @@
-"""What a recipe may choose about pose regressors."""
+"""Options of pose regressors in a recipe."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ LOSSES = ("beta", "learned", "reprojection")
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionOptions:
-    """What makes a member; network_options stand beside these."""
+    """Options that define the model, in addition to `network_options`."""
 
     network: str = "squeezeposenet"
     width: int = (
-        0  # px of the images that the network is given, height in proportion; 0: as they are
+        0  # width of the network's input in px, keeping the aspect ratio; 0: the images' own
     )
 
     def __post_init__(self) -> None:
         if self.width != 0 and not 21 <= self.width <= 8192:
-            raise InputError(f"width is {self.width}, needs to be 0 or to lie from 21 to 8192")
+            raise InputError(f"width is {self.width}, needs to be 0 or from 21 to 8192")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionStageOptions:
-    """How one stage of a training varies its images, and what it descends."""
+    """Options of one training stage: augmentation, loss and frozen layers."""
 
-    freeze_trunk: bool = False  # train the added layers alone
-    pretrained_rate: float = 1.0  # rate of the pretrained layers against that of the added ones
-    loss: str = "beta"  # beta, learned, reprojection
-    beta: float = 500.0  # world units that an error of 1 of the quaternion's length counts
-    points: int = 200  # map points of an image that the reprojection error is taken at
-    augmentation: bool = True  # turn the camera, change the look
-    tilt_deg: float = 20.0  # largest turn about each of the image's axes
-    roll_deg: float = 20.0  # and about the optical axis
-    look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
+    freeze_trunk: bool = False  # train the added layers only
+    pretrained_rate: float = 1.0  # learning rate of pretrained layers relative to added ones
+    loss: str = "beta"  # beta, learned or reprojection
+    beta: float = 500.0  # world units that correspond to a quaternion error of length 1
+    points: int = 200  # map points of an image used for the reprojection error
+    augmentation: bool = True  # rotate the camera, augment photometrically
+    tilt_deg: float = 20.0  # largest rotation about each image axis
+    roll_deg: float = 20.0  # largest rotation about the optical axis
+    look: bool = True  # augment exposure, colour, sharpness and noise, and occlude parts
     dropout: bool = True
-    batch_statistics: bool = False  # normalise by each batch, not by the stored statistics
-    cached_features: int = 0  # variants of each image whose features are stored; 0: none are
+    batch_statistics: bool = False  # normalise with batch statistics, not the stored ones
+    cached_features: int = 0  # augmented variants of each image whose features are cached
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
@@ -54,18 +54,19 @@ class RegressionStageOptions:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise InputError(f"{name} is {value}, needs to lie from {low} to {high}")
+                raise InputError(f"{name} is {value}, needs to be from {low} to {high}")
         if self.cached_features and not self.freeze_trunk:
             raise InputError(
-                "cached_features needs freeze_trunk: features of a trunk that is trained change"
+                "cached_features needs freeze_trunk: features change while the trunk is trained"
             )
         if self.cached_features > 1 and not self.augmentation:
             raise InputError(
-                "cached_features is above 1 without augmentation: all variants would be one"
+                "cached_features is above 1 without augmentation: all variants would be identical"
             )
 
     @property
     def warp(self) -> WarpOptions | None:
+        """Limits of the camera's rotation; None without geometric augmentation."""
         if not self.augmentation or self.tilt_deg == self.roll_deg == 0:
             return None
         return WarpOptions(tilt_deg=self.tilt_deg, roll_deg=self.roll_deg)

@@ -1,4 +1,4 @@
-"""The scene-coordinate network as a member: what it learns from each image, and a pose from its cells."""
+"""Pose model of the scene-coordinate network: its training, and PnP from its cells."""
 
 from __future__ import annotations
 
@@ -28,26 +28,27 @@ from spn_model.onboard.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.pretrained.weights import find
 
-_MEASURED = 16  # training images, spread evenly, by which features are normalised
+_MEASURED = 16  # training images, evenly spaced, on which features are normalised
 
-_UNSURE = 0.25  # spreads of the scene; a cell of a larger scale does not know where it is
+_UNSURE = 0.25  # in spreads of the scene; cells with a larger scale are too uncertain to use
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCoordinatesOptions(DecodingOptions):
-    """What makes a member."""
+    """Options that define the model."""
 
-    shrink: int = 2  # factor by which images are reduced: more surroundings, a quarter of the time
+    shrink: int = 2  # factor by which images are reduced: more context, a quarter of the time
 
     def __post_init__(self) -> None:
         if not 1 <= self.shrink <= 8:
-            raise InputError(f"shrink is {self.shrink}, needs to lie from 1 to 8")
+            raise InputError(f"shrink is {self.shrink}, needs to be from 1 to 8")
 
 
 class SceneCoordinatesModel(PoseModel):
-    """Learns, for each cell of an image, the point of the map that it shows; PnP makes a pose of them.
+    """Pose model that learns the map point shown by each cell of an image; PnP computes the pose.
 
-    Fixed options, in `make`: `shrink`, and those of DecodingOptions. Of a stage: StageOptions.
+    The options of `make` are `shrink` and those of `DecodingOptions`. The options of a stage are those of
+    `SceneStageOptions`.
     """
 
     kind: ClassVar[str] = "scene-coordinates"
@@ -64,7 +65,7 @@ class SceneCoordinatesModel(PoseModel):
 
     @classmethod
     def make(cls, options: Mapping[str, Any], seed: int = 0) -> SceneCoordinatesModel:
-        """With weights drawn by the seed. Raises InputError for an unknown option."""
+        """Build the model with random weights. Raises InputError for an unknown option."""
         chosen = from_mapping(SceneCoordinatesOptions, options, f"network {cls.kind}")
         decoding = DecodingOptions(
             **{f.name: getattr(chosen, f.name) for f in fields(DecodingOptions)}
@@ -76,23 +77,29 @@ class SceneCoordinatesModel(PoseModel):
 
     @property
     def options(self) -> dict[str, Any]:
+        """Options of network and decoding by name."""
         return {"shrink": self.network.shrink, **asdict(self.decoding)}
 
     @property
     def weights_name(self) -> str:
+        """Name of the published weights of the features."""
         return SceneCoordinates.weights_name
 
     def load_pretrained(self, weights: str) -> None:
+        """Load published weights of the features, by name or file."""
         path = find(weights)
         load_pretrained(self.network, read_tensors(path), path)
 
     def fit(self, data: TrainingSet) -> None:
-        """Centre and spread of the scene, size of published features. Raises InputError without points."""
+        """Measure the scene's centre and spread and the scale of published features.
+
+        Raises InputError if the training images see too few points.
+        """
         xyz = np.concatenate([data.points(k).xyz for k in range(len(data))])
         if len(xyz) < 100:
             raise InputError(
-                f"the training images see {len(xyz)} map points: a scene-coordinate network learns from "
-                "points; train another network, or make the data set from a model with points"
+                f"the training images see {len(xyz)} map points, too few for a scene-coordinate network; "
+                "train another network, or make the data set from a model with points"
             )
         self._check_size(*data.size)
         self.network.set_scene(torch.from_numpy(xyz.astype(np.float32)))
@@ -103,12 +110,14 @@ class SceneCoordinatesModel(PoseModel):
     def begin_stage(
         self, stage: Mapping[str, Any], data: TrainingSet, images: int = UNKNOWN_COUNT
     ) -> None:
+        """Set the stage's options and freeze layers; see `PoseModel.begin_stage`."""
         self._stage = from_mapping(SceneStageOptions, stage, f"stage of {self.kind}")
         self._images = images
         self.network.freeze_features(self._stage.freeze_layers)
         self._examples = None
 
     def parameter_groups(self) -> list[dict[str, Any]]:
+        """Return the trainable parameters as "added" and "pretrained", with their learning rate factors."""
         rates = {"added": 1.0, "pretrained": self._stage.features_rate}
         groups = [
             {"name": name, "params": [p for p in of if p.requires_grad], "rate": rates[name]}
@@ -119,9 +128,10 @@ class SceneCoordinatesModel(PoseModel):
     def batch(
         self, data: TrainingSet, rows: np.ndarray, generator: np.random.Generator, progress: float
     ) -> Batch:
-        """images (N, h, w, 3) uint8, targets (N, 3, r, c), known (N, r, c).
+        """Make a batch: images (N, h, w, 3) uint8, targets (N, 3, r, c) and known (N, r, c).
 
-        See `SceneExamples.batch`: all images have one zoom, and smaller ones are more than the rows.
+        See `SceneExamples.batch`: all images have the same zoom, and a batch of smaller images has more of
+        them than rows.
         """
         images, targets, known = self._examples_of(data).batch(rows, generator, progress)
         return {
@@ -131,10 +141,11 @@ class SceneCoordinatesModel(PoseModel):
         }
 
     def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
+        """Render up to `count` novel views that the stage never draws; None if it renders none."""
         return self._examples_of(data).held_out_views(count)
 
     def _examples_of(self, data: TrainingSet) -> SceneExamples:
-        with self._making_examples:  # once, whichever thread comes first: it may take seconds
+        with self._making_examples:  # once, by whichever thread is first: it can take seconds
             if self._examples is None or self._examples[0] is not data:
                 center, spread = self.network.center.cpu().numpy(), float(self.network.spread)
                 made = SceneExamples(
@@ -144,14 +155,13 @@ class SceneCoordinatesModel(PoseModel):
             return self._examples[1]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Laplace likelihood, and cross entropy of the parts of the scene.
+        """Return the Laplace negative log-likelihood plus the cross-entropy of the scene's parts.
 
-        Figures: median distance of cells, and median scale, in the scene's unit; the cross entropy.
-
-        Where no cell of the batch has a target the loss is 0.
+        The metrics are the median distance of cells and the median scale, both in the scene's unit, and the
+        cross-entropy. The loss is 0 if no cell of the batch has a target.
         """
         images, known = batch["images"], batch["known"]
-        # Each weight is used once: a cache of them serves nothing, and other threads would share it.
+        # Each weight is used once, so a cast cache is useless, and other threads would share it.
         with torch.autocast(
             images.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False
         ):
@@ -173,12 +183,12 @@ class SceneCoordinatesModel(PoseModel):
         return float(self.network.covariance_scale)
 
     def set_covariance_scale(self, factor: float) -> None:
-        """Scale all covariances by a factor more; kept in the network's state."""
+        """Multiply all covariances by a factor, which is kept in the network's state."""
         self.network.covariance_scale.mul_(factor)
 
     @property
     def decoding_options(self) -> DecodingOptions:
-        """What `spn_model.onboard.decoding.decode` needs, with what was measured."""
+        """Options of `spn_model.onboard.decoding.decode`, including the measured covariance scale."""
         return replace(
             self.decoding,
             cells_per_observation=self.decoding.cells_per_observation * self.covariance_scale,
@@ -188,7 +198,7 @@ class SceneCoordinatesModel(PoseModel):
     def decode(
         self, coordinates: np.ndarray, log_scale: np.ndarray, matrix: np.ndarray
     ) -> PoseEstimate:
-        """A pose from the network's output (3, h, w), (h, w) for one image of K (3, 3)."""
+        """Estimate a pose from the network's outputs (3, h, w) and (h, w) for one image with K (3, 3)."""
         return decode(
             coordinates,
             log_scale,
@@ -202,13 +212,13 @@ class SceneCoordinatesModel(PoseModel):
         shrink, smallest = self.network.shrink, SceneCoordinates.min_side_px
         if min(width, height) // shrink < smallest:
             raise InputError(
-                f"images of {width} x {height}, reduced by {shrink}, are smaller than the {smallest} pixels "
-                "that the network needs; give it larger ones, or shrink = 1"
+                f"images of {width} x {height}, reduced by {shrink}, are smaller than the {smallest} px "
+                "a side that the network needs; use larger images or shrink = 1"
             )
 
     @torch.inference_mode()
     def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
-        """As `Member.estimate`; in float32, as the exported network computes."""
+        """Estimate poses as `PoseModel.estimate` does, in float32 like the exported network."""
         self._check_size(images.shape[2], images.shape[1])
         device = self.network.center.device
         poses = Poses.unknown(len(images))
@@ -218,22 +228,22 @@ class SceneCoordinatesModel(PoseModel):
             if not np.isfinite(matrix).all():
                 reasons[k] = "its camera is not known"
                 continue
-            # One at a time: as fast on a processor, and no image changes another's result.
+            # One image at a time: just as fast on a CPU, and results do not depend on other images.
             x = torch.from_numpy(np.ascontiguousarray(image[None])).to(device)
             coordinates, log_scale = (t[0].cpu().numpy() for t in self.network(_normalised(x)))
             try:
-                found = self.decode(coordinates, log_scale[0], matrix)
+                estimate = self.decode(coordinates, log_scale[0], matrix)
             except GeometryError as error:
                 reasons[k] = str(error)
                 continue
-            poses.centers[k] = found.poses.centers[0]
-            poses.quats_wxyz[k] = found.poses.quats_wxyz[0]
-            covariance[k] = found.covariance
+            poses.centers[k] = estimate.poses.centers[0]
+            poses.quats_wxyz[k] = estimate.poses.quats_wxyz[0]
+            covariance[k] = estimate.covariance
         return PoseEstimates(poses, covariance, reasons.astype(str))
 
 
 def _normalised(images: Tensor) -> Tensor:
-    """(N, 3, H, W) for the network, channels last, from (N, H, W, 3) uint8 RGB."""
+    """Return images (N, H, W, 3) uint8 RGB as network input (N, 3, H, W), channels last in memory."""
     mean = torch.tensor([v * 255 for v in MEAN], device=images.device)
     std = torch.tensor([v * 255 for v in STD], device=images.device)
     return ((images - mean) / std).permute(0, 3, 1, 2)

@@ -1,4 +1,4 @@
-"""What a scene-coordinate network is shown in one step: images, and the point of the map at each cell."""
+"""Training examples of a scene-coordinate network: augmented images and novel views with their targets."""
 
 from __future__ import annotations
 
@@ -39,42 +39,42 @@ from spn_model.networks.scene_coordinates import (
     grid_size,
 )
 
-_FAR = 4.0  # spreads from the scene's centre: a point beyond is no target, it may lie anywhere
-_LEVEL = 0.011  # spreads by which the corners of a level triangle differ in height
-_VIEW_BYTES = 800_000_000  # of rendered images, which are kept: one is made in 20 to 80 ms
-_MOST_VIEWS = 1_000_000  # whose numbers training draws; those beyond judge
-_IMAGES_A_VIEW = 120  # drawn for each view that is made, at least: it takes the time of ten of them
-_FIRST_VIEWS = 32  # at a stage's beginning: it does not wait until all are made
-_ALL_VIEWS_AT = 0.8  # progress from which on all of them are drawn
-_GOLDEN = 0.6180339887498949  # steps of it fill the circle evenly, however many
-_LEAST_SHOWN = 0.3  # share of a view that has to show something
-_ATTEMPTS = 4  # at such a view
-_RAMP_FROM = 0.3  # of turns, and of zooms in their logarithm, at a stage's beginning
+_FAR = 4.0  # in spreads from the scene's centre; points beyond are unreliable and no targets
+_LEVEL = 0.011  # largest height difference of a level triangle, in spreads
+_VIEW_BYTES = 800_000_000  # memory for rendered views, which are kept: one takes 20 to 80 ms
+_MOST_VIEWS = 1_000_000  # view numbers below it are for training, those above are held out
+_IMAGES_A_VIEW = 120  # images drawn for each rendered view, which costs as much as ten of them
+_FIRST_VIEWS = 32  # views available at a stage's start, so that it need not wait for all
+_ALL_VIEWS_AT = 0.8  # progress from which all views are drawn
+_GOLDEN = 0.6180339887498949  # multiples of it fill the unit interval evenly, however many
+_LEAST_SHOWN = 0.3  # smallest fraction of a view that must show something
+_ATTEMPTS = 4  # attempts to render such a view
+_RAMP_FROM = 0.3  # fraction of rotations and log zooms at a stage's start
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneStageOptions:
-    """How one stage of a training varies its images, and what it trains."""
+    """Options of one training stage: augmentation, novel views and frozen layers."""
 
-    freeze_layers: int = 5  # first layers of SqueezeNet that stay as published
-    features_rate: float = 0.3  # rate of SqueezeNet's other layers against that of the head
-    choice_weight: float = 1.0  # of the choice among parts of the scene, in the loss
-    surfaces: bool = True  # learn from surfaces between map points; else from the points alone
-    tilt_deg: float = 20.0  # largest turn about each of the image's axes
-    roll_deg: float = 20.0  # and about the optical axis
-    zoom_min: float = 0.65  # focal length against that of the images as the network is given them
+    freeze_layers: int = 5  # number of SqueezeNet's first layers that stay as published
+    features_rate: float = 0.3  # learning rate of SqueezeNet's other layers relative to the head
+    choice_weight: float = 1.0  # weight of the cross-entropy of scene parts in the loss
+    surfaces: bool = True  # learn from surfaces between map points, not only from the points
+    tilt_deg: float = 20.0  # largest rotation about each image axis
+    roll_deg: float = 20.0  # largest rotation about the optical axis
+    zoom_min: float = 0.65  # focal length relative to that of the network's input images
     zoom_max: float = 1.6
-    size_min: float = 0.9  # sides of the images that it is shown, against the same
-    size_max: float = 1.2  # between these they follow the focal length
-    ramp_share: float = 0.2  # first share of the stage, over which turns and zooms grow to these
-    look: bool = True  # change exposure, colour, sharpness, noise, and hide parts
-    views_share: float = 0.0  # share of images rendered from another place
-    views: int = 1000  # how many of these are made, as far as memory reaches
-    views_fused: bool = True  # of several images; else each is one training image, moved
-    views_rise: float = 0.6  # how far up they lie, at most, in spreads of the scene
-    views_side: float = 0.2  # how far aside
-    views_high: float = 0.4  # share of fused views that look down from anywhere above the scene
-    views_height: float = 0.7  # spreads above the highest training image, at most
+    size_min: float = 0.9  # image size relative to that of the network's input images;
+    size_max: float = 1.2  # between these limits it follows the focal length
+    ramp_share: float = 0.2  # first fraction of the stage, over which rotations and zooms grow
+    look: bool = True  # augment exposure, colour, sharpness and noise, and occlude parts
+    views_share: float = 0.0  # fraction of images rendered as novel views
+    views: int = 1000  # number of novel views to render, as far as memory allows
+    views_fused: bool = True  # fuse several images, instead of warping one training image
+    views_rise: float = 0.6  # largest rise of a view, in spreads of the scene
+    views_side: float = 0.2  # largest sideways shift, in spreads
+    views_high: float = 0.4  # fraction of fused views that look down from above the scene
+    views_height: float = 0.7  # largest height above the highest training image, in spreads
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -97,16 +97,30 @@ class SceneStageOptions:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise InputError(f"{name} is {value}, needs to lie from {low} to {high}")
+                raise InputError(f"{name} is {value}, needs to be from {low} to {high}")
         if self.views_share and not self.surfaces:
             raise InputError("views_share needs surfaces: views are rendered from them")
 
 
 class SceneExamples:
-    """Examples of one data set, as one stage varies them; surfaces and views are kept once they are made.
+    """Examples of one data set with the augmentation of one stage; surfaces and views are cached.
 
-    center (3,), spread : of the scene; shrink : factor by which the network's images are smaller than the
-    data's; images : that are drawn, about. What is kept is made of the data alone, whichever row comes first.
+    The cache depends on the data only, not on the order in which rows are drawn.
+
+    Parameters
+    ----------
+    data : TrainingSet
+        Training images.
+    options : SceneStageOptions
+        Augmentation and novel views.
+    center : ndarray, shape (3,)
+        Centre of the scene.
+    spread : float
+        Spread of the scene.
+    shrink : int
+        Factor by which the network's images are smaller than the data set's.
+    images : int
+        Approximate number of images that the stage draws.
     """
 
     def __init__(
@@ -143,15 +157,16 @@ class SceneExamples:
         self._looks_down = False
         if options.views_share and options.views_fused:
             self._sources = SourceImages(data, center, spread, _FAR * spread)
-            lies_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
-            self._looks_down = data.up_is_known and bool(lies_below.any())
+            is_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
+            self._looks_down = data.up_is_known and bool(is_below.any())
 
     def batch(
         self, rows: np.ndarray, generator: np.random.Generator, progress: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Images (N, h, w, 3) uint8, targets (N, 3, r, c) float32, known (N, r, c), of one zoom and size.
+        """Make a batch of images (N, h, w, 3) uint8, targets (N, 3, r, c) float32 and known (N, r, c).
 
-        Images that the zoom makes smaller are up to twice as many, of further rows.
+        All images have the same zoom and size. If the zoom makes them smaller, there are up to twice as
+        many, from further rows.
         """
         data, options = self._data, self._options
         zoom, warp = self._variation(generator, progress)
@@ -191,7 +206,7 @@ class SceneExamples:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, seen = self._source(row, generator, progress)
         matrix = self._data.intrinsics[row] if seen is None else seen.matrix
-        # A view is kept as small as it is needed.
+        # Rendered views are stored at the network's size, training images at full size.
         zoom *= self._data.size[0] / image.shape[1]
         warp = random_warp(
             generator, matrix, image.shape[1::-1], options, zoom=zoom, target_size=size
@@ -223,7 +238,7 @@ class SceneExamples:
     def _source(
         self, row: int, generator: np.random.Generator, progress: float
     ) -> tuple[np.ndarray, Surface | None]:
-        """A training image, or a view rendered from any of them, with the surface that it shows."""
+        """Return a training image, or a rendered view of the scene, with the surface that it shows."""
         if generator.random() < self._options.views_share:
             number = int(generator.integers(self._views_at(progress)))
             if number not in self._views:
@@ -252,12 +267,12 @@ class SceneExamples:
         return self._surfaces[row]
 
     def _views_at(self, progress: float) -> int:
-        """How many views are drawn from, the first ones: they are made bit by bit, beside the training."""
+        """Return how many views are drawn from; they are rendered gradually while training runs."""
         share = min(1.0, progress / _ALL_VIEWS_AT)
         return min(self._view_count, max(_FIRST_VIEWS, round(self._view_count * share)))
 
     def held_out_views(self, count: int) -> HeldOutViews | None:
-        """Up to `count` views that no batch has; None where the stage renders none."""
+        """Render up to `count` views that no batch contains; None if the stage renders none."""
         if not self._options.views_share:
             return None
         numbers = range(_MOST_VIEWS, _MOST_VIEWS + count)
@@ -277,17 +292,17 @@ class SceneExamples:
         return int(number * _GOLDEN % 1 * len(self._data))
 
     def _training_image(self, number: int) -> tuple[np.ndarray, Surface]:
-        """In place of a view that cannot be made."""
+        """Return the fallback for a view that cannot be rendered."""
         row = self._row_of_view(number)
         return self._image(row), self._surface(row)
 
     def _view(self, number: int) -> tuple[np.ndarray, Surface] | None:
-        """None where it would show too little."""
+        """Render a view by its number; None if it shows too little."""
         row = self._row_of_view(number)
         seen = self._surface(row)
         if not np.isfinite(seen.inverse_depth).any():
             return None
-        # A view is the same whenever it is made: a batch depends on its arguments alone.
+        # A view depends on its number only, so that a batch depends on its arguments only.
         generator = np.random.default_rng(number)
         if self._sources is None:
             return self._moved(row, seen, generator)
@@ -330,7 +345,7 @@ class SceneExamples:
 
 
 def _mean_up(data: TrainingSet) -> tuple[float, float, float]:
-    """Mean of the directions in which the images' upper edges lie, of length 1."""
+    """Return the mean direction of the images' upper edges as a unit vector."""
     up = -data.poses.rotations[:, 1].mean(axis=0)
     x, y, z = up / max(float(np.linalg.norm(up)), 1e-9)
     return float(x), float(y), float(z)

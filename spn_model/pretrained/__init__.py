@@ -1,0 +1,1 @@
+"""Published weights: catalogue, download and loading into networks."""

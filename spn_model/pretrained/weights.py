@@ -1,4 +1,4 @@
-"""Published weights: which there are, where they lie, and their download; no torch in here."""
+"""Catalogue of published weights, their location and download; imports no torch."""
 
 from __future__ import annotations
 
@@ -22,10 +22,24 @@ _CHUNK_BYTES = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights of one network, in torchvision's parameter names.
+    """Published weights of one network, with torchvision's parameter names.
 
-    sha256 : of the file, or its beginning as it stands in the file's name; size_bytes : exact for what is
-    shipped, else about; url : None for what is shipped.
+    Attributes
+    ----------
+    name : str
+        Name in the catalogue.
+    holds : str
+        Network and training data.
+    file : str
+        File name.
+    sha256 : str
+        Hash of the file, or its first digits as contained in the file name.
+    size_bytes : int
+        Exact size of shipped files, approximate size of others.
+    licence : str
+        Licence of the weights.
+    url : str or None
+        Download address; None for shipped files.
     """
 
     name: str
@@ -38,12 +52,12 @@ class Weights:
 
     @property
     def path(self) -> Path:
-        """Where the file lies, or will lie once fetched."""
+        """Path of the file, or where a download puts it."""
         return (SHIPPED if self.url is None else cache_folder()) / self.file
 
     @property
     def origin(self) -> str:
-        """Server, or that it is part of this package."""
+        """Server of the download, or "this package"."""
         return "this package" if self.url is None else urlsplit(self.url).netloc
 
 
@@ -76,40 +90,54 @@ CATALOGUE = (
 
 
 def by_name(name: str) -> Weights:
-    """Raises InputError for a name that isn't in the catalogue."""
+    """Return an entry of the catalogue. Raises InputError for an unknown name."""
     for weights in CATALOGUE:
         if weights.name == name:
             return weights
     names = ", ".join(weights.name for weights in CATALOGUE)
-    raise InputError(f"there are no weights {name!r}; there are {names}")
+    raise InputError(f"unknown weights {name!r}; choose one of {names}")
 
 
 def cache_folder() -> Path:
-    """Where fetched files are kept: in the user's cache, by the XDG Base Directory Specification."""
+    """Return the folder of downloads in the user's cache, by the XDG Base Directory Specification."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(base) if Path(base).is_absolute() else Path.home() / ".cache"
     return root / "squeezeposenet-toolkit" / "weights"
 
 
 def is_intact(weights: Weights, path: Path) -> bool:
-    """Whether a file is the one that the hash belongs to."""
+    """Return whether a file has the expected hash."""
     with path.open("rb") as handle:
         digest = hashlib.file_digest(handle, "sha256").hexdigest()
     return digest.startswith(weights.sha256)
 
 
 def state(weights: Weights) -> str:
-    """Whether they are on this machine: "yes", "no" or "damaged"."""
+    """Return whether the weights are on this machine: "yes", "no" or "damaged"."""
     if not weights.path.is_file():
         return "no"
     return "yes" if is_intact(weights, weights.path) else "damaged"
 
 
 def find(name_or_file: str | Path) -> Path:
-    """The file of published weights, by their name in the catalogue; or a file of the user's own.
+    """Find the file of published weights by name, or accept a file of the user.
 
-    A file under a published file's name is checked against its hash, wherever it lies. Nothing is
-    downloaded. Raises InputError where there is no such file, or it is damaged.
+    Nothing is downloaded.
+
+    Parameters
+    ----------
+    name_or_file : str or Path
+        Name in the catalogue, or a path. A file with the name of a published file is checked against its
+        hash, whatever its folder.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        If the file does not exist or is damaged.
     """
     own = Path(name_or_file)
     known = next((w for w in CATALOGUE if w.name == str(name_or_file)), None)
@@ -124,7 +152,9 @@ def find(name_or_file: str | Path) -> Path:
         path = own
         if not path.is_file():
             names = ", ".join(weights.name for weights in CATALOGUE)
-            raise InputError(f"is no file of weights, nor one of the names {names}", path=path)
+            raise InputError(
+                f"is neither a file of weights nor one of the names {names}", path=path
+            )
         known = next((w for w in CATALOGUE if w.file == own.name), None)
     if known is not None and not is_intact(known, path):
         raise InputError(
@@ -136,10 +166,25 @@ def find(name_or_file: str | Path) -> Path:
 
 
 def fetch(weights: Weights, progress: Progress) -> Path:
-    """Download published weights into the cache, checked against the hash in the file's name.
+    """Download published weights into the cache and verify their hash; keep an intact file.
 
-    Leaves an intact file alone. Raises InputError where the network, the server or the content fails; a
-    file stands in the cache only when it is complete and right.
+    Parameters
+    ----------
+    weights : Weights
+        Entry of the catalogue.
+    progress : Progress
+        Called with the downloaded megabytes.
+
+    Returns
+    -------
+    Path
+        The complete and verified file.
+
+    Raises
+    ------
+    InputError
+        If the network or the server fails, or the content is wrong. The cache never contains incomplete
+        files.
     """
     if weights.url is None:
         return find(weights.name)
@@ -157,14 +202,14 @@ def fetch(weights: Weights, progress: Progress) -> Path:
             if isinstance(error, urllib.error.HTTPError):
                 error.close()
             raise InputError(
-                f"cannot be fetched ({reason}); without a network, fetch it elsewhere and put it at "
-                f"{target}, or give its path",
+                f"download failed ({reason}); download it elsewhere and put it at {target}, or give "
+                "its path",
                 path=weights.url,
             ) from error
         if not digest.startswith(weights.sha256):
             raise InputError(
-                f"what the server sent has SHA-256 {digest[:8]}..., not {weights.sha256}...; "
-                "nothing is kept of it",
+                f"the downloaded file has SHA-256 {digest[:8]}..., expected {weights.sha256}...; "
+                "it was discarded",
                 path=weights.url,
             )
         partial.replace(target)
@@ -174,7 +219,7 @@ def fetch(weights: Weights, progress: Progress) -> Path:
 
 
 def _save(answer: HTTPResponse, path: Path, weights: Weights, progress: Progress) -> str:
-    """SHA-256 of what was written. Raises InputError where more comes than the file can be."""
+    """Write a response to a file and return its SHA-256. Raises InputError if it is larger than expected."""
     digest, done = hashlib.sha256(), 0
     expected_mb = round(weights.size_bytes / 1e6)
     with path.open("wb") as handle:
@@ -182,24 +227,25 @@ def _save(answer: HTTPResponse, path: Path, weights: Weights, progress: Progress
             done += len(chunk)
             if done > 1.1 * weights.size_bytes + _CHUNK_BYTES:
                 raise InputError(
-                    f"the server sends more than the {weights.size_bytes / 1e6:.0f} MB that the file "
-                    "has; nothing is kept of it",
+                    f"the download is larger than the {weights.size_bytes / 1e6:.0f} MB expected; it was "
+                    "discarded",
                     path=weights.url,
                 )
             handle.write(chunk)
             digest.update(chunk)
             progress("MB", min(round(done / 1e6), expected_mb), expected_mb)
     if answer.length:  # bytes announced and not received
-        raise ConnectionError(f"the connection broke off after {done} B")
+        raise ConnectionError(f"the connection was lost after {done} B")
     return digest.hexdigest()
 
 
 class _StaySecure(urllib.request.HTTPRedirectHandler):
-    """Follows no redirection from https to anything else."""
+    """Redirect handler that refuses to leave https."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
+        """Follow a redirection unless it leads from https to another scheme."""
         if req.type == "https" and not newurl.startswith("https:"):
             raise urllib.error.URLError("the server redirects to an insecure address")
         return super().redirect_request(req, fp, code, msg, headers, newurl)

@@ -1,0 +1,1 @@
+"""Training of pose models: recipes, the training loop, optimisers, logs and checkpoints."""

@@ -1,4 +1,4 @@
-"""Which training images a step takes, and batches made ahead of their use."""
+"""Selection of the training images of each step, and prefetching of batches."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from spn_model.models.pose_model import Batch
 def rows_of_step(
     count: int, batch: int, step: int, seed: int, stage: int, *, rank: int = 0, world: int = 1
 ) -> np.ndarray:
-    """(batch,) rows of `count` training images: every image once an epoch, in an order of each epoch's own.
+    """Return the training rows (batch,) of a step; each epoch takes every image once in an order of its own.
 
-    A function of its arguments alone: a training that was stopped goes on with the same images. Of several
-    processes each takes its part of a larger batch.
+    The rows depend on the arguments only, so that a resumed training continues with the same images. If
+    there are several processes, each takes its part of a larger batch.
     """
     first = (step * world + rank) * batch
     places = np.arange(first, first + batch)
@@ -33,21 +33,26 @@ def rows_of_step(
 
 
 def generator_of_step(seed: int, stage: int, step: int, rank: int = 0) -> np.random.Generator:
-    """Draws all that is random in a batch."""
-    # 1: epochs draw from [seed, stage, epoch], and a step's number may be an epoch's.
+    """Return the generator of everything random in a batch."""
+    # The 1 separates it from the seeds of epochs, [seed, stage, epoch], since a step can equal an epoch.
     return np.random.default_rng([seed, stage, step, 1, rank])
 
 
 def torch_seed_of_step(seed: int, stage: int, step: int, rank: int = 0) -> int:
-    """For torch, which draws what dropout drops."""
+    """Return the seed of torch for a step, which determines dropout."""
     return int(np.random.SeedSequence([seed, stage, step, 2, rank]).generate_state(1)[0])
 
 
 class BatchPrefetcher:
-    """Batches by their numbers; while one is used the next are made, in threads.
+    """Batches in order, made ahead in threads while one is being used.
 
-    Threads, since OpenCV, NumPy and torch let others run while they compute, and images need not be sent.
-    waited_s : seconds that `next` has waited for a batch that was not ready.
+    It uses threads because OpenCV, NumPy and torch release the interpreter lock while they compute, and
+    images need not be copied between processes.
+
+    Attributes
+    ----------
+    waited_s : float
+        Seconds that `next` has waited for batches that were not ready.
     """
 
     def __init__(
@@ -57,17 +62,17 @@ class BatchPrefetcher:
         self._made: deque[Future[Batch]] = deque()
         self.waited_s = 0.0
         for _ in range(depth):
-            self._order()
+            self._submit()
 
     def next(self) -> Batch:
-        """The next batch. Raises what making it has raised."""
+        """Return the next batch. Raises what making it has raised."""
         began = time.perf_counter()
         batch = self._made.popleft().result()
         self.waited_s += time.perf_counter() - began
-        self._order()
+        self._submit()
         return batch
 
-    def _order(self) -> None:
+    def _submit(self) -> None:
         self._made.append(self._pool.submit(self._make, self._number))
         self._number += 1
 
@@ -76,9 +81,9 @@ class BatchPrefetcher:
 def prefetch_batches(
     make: Callable[[int], Batch], first: int, workers: int, depth: int = 0
 ) -> Iterator[BatchPrefetcher]:
-    """`make` is called with number `first` and those after it, by threads that end with the block.
+    """Call `make` with number `first` and the following ones in threads, which end with the block.
 
-    depth : that are ready or under way, at most; at least two for each worker.
+    At most `depth` batches, and at least two for each worker, are ready or in progress.
     """
     pool = ThreadPoolExecutor(workers, "batches", initializer=torch.set_num_threads, initargs=(1,))
     try:

@@ -1,4 +1,4 @@
-"""One factor that makes stated covariances as large as the errors on images that a network has not seen."""
+"""Calibration of a network's covariances by one factor, from images that it was not trained on."""
 
 from __future__ import annotations
 
@@ -14,13 +14,32 @@ LEAST_FRAMES = 10
 
 
 def fit_covariance_scale(estimates: PoseEstimates, truth: Poses) -> float:
-    """Factor by which the covariances of these estimates have to grow, from the true poses (N).
+    """Fit the factor that makes covariances consistent with the errors.
 
-    The median of the errors' squared Mahalanobis distances becomes that of chi-squared with 6 degrees of
-    freedom: half of the frames lie within the ellipsoid that should hold half of them. The median, because a
-    few wrong poses have distances without bound. `Member.set_covariance_scale` takes the factor from images
-    that training does not draw, for a network knows too much of the others. Raises GeometryError where fewer
-    than 10 frames have a pose and a covariance.
+    Parameters
+    ----------
+    estimates : PoseEstimates
+        Poses and covariances of N images.
+    truth : Poses
+        N true poses.
+
+    Returns
+    -------
+    float
+        Factor by which the covariances need to grow.
+
+    Raises
+    ------
+    GeometryError
+        If fewer than 10 images have a pose and a covariance.
+
+    Notes
+    -----
+    With this factor, the median of the squared Mahalanobis distances (NEES) equals that of chi-squared with
+    6 degrees of freedom: half of the frames are within the ellipsoid that should contain half of them. The
+    median is used because the distances of a few wrong poses have no bound.
+    `PoseModel.set_covariance_scale` takes the factor; it must be measured on images that training does not
+    draw, because a network is overconfident on the others.
     """
     known = np.isfinite(estimates.poses.centers).all(axis=1)
     errors = np.full((len(known), DOF), np.nan)
@@ -31,7 +50,7 @@ def fit_covariance_scale(estimates: PoseEstimates, truth: Poses) -> float:
     squared = squared[np.isfinite(squared)]
     if len(squared) < LEAST_FRAMES:
         raise GeometryError(
-            f"{len(squared)} images have a pose with a covariance, need {LEAST_FRAMES} to "
-            "measure how large covariances are"
+            f"{len(squared)} images have a pose with a covariance, at least {LEAST_FRAMES} are needed "
+            "to calibrate covariances"
         )
     return float(np.median(squared) / chdtri(DOF, 0.5))

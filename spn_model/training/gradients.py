@@ -1,4 +1,4 @@
-"""The gradient of a step: of a whole batch, or of its parts beside each other."""
+"""Gradient of a step, computed from a whole batch or from its parts in parallel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spn_model.training.machine import Machine
 
 
 class Gradients:
-    """Sets the gradients of parameters; threads compute as many parts at once as the pool has."""
+    """Computation of parameter gradients, with as many parts in parallel as the pool has threads."""
 
     def __init__(
         self, model: PoseModel, parameters: Sequence[nn.Parameter], pool: ThreadPoolExecutor | None
@@ -22,19 +22,20 @@ class Gradients:
         self._model, self._parameters, self._pool = model, parameters, pool
 
     def compute(self, parts: Sequence[Batch]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean loss of a step's parts, and its figures, detached; parameters have the mean's gradient.
+        """Set the gradients of a step and return its mean loss and metrics, both detached.
 
-        The sum is taken in the order of the parts: it does not depend on which is ready first.
+        The parameters get the gradient of the mean loss. It is summed in the order of the parts, so that it
+        does not depend on which one is ready first.
         """
-        found = list((self._pool.map if self._pool else map)(self._part, parts))
+        computed = list((self._pool.map if self._pool else map)(self._part, parts))
         share = 1 / len(parts)
         for k, parameter in enumerate(self._parameters):
-            given = [gradient for _, _, of in found if (gradient := of[k]) is not None]
+            given = [gradient for _, _, of in computed if (gradient := of[k]) is not None]
             parameter.grad = sum(given[1:], start=given[0]) * share if given else None
-        losses = torch.stack([loss for loss, _, _ in found])
-        names = {name: None for _, figures, _ in found for name in figures}
+        losses = torch.stack([loss for loss, _, _ in computed])
+        names = {name: None for _, figures, _ in computed for name in figures}
         figures = {
-            name: torch.stack([of[name] for _, of, _ in found if name in of]).mean()
+            name: torch.stack([of[name] for _, of, _ in computed if name in of]).mean()
             for name in names
         }
         return losses.mean(), figures
@@ -49,10 +50,10 @@ class Gradients:
 def gradient_workers(
     model: PoseModel, parameters: Sequence[nn.Parameter], parts: int, machine: Machine
 ) -> Iterator[Gradients]:
-    """Threads for the parts of each step, which end with the block.
+    """Provide `Gradients` with threads for the parts of each step, which end with the block.
 
-    Two threads that each compute a part are faster than two that share each convolution: these wait for
-    each other at every layer.
+    Two threads that each compute a part are faster than two that share each convolution, since these wait
+    for each other at every layer.
     """
     threads = min(parts, machine.cores) if machine.device.type == "cpu" else 1
     if threads == 1:

@@ -1,4 +1,4 @@
-"""What a training runs on: device, threads, precision, and the processes that share its work."""
+"""Compute resources of a training: device, threads, precision and distributed processes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,21 @@ _MAX_WORKERS = 8
 
 @dataclass(frozen=True)
 class Machine:
-    """device : of torch. threads : that the network computes with on the processor. workers : others, that
-    make batches. bfloat16 : matrices are multiplied in it while training. cores : that all may use."""
+    """Device and threads used by a training or an evaluation.
+
+    Attributes
+    ----------
+    device : torch.device
+        Device of the network.
+    threads : int
+        Threads that compute the network on the CPU.
+    workers : int
+        Further threads that make batches.
+    bfloat16 : bool
+        Whether matrices are multiplied in bfloat16 in training.
+    cores : int
+        Cores available to all threads.
+    """
 
     device: torch.device
     threads: int
@@ -31,7 +44,7 @@ class Machine:
     cores: int
 
     def plain(self) -> dict[str, str | int]:
-        """For the log."""
+        """Return the description of the machine for the log."""
         on_card = self.device.type == "cuda"
         return {
             "device": torch.cuda.get_device_name(self.device) if on_card else str(self.device),
@@ -42,17 +55,32 @@ class Machine:
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 def choose(
     device: str, threads: int, precision: str, local_rank: int = 0, *, makes_batches: bool = False
 ) -> Machine:
-    """device : "auto" (CUDA where there is one), "cpu", "cuda", "cuda:N"; threads : in all, 0 for all cores.
+    """Choose device, threads and precision.
 
-    With makes_batches some of the threads are set apart for that; it takes one in any case. Raises
-    InputError for a device that there isn't.
+    Parameters
+    ----------
+    device : str
+        "auto" (CUDA if available), "cpu", "cuda" or "cuda:N".
+    threads : int
+        Number of threads in total; 0 for all cores.
+    precision : str
+        One of `PRECISIONS`.
+    local_rank : int
+        Index of the process on this machine, which selects the device of "cuda".
+    makes_batches : bool
+        Whether to reserve some of the threads, at least one, for making batches.
+
+    Raises
+    ------
+    InputError
+        If the device does not exist.
     """
     available = torch.cuda.is_available()
     if device == "auto":
@@ -62,32 +90,32 @@ def choose(
     try:
         chosen = torch.device(device)
     except RuntimeError as error:
-        raise InputError(f"there is no device {device!r}: auto, cpu, cuda or cuda:N") from error
+        raise InputError(f"unknown device {device!r}; choose auto, cpu, cuda or cuda:N") from error
     if chosen.type not in ("cpu", "cuda"):
-        raise InputError(f"there is no device {device!r}: auto, cpu, cuda or cuda:N")
+        raise InputError(f"unknown device {device!r}; choose auto, cpu, cuda or cuda:N")
     if chosen.type == "cuda" and not (
         available and (chosen.index or 0) < torch.cuda.device_count()
     ):
-        raise InputError(f"device {device} is not in this machine, or torch was built without CUDA")
+        raise InputError(f"device {device} not found, or torch was built without CUDA")
     threads = threads or cores()
     fast = bfloat16_is_fast(chosen.type) if precision == "auto" else precision == "bfloat16"
     if not makes_batches:
         return Machine(chosen, threads, 0, fast, threads)
     if chosen.type == "cuda":
         return Machine(chosen, 1, min(max(1, threads - 1), _MAX_WORKERS), fast, threads)
-    # Threads of one convolution wait for each other: one that shares its core holds up all of them.
+    # Threads of one convolution wait for each other, so that one without a core of its own delays all.
     workers = min(max(1, threads // 4), _MAX_WORKERS)
     return Machine(chosen, max(1, threads - workers), workers, fast, threads)
 
 
 @contextmanager
 def limited_threads(machine: Machine) -> Iterator[None]:
-    """Libraries compute with the machine's threads inside, and as before after it."""
+    """Limit the threads of torch, OpenCV and BLAS to those of the machine within the block."""
     before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(machine.threads)
-    cv2.setNumThreads(1)  # each maker of batches is one thread
+    cv2.setNumThreads(1)  # each worker that makes batches is one thread
     try:
-        # NumPy's and SciPy's further threads wait busily, on cores that others compute on.
+        # Further BLAS threads of NumPy and SciPy busy-wait on cores that other threads need.
         with threadpool_limits(1, user_api="blas"):
             yield
     finally:
@@ -97,7 +125,15 @@ def limited_threads(machine: Machine) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes of one training, as `torchrun` starts them; one alone has rank 0 of 1."""
+    """Processes of one training as started by `torchrun`; a single process has rank 0 of 1.
+
+    Attributes
+    ----------
+    rank, world : int
+        Index of this process, and number of processes.
+    local_rank : int
+        Index of this process on its machine.
+    """
 
     rank: int = 0
     world: int = 1
@@ -105,11 +141,11 @@ class Ranks:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process writes and speaks."""
+        """Whether this process writes files and messages."""
         return self.rank == 0
 
     def broadcast_from_first(self, tensors: Sequence[Tensor]) -> None:
-        """Give all processes the first one's values."""
+        """Copy the first process's tensors to all processes."""
         if self.world > 1:
             for tensor in tensors:
                 distributed.broadcast(tensor, src=0)
@@ -117,15 +153,15 @@ class Ranks:
     def average(
         self, parameters: Sequence[Tensor], seconds: float, stop: bool
     ) -> tuple[float, bool]:
-        """Average gradients over the processes; to all come the first one's seconds, and whether one stops.
+        """Average gradients over the processes; return the first one's seconds and whether any stops.
 
-        One message for all of them: they are many and small.
+        All values are sent as one message, because they are many and small.
         """
         if self.world == 1:
             return seconds, stop
         parts = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
-        told = [seconds if self.is_main else 0.0, float(stop)]
-        more = torch.tensor(told, device=parts[0].device)
+        status = [seconds if self.is_main else 0.0, float(stop)]
+        more = torch.tensor(status, device=parts[0].device)
         flat = torch.cat([*(part.float().reshape(-1) for part in parts), more])
         distributed.all_reduce(flat)
         at = 0
@@ -136,14 +172,14 @@ class Ranks:
         return float(flat[-2]), bool(flat[-1] > 0)
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Wait until all processes have reached this call."""
         if self.world > 1:
             distributed.barrier()
 
 
 @contextmanager
 def process_group(device: str) -> Iterator[Ranks]:
-    """The processes that `torchrun` started, if it did; they part at the end."""
+    """Join the processes that `torchrun` started, if any, for the duration of the block."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Ranks()
         return

@@ -1,7 +1,8 @@
-"""Muon: each matrix of weights is moved by an orthogonal matrix, all else as AdamW moves it.
+"""Muon optimiser: weight matrices are updated by orthogonalised steps, all other parameters as by AdamW.
 
-Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks". torch has it for matrices
-alone; here the weights of convolutions are matrices too, (outputs, inputs x height x width).
+Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks". torch implements it for
+matrices only; here the weights of convolutions are treated as matrices too, (outputs, inputs x height x
+width).
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ import torch
 from torch import Tensor
 
 _MOMENTUM = 0.95
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # of AdamW
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # AdamW's
 _NEWTON_SCHULZ = (
     3.4445,
     -4.7750,
     2.0315,
-)  # coefficients of the paper: fast, singular values 0.7 to 1.2
+)  # the paper's coefficients: fast convergence, to singular values from 0.7 to 1.2
 _ROUNDS = 5
 
 
 def orthogonalized(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """About U V' of a matrix U S V' (n, m), in its own type: five rounds of a Newton-Schulz iteration.
+    """Orthogonalise a matrix U S V' (n, m) to approximately U V' by five Newton-Schulz iterations.
 
-    dtype : that it is computed in; bfloat16 is enough.
+    They are computed in `dtype`, for which bfloat16 is sufficient; the result has the matrix's own type.
     """
     a, b, c = _NEWTON_SCHULZ
     is_tall = matrix.shape[0] > matrix.shape[1]
@@ -38,9 +39,18 @@ def orthogonalized(matrix: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """The entries of a matrix's step have the rate as their root mean square: about the size of AdamW's.
+    """Optimiser whose steps of a matrix have the learning rate as root mean square, similar to AdamW's.
 
-    groups : as torch's optimisers take them. dtype : that matrices are orthogonalised in.
+    Parameters
+    ----------
+    groups : iterable of dict
+        Parameter groups as for torch's optimisers.
+    lr : float
+        Learning rate.
+    weight_decay : float
+        Decoupled weight decay.
+    dtype : torch.dtype
+        Type in which matrices are orthogonalised.
     """
 
     def __init__(
@@ -55,7 +65,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Move all parameters that have a gradient."""
+        """Update all parameters that have a gradient."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is None:
@@ -73,7 +83,7 @@ class Muon(torch.optim.Optimizer):
         parameter.mul_(1 - rate * decay).add_(step.reshape(parameter.shape), alpha=-rate)
 
     def _move_vector(self, parameter: Tensor, gradient: Tensor, rate: float, decay: float) -> None:
-        """AdamW (Loshchilov and Hutter 2019)."""
+        """Apply an AdamW step (Loshchilov and Hutter 2019)."""
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros(())

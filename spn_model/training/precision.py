@@ -1,4 +1,4 @@
-"""Where networks compute in bfloat16: on processors that do so faster than in float32."""
+"""Choice of precision: bfloat16 on processors where it is faster than float32."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 @cache
 def bfloat16_is_fast(device_type: str) -> bool:
-    """Whether a device ("cpu" or "cuda") multiplies bfloat16 by itself; others emulate it, slowly."""
+    """Return whether a device ("cpu" or "cuda") has native bfloat16; others emulate it slowly."""
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type == "cpu":
@@ -19,5 +19,5 @@ def bfloat16_is_fast(device_type: str) -> bool:
 
 
 def _cpu_has_bfloat16() -> bool:
-    # There is no public name for it yet.
+    # torch has no public name for this yet.
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())

@@ -1,7 +1,7 @@
-"""Training: the loop, top to bottom. Stopped at any moment, the same call goes on from where it was.
+"""Training loop. A training can be stopped at any moment, and the same call resumes it.
 
-Batch k of a stage is a function of (seed, stage, k) alone, and so is what dropout drops: with one thread and
-a budget in images, a training that was killed ends with the weights of one that never was.
+Batch k of a stage, dropout included, depends on (seed, stage, k) only. With one thread and a budget in
+images, a training that was killed and resumed therefore ends with the same weights as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -40,49 +40,79 @@ from spn_model.training.training_state import Position, read_state
 
 _LOG_EVERY_S = 10.0
 _SAVE_EVERY_S = 30.0
-_SAVING_SHARE = 0.05  # of the time, at most, goes into saving the state
-_STEPS_UNSEEN = 20  # losses on a graphics card are looked at together: each look waits for it
+_SAVING_SHARE = 0.05  # largest fraction of the time spent on saving the state
+_STEPS_UNSEEN = 20  # steps between checks of the loss on a GPU, each of which waits for the GPU
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """How a recipe is carried out."""
+    """Options of a training that are not part of its recipe."""
 
     seed: int = 0
     device: str = "auto"  # auto, cpu, cuda, cuda:N
-    threads: int = 0  # of the processor; 0: all
-    precision: str = (
-        "auto"  # auto: bfloat16 where the device multiplies it by itself; float32, bfloat16
-    )
-    validations: int = 10  # over the whole training, at least one a stage
-    validation_frames: int = 64  # at most, evenly spread
-    sample: int = 16  # training images, evenly spread, that are judged beside them
+    threads: int = 0  # CPU threads; 0: all cores
+    precision: str = "auto"  # auto (bfloat16 if the device has it natively), float32, bfloat16
+    validations: int = 10  # validations in the whole training, at least one in each stage
+    validation_frames: int = 64  # largest number of validation frames, evenly spaced
+    sample: int = 16  # evenly spaced training images that are evaluated too
 
 
 @dataclass(frozen=True)
 class Data:
-    """Data sets: of the area, and another one for stages of pretraining."""
+    """Data sets of a training.
+
+    Attributes
+    ----------
+    area : Path
+        Data set of the area.
+    pretraining : Path or None
+        Another data set, for pretraining stages.
+    """
 
     area: Path
     pretraining: Path | None = None
 
     def of(self, stage: Stage) -> Path:
-        """The file that a stage trains on."""
+        """Return the data set file that a stage trains on."""
         named = {AREA: self.area, PRETRAINING: self.pretraining or self.area}
         return named.get(stage.data, Path(stage.data))
 
 
 class TrainingStopped(Exception):
-    """Raised when the watcher wanted a stop; the state is saved."""
+    """Raised when the watcher requested a stop; the state is saved."""
 
 
 def train(
     recipe: Recipe, files: Files, data: Data, options: TrainOptions, watch: Watch
 ) -> dict[str, Any]:
-    """Facts of the finished training, which its checkpoints hold too.
+    """Train a pose model by a recipe, or resume from `files.state`.
 
-    Starts anew, or goes on from files.state. Raises InputError and FormatError for a recipe, weights or data
-    that nothing can be trained with or on, StageError where the loss diverges or the disk is full.
+    Parameters
+    ----------
+    recipe : Recipe
+        Kind of network and stages.
+    files : Files
+        Files to write.
+    data : Data
+        Data sets.
+    options : TrainOptions
+        Seed, device and validation.
+    watch : Watch
+        Receives log rows and can request a stop.
+
+    Returns
+    -------
+    dict
+        Facts of the finished training, which its checkpoints contain too.
+
+    Raises
+    ------
+    InputError, FormatError
+        If the recipe, the weights or the data cannot be used for training.
+    StageError
+        If the loss diverges or a file cannot be written.
+    TrainingStopped
+        If the watcher requested a stop.
     """
     with process_group(options.device) as ranks, ExitStack() as stack:
         machine = choose(
@@ -95,7 +125,7 @@ def train(
         model = make(recipe.kind, recipe.options, seed=options.seed)
         if not model.has_parts and any(stage.parts > 1 for stage in recipe.stages):
             raise InputError(
-                f"a network of kind {recipe.kind} computes a batch as a whole: parts needs to be 1"
+                f"a network of kind {recipe.kind} cannot split a batch: parts needs to be 1"
             )
         model.bfloat16 = machine.bfloat16
         if state is not None:
@@ -160,10 +190,10 @@ def run_stage(
     seed: int,
     validations: int,
 ) -> None:
-    """Steps of a stage, the `index`-th, from at.step on until the budget is spent; `at` moves on.
+    """Run the steps of stage number `index` from at.step until its budget is used up, advancing `at`.
 
-    record : of the first process, None in the others. Raises StageError where the loss diverges, Stopped
-    where the watcher wants it.
+    `record` belongs to the first process and is None in the others. Raises StageError if the loss diverges,
+    TrainingStopped if the watcher requests a stop.
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     step_images = stage.batch * ranks.world
@@ -173,7 +203,7 @@ def run_stage(
     progress = stage.progress(at.step * step_images, at.stage_s)
 
     def part_of(number: int) -> Batch:
-        # A budget in minutes is as far as it was when the batch was begun.
+        # For a budget in minutes, use the progress at the time the batch is started.
         spent = progress if stage.minutes else 0.0
         return _pinned(make_part(model, images, stage, index, number, seed, ranks, spent), machine)
 
@@ -238,9 +268,9 @@ def make_part(
     ranks: Ranks,
     spent: float,
 ) -> Batch:
-    """One part of a batch of the `index`-th stage; `number` counts the parts of all steps.
+    """Make one part of a batch of stage number `index`; `number` counts the parts of all steps.
 
-    spent : share of the stage's minutes.
+    `spent` is the used fraction of the stage's minutes.
     """
     step, part = divmod(number, stage.parts)
     part, world = part + ranks.rank * stage.parts, ranks.world * stage.parts
@@ -253,36 +283,35 @@ def make_part(
 
 @contextmanager
 def _divergence_as_stage_error(at: Position) -> Iterator[None]:
-    """Raises StageError where the loss diverges."""
+    """Turn `Diverged` into a StageError that says which checkpoint is kept."""
     try:
         yield
     except Diverged as error:
-        kept = "no checkpoint was made yet"
+        kept = "there is no checkpoint yet"
         if at.kept is not None:
             kept = f"the checkpoint after {at.kept['steps']} steps is kept"
         raise StageError(
-            f"the training diverges after {at.steps} steps: {error}; {kept}. "
-            "Lower the rate in the recipe, or clip the gradient"
+            f"the training diverged after {at.steps} steps: {error}; {kept}. "
+            "Lower the learning rate in the recipe, or use gradient clipping"
         ) from error
 
 
 def _training_group(dataset: Dataset) -> DatasetGroup:
-    """Raises InputError where there is not one group of training frames."""
+    """Return the group of training frames. Raises InputError unless there is exactly one, with images."""
     groups = dataset.of_role(Role.TRAIN)
     filled = [group for group in groups if len(group)] or groups
     if len(filled) != 1:
         raise InputError(
-            f"holds {len(filled)} groups of training frames, one is needed", path=dataset.path
+            f"has {len(filled)} groups of training frames, exactly one is needed",
+            path=dataset.path,
         )
     if filled[0].image_size is None:
-        raise InputError(
-            "holds no training images: there is nothing to train on", path=dataset.path
-        )
+        raise InputError("has no training images: there is nothing to train on", path=dataset.path)
     return filled[0]
 
 
 def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:
-    """That a stage trains on."""
+    """Return the groups that a stage trains on."""
     groups = [_training_group(dataset)]
     if frames == ALL:
         groups += [group for group in dataset.of_role(Role.VALIDATION) if len(group)]
@@ -290,7 +319,7 @@ def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:
 
 
 def optimizer_of(recipe: Recipe, stage: Stage, model: PoseModel) -> torch.optim.Optimizer:
-    """Raises InputError where the stage trains nothing."""
+    """Return the optimiser of a stage. Raises InputError if all its layers are frozen."""
     groups = [group for group in model.parameter_groups() if group["params"]]
     if not groups:
         raise InputError(f"stage {stage.name} trains nothing: all layers are frozen")
@@ -305,7 +334,7 @@ def optimizer_of(recipe: Recipe, stage: Stage, model: PoseModel) -> torch.optim.
 
 
 def _pinned(batch: Batch, machine: Machine) -> Batch:
-    """In the thread that makes batches: where a graphics card can fetch it."""
+    """Pin a batch's memory for transfer to the GPU, in the thread that makes it."""
     if machine.device.type == "cpu":
         return batch
     return {name: tensor.pin_memory() for name, tensor in batch.items()}

@@ -1,4 +1,4 @@
-"""How a training went, from its log.csv, as SVG."""
+"""Figure of a training's loss and errors, drawn from its log.csv as SVG."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spn_model.evaluation import svg
 from spn_model.evaluation.svg import COLOURS, INK, SOFT, Panel
 from spn_model.training.training_state import COLUMNS
 
-_MOST_POINTS = 400  # of one line; of more, an even choice is drawn
+_MOST_POINTS = 400  # largest number of points of a line; of more, an even selection is drawn
 _EVENTS = {
     "validation": ("validation frames", COLOURS[1]),
     "views": ("rendered views", COLOURS[2]),
@@ -25,7 +25,7 @@ _MAX_BYTES = 200_000_000
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Values of one kind over a training: minutes (N,), values (N,), NaN where not known."""
+    """Values over the minutes of a training, both of shape (N,); NaN if unknown."""
 
     minutes: np.ndarray
     values: np.ndarray
@@ -33,9 +33,20 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class TrainingLog:
-    """loss : of steps. errors : by event, medians of position and rotation. stages : (name, minute it began).
+    """Contents of a training's log.
 
-    minutes, images : at the end.
+    Attributes
+    ----------
+    loss : Curve
+        Loss of the steps.
+    errors : dict of str to (Curve, Curve)
+        Median errors of position and rotation by event.
+    stages : tuple of (str, float)
+        Name of each stage and the minute at which it began.
+    minutes : float
+        Duration of the training.
+    images : int
+        Number of images shown to the network.
     """
 
     loss: Curve
@@ -45,12 +56,12 @@ class TrainingLog:
     images: int
 
     def facts(self) -> dict[str, float]:
-        """Of the whole training, for metrics.json."""
+        """Return duration and number of images, for metrics.json."""
         return {"minutes": round(self.minutes, 3), "images": self.images}
 
 
 def read_log(path: Path) -> TrainingLog:
-    """Raises InputError with the line where it is no log of a training."""
+    """Read log.csv. Raises InputError, with the line, if it is not a training log."""
     rows: dict[str, list[tuple[float, float, float]]] = {"steps": [], **{e: [] for e in _EVENTS}}
     stages: list[tuple[str, float]] = []
     before, images = 0.0, 0
@@ -65,11 +76,11 @@ def read_log(path: Path) -> TrainingLog:
                 errors = _number(row["median_m"]), _number(row["median_deg"])
                 rows[row["event"]].append((minutes, *errors))
         except ValueError as error:
-            raise InputError(f"is no log of a training: {error}", path=path, line=line) from error
+            raise InputError(f"is not a training log: {error}", path=path, line=line) from error
         if not stages or stages[-1][0] != row["stage"]:
             stages.append((row["stage"], before))
         before = max(before, minutes)
-    tables = {name: np.array(found).reshape(-1, 3) for name, found in rows.items()}
+    tables = {name: np.array(values).reshape(-1, 3) for name, values in rows.items()}
     return TrainingLog(
         Curve(tables["steps"][:, 0], tables["steps"][:, 1]),
         {
@@ -86,7 +97,20 @@ def read_log(path: Path) -> TrainingLog:
 
 
 def training_figure(log: TrainingLog, *, unit: str = "m") -> str:
-    """Loss, and median errors of position and rotation, over minutes of training."""
+    """Draw loss and median errors of position and rotation over the minutes of training.
+
+    Parameters
+    ----------
+    log : TrainingLog
+        Contents of log.csv.
+    unit : str
+        Unit of positions.
+
+    Returns
+    -------
+    str
+        SVG document.
+    """
     heading = f"training: {log.minutes:.1f} minutes, {log.images:,} images"
     parts = [svg.text(20, 22, heading, bold=True)]
     far = max(log.minutes, 1e-3)
@@ -115,7 +139,7 @@ def training_figure(log: TrainingLog, *, unit: str = "m") -> str:
 
 
 def _line(panel: Panel, course: Curve, colour: str) -> str:
-    """Through known values, the most of them evenly chosen."""
+    """Draw a line through the known values, or an even selection of them."""
     known = np.flatnonzero(np.isfinite(course.values))
     if len(known) == 0:
         return ""
@@ -132,7 +156,7 @@ def _marks(panel: Panel, course: Curve, colour: str, wanted: bool) -> str:
 
 
 def _limits(courses: Sequence[Curve], *, from_zero: bool) -> tuple[float, float]:
-    """That show all but single bursts."""
+    """Return axis limits that show all values except isolated spikes."""
     values = np.concatenate([course.values[np.isfinite(course.values)] for course in courses])
     if len(values) == 0:
         return 0.0, 1.0
@@ -142,6 +166,6 @@ def _limits(courses: Sequence[Curve], *, from_zero: bool) -> tuple[float, float]
 
 
 def _number(cell: str) -> float:
-    """Infinite and unknown values are not drawn."""
+    """Parse a cell; empty and infinite values become NaN and are not drawn."""
     value = float(cell) if cell else np.nan
     return value if np.isfinite(value) else np.nan

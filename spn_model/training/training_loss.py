@@ -1,4 +1,4 @@
-"""Losses of the steps: their means for the log, and whether they diverge."""
+"""Monitoring of the losses of steps: means for the log, and detection of divergence."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import math
 import torch
 from torch import Tensor
 
-_LEVEL_STEPS = 50  # whose mean is the level that a stage's loss starts from
-_MEMORY = 0.95  # of the running mean that is compared with it
-_FAR = 10.0  # times the larger of that level and of how far the loss has come down from it
+_LEVEL_STEPS = 50  # first steps of a stage, whose mean loss is the initial level
+_MEMORY = 0.95  # decay of the running mean that is compared with this level
+_FAR = 10.0  # allowed rise, in multiples of the larger of this level and the decrease from it
 
 
 class Diverged(ArithmeticError):
-    """Raised when a loss leads nowhere."""
+    """Raised when a loss diverges."""
 
 
 class LossMonitor:
-    """Of one stage. Losses of several steps are looked at together where looking waits for the device."""
+    """Losses of one stage, checked every few steps if checking has to wait for the device."""
 
     def __init__(self, every: int):
         self._every = every
@@ -28,13 +28,13 @@ class LossMonitor:
         self._lowest = math.inf
 
     def add(self, loss: Tensor, gradient: Tensor, figures: dict[str, Tensor]) -> None:
-        """Of a step, before it is taken. Raises Diverged where the loss does."""
+        """Add the loss of a step before its update is applied. Raises Diverged if the loss does."""
         self._waiting.append((torch.stack([loss.detach().float(), gradient.float()]), figures))
         if len(self._waiting) >= self._every:
             self.settle()
 
     def settle(self) -> None:
-        """Look at what was added. Raises Diverged where the loss does."""
+        """Check the losses added since the last call. Raises Diverged if the loss does."""
         waiting, self._waiting = self._waiting, []
         for pair, figures in waiting:
             loss, gradient = pair.tolist()
@@ -46,7 +46,10 @@ class LossMonitor:
                 self._sums[name] = self._sums.get(name, 0.0) + value
 
     def means(self) -> dict[str, float]:
-        """Of the loss ("loss") and its figures, over the steps since the last call. Raises Diverged."""
+        """Return the means of "loss" and of the metrics since the last call.
+
+        Raises Diverged if the loss does.
+        """
         self.settle()
         count, sums = self._count, self._sums
         self._count, self._sums = 0, {}
@@ -62,4 +65,4 @@ class LossMonitor:
         self._lowest = min(self._lowest, self._running)
         room = _FAR * max(abs(self._level), self._level - self._lowest, 1.0)
         if self._running > self._level + room:
-            raise Diverged(f"the loss began at {self._level:.4g} and is {self._running:.4g} now")
+            raise Diverged(f"the loss rose from {self._level:.4g} to {self._running:.4g}")

@@ -1,4 +1,4 @@
-"""What a training leaves on disk while it runs: log, checkpoints, the state to go on from."""
+"""Files that a training writes while it runs: log, checkpoints and the state to resume from."""
 
 from __future__ import annotations
 
@@ -23,19 +23,32 @@ from spn_model.onboard.view import View
 from spn_model.training.covariance_scale import LEAST_FRAMES, fit_covariance_scale
 from spn_model.training.training_state import Log, Position, save_state
 
-# A later network is kept where its score is at most this times the best one: rates fall towards the end, and
-# validation frames are few and of one or two places.
+# A later network is kept if its score is at most this factor times the best one: learning rates decrease
+# towards the end, and the validation frames are few and show only one or two places.
 _WORSE = 1.25
-_VIEWS = 64  # that judge, at most; one is rendered in about 80 ms
-# By what covariances are scaled, the first that there is. After a few minutes hardly a validation frame is
-# found, for training shows little of their places: errors there tell nothing of places that it shows.
+_VIEWS = 64  # largest number of rendered validation views; one takes about 80 ms
+# Frames used to scale the covariances, in order of preference. After a few minutes of training hardly any
+# validation frame is located, because the training images show little of these places; errors there say
+# nothing about places that training covers.
 _SCALING = ("views", "validation")
-_SHOWN_SHARE = 0.5  # of a validation frame's map points, seen by training images too
+_SHOWN_SHARE = 0.5  # fraction of a validation frame's map points that training images see too
 
 
 @dataclass(frozen=True)
 class Files:
-    """checkpoint : the best by validation; last : as training left it; state : to go on from; log : CSV."""
+    """Files of a training.
+
+    Attributes
+    ----------
+    checkpoint : Path
+        Best network by validation.
+    last : Path
+        Network at the end of the training.
+    state : Path
+        State to resume from.
+    log : Path
+        log.csv.
+    """
 
     checkpoint: Path
     last: Path
@@ -44,20 +57,23 @@ class Files:
 
 
 class Watch(Protocol):
-    """Who follows a training."""
+    """Observer of a training."""
 
     def row(self, values: Mapping[str, Any]) -> None:
-        """A row of the log, by column: event "steps" (figures of the steps since the last one),
-        "validation", "views" or "training" (errors on validation frames, on views that training never
-        draws, and on images that are trained on)."""
+        """Receive a row of the log, by column.
+
+        The event is "steps" (means over the steps since the last one), "validation", "views" or "training"
+        (errors on validation frames, on rendered views that training never draws, and on images that are
+        trained on).
+        """
 
     def wants_stop(self) -> bool:
-        """Asked at each step: True saves the state and ends the training."""
+        """Return whether to save the state and end the training; called at each step."""
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationFrames:
-    """Frames that a member is judged by: some rows of a group of a name, or views, of none."""
+    """Frames on which a model is evaluated during training: rows of a named group, or views without one."""
 
     event: str
     frames: PosedImages
@@ -65,12 +81,12 @@ class ValidationFrames:
     group: str = ""
 
     def errors(self, model: PoseModel, *, scales: bool) -> ValidationErrors:
-        """Of the member's estimates; scales : they also tell how large its covariances have to be."""
-        errors, found = validate(model, self.frames, self.rows)
+        """Return the errors of the model's estimates; if `scales`, also rescale its covariances by them."""
+        errors, estimates = validate(model, self.frames, self.rows)
         if scales:
-            # Too few frames with a pose: covariances stay as they are.
+            # With too few poses, the covariances stay as they are.
             with suppress(GeometryError):
-                factor = fit_covariance_scale(found, self.frames.poses[self.rows])
+                factor = fit_covariance_scale(estimates, self.frames.poses[self.rows])
                 model.set_covariance_scale(min(max(factor, 1e-6), 1e6))
         return errors
 
@@ -78,7 +94,7 @@ class ValidationFrames:
 def select_validation_frames(
     dataset: Dataset, training: DatasetGroup, frames: int, sample: int
 ) -> list[ValidationFrames]:
-    """Validation frames, where there are any, and a sample of those that are trained on."""
+    """Return validation frames, if there are any, and a sample of the training frames."""
     judged = []
     for group in [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size][:1]:
         rows = _shown_to_training(group, training)
@@ -92,10 +108,10 @@ def select_validation_frames(
 
 
 def _shown_to_training(group: DatasetGroup, training: DatasetGroup) -> np.ndarray:
-    """Rows of a group of whose map points training images show half or more; all rows where they are few.
+    """Return the rows of frames at least half of whose map points are seen by training images.
 
-    Of a place that no training image shows a network can know nothing: such frames tell neither which
-    moment of a training was best nor how large covariances are.
+    Returns all rows if these are too few. A network can know nothing about a place that no training image
+    shows, so that such frames indicate neither the best moment of a training nor the size of covariances.
     """
     known = np.unique(np.concatenate(training.point_ids()))
     shares = [np.isin(ids, known).mean() if len(ids) else 0.0 for ids in group.point_ids()]
@@ -105,9 +121,24 @@ def _shown_to_training(group: DatasetGroup, training: DatasetGroup) -> np.ndarra
 
 @dataclass(eq=False)
 class Record:
-    """Written by the first process alone.
+    """Log and checkpoints of a training, written by the first process only.
 
-    position : moves on with the training. facts : what the checkpoints say of it.
+    Attributes
+    ----------
+    files : Files
+        Files to write.
+    watch : Watch
+        Observer of the log.
+    model : PoseModel
+        Model that is trained.
+    view : View
+        Camera and world of the area.
+    judged : list of ValidationFrames
+        Frames to evaluate.
+    position : Position
+        Progress of the training, which is updated.
+    facts : dict
+        Facts that are written into the checkpoints.
     """
 
     files: Files
@@ -125,7 +156,7 @@ class Record:
         self._log = Log(self.files.log, self.position.log_bytes)
 
     def steps(self, stage: str, progress: float, rate: float, figures: Mapping[str, float]) -> None:
-        """Figures of the steps since the last row."""
+        """Log metrics of the steps since the last row."""
         own = {"loss", "images_per_s"}
         others = " ".join(f"{k}={v:.5g}" for k, v in figures.items() if k not in own)
         self._row(
@@ -136,13 +167,14 @@ class Record:
         )
 
     def set_training_frames(self, groups: Sequence[str], images: TrainingSet) -> None:
-        """Before a stage: names of the groups that it or an earlier one learns: they judge no longer.
+        """Set what the next stage trains on.
 
-        images : that it trains on. What it renders of them judges too.
+        Groups trained on by this or an earlier stage, given by name in `groups`, no longer validate. Views
+        rendered from `images` validate too.
         """
         self._learnt, self._images = list(groups), images
-        self.judged = [judged for judged in self.judged if judged.event != "views"]
-        left = [j for j in self.judged if j.event == "training" or j.group not in self._learnt]
+        self.judged = [frames for frames in self.judged if frames.event != "views"]
+        left = [f for f in self.judged if f.event == "training" or f.group not in self._learnt]
         if len(left) == len(self.judged):
             return
         self.judged, latest = left, self.position.latest
@@ -150,7 +182,7 @@ class Record:
             latest["held out"] = latest.pop("validation")
 
     def _with_views(self) -> list[ValidationFrames]:
-        """What judges, with the stage's views, which are rendered when first asked for."""
+        """Return the frames to evaluate, including the stage's views, which are rendered on first use."""
         if self._images is not None:
             views = self.model.held_out_views(self._images, _VIEWS)
             if views is not None:
@@ -160,20 +192,20 @@ class Record:
         return self.judged
 
     def validate(self, stage: str, progress: float) -> None:
-        """Judge, and keep the network where it is among the best so far, or where nothing can tell."""
+        """Evaluate the model; save a checkpoint if it is among the best or nothing can validate it."""
         at = self.position
         began = time.perf_counter()
         judged = self._with_views()
-        events = [one.event for one in judged]
+        events = [frames.event for frames in judged]
         by = next((event for event in _SCALING if event in events), None)
-        found = {one.event: one.errors(self.model, scales=one.event == by) for one in judged}
+        results = {f.event: f.errors(self.model, scales=f.event == by) for f in judged}
         at.validate_s += time.perf_counter() - began
-        for event, errors in found.items():
+        for event, errors in results.items():
             plain = errors.plain()
             self._row(event, stage, progress, plain)
             at.latest[event] = plain
-        if "validation" in found:
-            score = found["validation"].score
+        if "validation" in results:
+            score = results["validation"].score
             if at.best is not None and score > _WORSE * at.best:
                 return
             at.best = score if at.best is None else min(at.best, score)
@@ -181,17 +213,17 @@ class Record:
         checkpoint.save(self.files.checkpoint, self.model, self.view, self.summary())
 
     def save(self, optimizer: torch.optim.Optimizer | None) -> None:
-        """The state to go on from."""
+        """Save the state to resume from."""
         save_state(self.files.state, self.model.network, optimizer, self.position)
 
     def finish(self) -> dict[str, Any]:
-        """The network as it is at the end; facts of the training."""
-        told = self.summary()
-        checkpoint.save(self.files.last, self.model, self.view, told)
-        return told
+        """Save the network as it is at the end; return the facts of the training."""
+        summary = self.summary()
+        checkpoint.save(self.files.last, self.model, self.view, summary)
+        return summary
 
     def summary(self) -> dict[str, Any]:
-        """Facts of the training so far."""
+        """Return the facts of the training so far."""
         at = self.position
         return {
             **self.facts,
@@ -223,21 +255,24 @@ class Record:
         self.watch.row(row)
 
     def close(self) -> None:
+        """Close the log."""
         self._log.close()
 
 
 class Clock:
-    """Seconds of training; what is done in `paused` does not count."""
+    """Stopwatch of the training time, excluding what is done in `paused`."""
 
     def __init__(self, before_s: float):
         self._before_s, self._began = before_s, time.perf_counter()
 
     @property
     def seconds(self) -> float:
+        """Seconds of training so far."""
         return self._before_s + time.perf_counter() - self._began
 
     @contextmanager
     def paused(self) -> Iterator[None]:
+        """Stop the clock within the block."""
         self._before_s = self.seconds
         try:
             yield

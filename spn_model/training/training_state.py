@@ -1,4 +1,4 @@
-"""Where a training stands, so that it can go on after it was stopped: weights, optimiser, position, log."""
+"""State of an interrupted training to resume from: weights, optimiser, position and log."""
 
 from __future__ import annotations
 
@@ -27,13 +27,31 @@ COLUMNS = (
 
 @dataclass
 class Position:
-    """How far a training is.
+    """Progress of a training.
 
-    stage, step : the next to do; steps : done in all stages. drawn, shown : training images drawn, and given
-    to the network, which differ where a member makes more of them or fewer. Seconds : of training in all and
-    in this stage, of validation, and waited for batches (part of training). validated : times in this stage.
-    best : lowest score so far; kept : of the checkpoint: stage, step, errors; latest : errors at the last
-    validation. log_bytes : length of the log.
+    Attributes
+    ----------
+    stage, step : int
+        Next stage and step.
+    steps : int
+        Steps done in all stages.
+    drawn, shown : int
+        Training images drawn, and given to the network; they differ if a pose model makes more or fewer of
+        them.
+    train_s, stage_s : float
+        Seconds of training in total and in this stage.
+    validate_s, wait_s : float
+        Seconds of validation, and of waiting for batches (part of the training time).
+    validated : int
+        Validations in this stage.
+    best : float or None
+        Lowest score so far.
+    kept : dict or None
+        Stage, steps and errors of the checkpoint.
+    latest : dict
+        Errors at the last validation.
+    log_bytes : int
+        Length of the log.
     """
 
     stage: int = 0
@@ -55,7 +73,7 @@ class Position:
 def save_state(
     path: Path, network: nn.Module, optimizer: torch.optim.Optimizer | None, position: Position
 ) -> None:
-    """Write whole. Raises StageError where the disk does not take it."""
+    """Write the state atomically. Raises StageError if it cannot be written."""
     tensors = {_NETWORK + name: t for name, t in network.state_dict().items()}
     if optimizer is not None:
         for index, values in optimizer.state_dict()["state"].items():
@@ -67,14 +85,14 @@ def save_state(
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """What `save_state` saved."""
+    """State of a training read from a file."""
 
     path: Path
     position: Position
     tensors: Mapping[str, Tensor]
 
     def restore_network(self, network: nn.Module) -> None:
-        """Raises FormatError where the state is another network's."""
+        """Load the weights. Raises FormatError if they belong to another network."""
         own = {
             name.removeprefix(_NETWORK): tensor
             for name, tensor in self.tensors.items()
@@ -83,7 +101,7 @@ class TrainingState:
         set_state(network, own, self.path)
 
     def restore_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
-        """Raises FormatError where the state is of other parameters."""
+        """Load the optimiser's state. Raises FormatError if it belongs to other parameters."""
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in self.tensors.items():
@@ -91,11 +109,11 @@ class TrainingState:
                 continue
             index, _, key = name.removeprefix(_OPTIMIZER).partition(".")
             if not index.isdigit() or int(index) >= len(parameters):
-                raise FormatError(f"{self.path}: is of another training; start anew")
+                raise FormatError(f"{self.path}: belongs to another training; start again")
             parameter = parameters[int(index)]
             if tensor.ndim and tensor.shape != parameter.shape:
-                raise FormatError(f"{self.path}: is of another training; start anew")
-            # Fused steps run over memory: moments lie in the order of their parameter.
+                raise FormatError(f"{self.path}: belongs to another training; start again")
+            # Fused steps run over raw memory, so moments need their parameter's memory layout.
             value = torch.empty_like(parameter).copy_(tensor) if tensor.ndim else tensor
             state.setdefault(int(index), {})[key] = value
         whole = optimizer.state_dict()
@@ -103,7 +121,7 @@ class TrainingState:
 
 
 def read_state(path: Path) -> TrainingState | None:
-    """None where there is none. Raises FormatError for a damaged one."""
+    """Read a state; return None if there is none. Raises FormatError if it is damaged."""
     if not path.exists():
         return None
     tensors, document = read_tensors(path, FORMAT)
@@ -117,12 +135,12 @@ def read_state(path: Path) -> TrainingState | None:
         for name in ("train_s", "stage_s", "validate_s", "wait_s"):
             setattr(position, name, float(values[name]))
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: is a damaged state of a training ({error!r})") from error
+        raise FormatError(f"{path}: damaged training state ({error!r})") from error
     return TrainingState(path, position, tensors)
 
 
 class Log:
-    """log.csv: a row a line, on disk as soon as it is written; a resumed training cuts off what is redone."""
+    """log.csv, flushed after each row; resuming truncates rows that will be computed again."""
 
     def __init__(self, path: Path, length: int):
         self._path = path
@@ -136,7 +154,7 @@ class Log:
             self._write(list(COLUMNS))
 
     def write(self, values: Mapping[str, object]) -> int:
-        """Length of the file with this row. Raises StageError where the disk does not take it."""
+        """Append a row and return the length of the file. Raises StageError if it cannot be written."""
         return self._write([_cell(values.get(name)) for name in COLUMNS])
 
     def _write(self, cells: list[str]) -> int:
@@ -150,6 +168,7 @@ class Log:
         return self._file.tell()
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
 

@@ -230,7 +230,7 @@ def test_a_camera_may_look_straight_down():
     )
     assert place.rotations[0, 2] == pytest.approx([0, 0, -1])
     assert np.linalg.det(place.rotations[0]) == pytest.approx(1)
-    with pytest.raises(ValueError, match="nothing of the scene lies below"):
+    with pytest.raises(ValueError, match="no part of the scene is below"):
         overhead_pose(np.random.default_rng(1), below, below + 50, NovelViewOptions(height_m=1.0))
 
 

@@ -117,7 +117,7 @@ def test_what_is_no_file_is_told(tmp_path):
     """A missing path and a folder are the user's mistakes."""
     with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "none.safetensors")
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="is not a file"):
         load(tmp_path)
 
 
@@ -125,11 +125,11 @@ def test_another_file_is_refused(saved, tmp_path):
     """Published weights, another format of ours and another version are named for what they are."""
     path, _, _ = saved
     save_file({"a": torch.zeros(2)}, tmp_path / "w.safetensors")
-    with pytest.raises(FormatError, match="is no checkpoint of this program"):
+    with pytest.raises(FormatError, match="is not a checkpoint of this program"):
         load(tmp_path / "w.safetensors")
-    with pytest.raises(FormatError, match="is no checkpoint of this program"):
+    with pytest.raises(FormatError, match="is not a checkpoint of this program"):
         load(rewritten(path, format="squeezeposenet-state"))
-    with pytest.raises(FormatError, match=r"is of format 2, this program reads 1"):
+    with pytest.raises(FormatError, match=r"has format version 2, this program reads 1"):
         load(rewritten(path, version=2))
     assert load(rewritten(path, format=FORMAT, version=1)).facts["images"] == 96
 
@@ -137,19 +137,22 @@ def test_another_file_is_refused(saved, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"kind": "nerf"}, "there is no kind of network 'nerf'"),
+        ({"kind": "nerf"}, "unknown kind of network 'nerf'"),
         ({"kind": 3}, "damaged checkpoint"),
         ({"options": {"depth": 3}}, "kind tiny has no option 'depth'"),
-        ({"options": {"width": 6}}, "5 of float32, 6 of float32 is needed|is of another network"),
+        (
+            {"options": {"width": 6}},
+            "5 of float32, needs to be 6 of float32|belongs to another network",
+        ),
         ({"options": None}, "damaged checkpoint"),
         ({"view": {}}, "damaged checkpoint"),
         ({"view": []}, "damaged checkpoint"),
         ({"facts": None}, "damaged checkpoint"),
-        ({"out.bias": None}, r"is of another network: it holds no 'out\.bias'"),
-        ({"out.bias": torch.zeros(6)}, "'out.bias' is 6 of float32, 7 of float32 is needed"),
+        ({"out.bias": None}, r"belongs to another network: 'out\.bias' is missing"),
+        ({"out.bias": torch.zeros(6)}, "'out.bias' is 6 of float32, needs to be 7 of float32"),
         ({"out.bias": torch.zeros(7).double()}, "'out.bias' is 7 of float64"),
-        ({"out.bias": torch.full((7,), torch.nan)}, "'out.bias' holds values that are not finite"),
-        ({"more": torch.zeros(1)}, "is of another network, which has 'more'"),
+        ({"out.bias": torch.full((7,), torch.nan)}, "'out.bias' has values that are not finite"),
+        ({"more": torch.zeros(1)}, "belongs to another network: unexpected 'more'"),
     ],
 )
 def test_what_does_not_fit_is_refused(saved, changes, told):
@@ -166,7 +169,7 @@ def test_a_file_cut_short_is_refused(saved):
     content = path.read_bytes()
     for length in (0, 7, 100, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:length])
-        with pytest.raises(FormatError, match="is no checkpoint, or damaged"):
+        with pytest.raises(FormatError, match="is not a checkpoint, or damaged"):
             load(path)
 
 

@@ -199,10 +199,10 @@ def test_published_weights_are_loaded(data):
 @pytest.mark.parametrize(
     ("stage", "message"),
     [
-        ({"tilt": 3}, "'tilt' is not known"),
+        ({"tilt": 3}, "unknown option 'tilt'"),
         ({"tilt_deg": "3"}, "tilt_deg is '3', needs a float"),
         ({"look": 1}, "look is 1, needs a bool"),
-        ({"zoom_min": 2.0, "zoom_max": 1.0}, "zoom_max is 1.0, needs to lie from 2.0 to 10"),
+        ({"zoom_min": 2.0, "zoom_max": 1.0}, "zoom_max is 1.0, needs to be from 2.0 to 10"),
         ({"freeze_layers": 14}, "freeze_layers is 14"),
         ({"tilt_deg": float("nan")}, "needs a finite number"),
         ({"views_share": 0.5, "surfaces": False}, "needs surfaces"),
@@ -269,7 +269,7 @@ def test_options_of_decoding_make_the_member():
     assert SceneCoordinatesModel.make(model.options).network.shrink == 1
     assert SceneCoordinatesModel.make(model.options).decoding == model.decoding
     assert model.decoding.cells == 300
-    with pytest.raises(InputError, match="'cell' is not known"):
+    with pytest.raises(InputError, match="unknown option 'cell'"):
         SceneCoordinatesModel.make({"cell": 300})
 
 
@@ -289,7 +289,7 @@ def test_an_image_of_nothing_has_no_pose(data):
     found = model.estimate(grey, intrinsics)
     assert np.isnan(found.poses.centers).all()
     assert np.isnan(found.covariance).all()
-    assert "0 cells are sure of what they show" in found.reasons[0]
+    assert "only 0 cells are confident" in found.reasons[0]
     assert found.reasons[1] == "its camera is not known"
 
 

@@ -273,7 +273,7 @@ def test_without_points_nothing_is_known(count):
     few = FramePoints(some.ids[:count], some.pixels[:count], some.xyz[:count])
     seen = surface(few, pose, LENS.matrix, SIZE, SurfaceOptions())
     assert np.isnan(seen.xyz(np.array([[100.0, 100.0]]))).all()
-    with pytest.raises(ValueError, match="nothing is known"):
+    with pytest.raises(ValueError, match="surface that the image shows is unknown"):
         nearby_pose(np.random.default_rng(0), seen, NovelViewOptions())
 
 

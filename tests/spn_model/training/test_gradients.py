@@ -104,5 +104,5 @@ def test_parts_draw_the_images_of_a_whole_batch(field, in_parts, tmp_path):
 def test_a_network_with_statistics_of_the_batch_has_no_parts(field, tmp_path):
     """A pose regressor normalises by the whole batch: parts are refused before anything is trained."""
     recipe = replace(RECIPE, kind="regression", options={})
-    with pytest.raises(InputError, match="computes a batch as a whole: parts needs to be 1"):
+    with pytest.raises(InputError, match="cannot split a batch: parts needs to be 1"):
         train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())

@@ -63,23 +63,23 @@ def test_a_recipe_is_read_whole(tmp_path):
     ("old", "new", "told"),
     [
         ('kind = "regression"', 'kin = "regression"', "kind is missing"),
-        ('momentum = 0.8', "momentun = 0.8", ":4: 'momentun' is no key of a recipe"),
-        ("momentum = 0.8", "momentum = 1.0", ":4: momentum is 1.0, needs to lie in"),
-        ("momentum = 0.8", 'momentum = "0.8"', ":4: momentum is '0.8', needs a number"),
+        ('momentum = 0.8', "momentun = 0.8", ":4: unknown key 'momentun' of a recipe"),
+        ("momentum = 0.8", "momentum = 1.0", ":4: momentum is 1.0, needs to be in"),
+        ("momentum = 0.8", 'momentum = "0.8"', ":4: momentum is '0.8', needs to be a number"),
         ('"sgd"', '"adam"', ":3: optimizer is 'adam', needs to be one of adamw, sgd, muon"),
-        ("batch = 4", "batch = 4.5", ":10: batch is 4.5, needs a whole number"),
-        ("batch = 4", "batch = true", ":10: batch is True, needs a whole number"),
-        ("batch = 4", "batch = 0", ":10: batch is 0, needs to lie from 1 to"),
-        ("batch = 4", "batch = 4\nparts = 3", ":11: parts is 3, needs to divide the batch of 4"),
-        ("rate = 1", "rate = nan", ":11: rate is nan, needs to lie from 0 to 100"),
-        ("rate = 1", "speed = 1", ":11: 'speed' is no key of a stage"),
+        ("batch = 4", "batch = 4.5", ":10: batch is 4.5, needs to be an integer"),
+        ("batch = 4", "batch = true", ":10: batch is True, needs to be an integer"),
+        ("batch = 4", "batch = 0", ":10: batch is 0, needs to be from 1 to"),
+        ("batch = 4", "batch = 4\nparts = 3", ":11: parts is 3, needs to divide the batch size 4"),
+        ("rate = 1", "rate = nan", ":11: rate is nan, needs to be from 0 to 100"),
+        ("rate = 1", "speed = 1", ":11: unknown key 'speed' of a stage"),
         ('"constant"', '"linea"', ":19: schedule is 'linea', needs to be one of cosine, linear, constant"),
-        ('"none"', "1", ":2: weights is 1, needs a text"),
-        ("[stages.options]", "[stages.option]", ":13: 'option' is no key of a stage"),
-        ("images = 900", "minutes = 900", ":7: all stages need a budget: all images, or all min"),
+        ('"none"', "1", ":2: weights is 1, needs to be a string"),
+        ("[stages.options]", "[stages.option]", ":13: unknown key 'option' of a stage"),
+        ("images = 900", "minutes = 900", ":7: all stages need a budget, either all in images"),
         ("images = 900", "images = 0", ":7: all stages need a budget"),
-        ("[[stages]]", "[stages]", "is no recipe that can be read"),
-        ("kind =", "kind", r"is no recipe that can be read: .*line 1"),
+        ("[[stages]]", "[stages]", "is not a valid recipe"),
+        ("kind =", "kind", r"is not a valid recipe: .*line 1"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_told_with_its_line(tmp_path, old, new, told):
@@ -93,14 +93,14 @@ def test_a_mistake_is_told_with_its_line(tmp_path, old, new, told):
 
 def test_what_is_no_recipe_is_refused(tmp_path):
     """A name that there isn't, a file without stages, one that is large, one that is not text."""
-    with pytest.raises(InputError, match=r"there is no recipe 'none': .* default, paper"):
+    with pytest.raises(InputError, match=r"unknown recipe 'none'; .* default, paper"):
         read_recipe("none")
-    with pytest.raises(InputError, match=r"\[\[stages\]\] is needed"):
+    with pytest.raises(InputError, match=r"a recipe needs 1 to 50 tables \[\[stages\]\]"):
         read_recipe(str(written(tmp_path, 'kind = "regression"\n')))
     with pytest.raises(InputError, match="is too large to be a recipe"):
         read_recipe(str(written(tmp_path, "#" * 200_000)))
     (tmp_path / "my.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match="is no recipe that can be read"):
+    with pytest.raises(InputError, match="is not a valid recipe"):
         read_recipe(str(tmp_path / "my.toml"))
 
 
