@@ -1,9 +1,9 @@
-"""Do two georegistered areas agree on the poses of the frames that both hold?
+"""Compare the poses of the common frames of two georegistered areas.
 
     python benchmarks/agreement.py AREA OTHER_AREA [--json OUT]
 
-Frames are paired by the name of their file. Positions are compared in the world, as georegistered, and
-after the best similarity of one to the other, which leaves the difference of the two reconstructions.
+Frames are paired by file name. Positions are compared in the world, as georegistered, and after alignment by
+the best similarity, which leaves the difference between the two reconstructions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from spn_data.area.area import GEO, Area
+from spn_data.area.area import Area
+from spn_data.area.names import GEO, GEO_FIT
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
@@ -25,9 +26,9 @@ from spn_data.storage.json_files import read_json
 
 
 def compare(area: Area, other: Area) -> dict[str, Any]:
-    """Differences in metres and degrees over the common frames."""
+    """Return differences in metres and degrees over the common frames."""
     scenes = [read_scene(a.folder(GEO)) for a in (area, other)]
-    fits = [GeoFit.from_json(read_json(a.folder(GEO) / "geo.json")) for a in (area, other)]
+    fits = [GeoFit.from_json(read_json(a.folder(GEO) / GEO_FIT)) for a in (area, other)]
     rows = [_by_stem(scene) for scene in scenes]
     common = sorted(set(rows[0]) & set(rows[1]))
     first, second = (
@@ -65,11 +66,12 @@ def _by_stem(scene: Scene) -> dict[str, int]:
 
 
 def _same_zero(a: GeoOrigin, b: GeoOrigin) -> bool:
-    """Heights above take-off of two flights need not count from one point."""
+    """Return whether heights are comparable; two take-off points may have different heights."""
     return a.height_reference == b.height_reference != "takeoff"
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -1,9 +1,9 @@
-"""Errors of what needs no training, on the evaluation groups of a data set, with time and memory.
+"""Errors, time and memory of the baselines without training, on the evaluation groups of a dataset.
 
     python benchmarks/baselines.py DATASET [--out FOLDER]
 
-DATASET is a dataset.h5. --out writes metrics.json, errors.csv and figures there. Seconds are CPU seconds of
-one thread for one image: VLAD includes SIFT, GeM includes the network; looking up is counted with both.
+DATASET is a dataset.h5. --out writes metrics.json, errors.csv and figures to a folder. Times are CPU
+seconds of one thread per image: VLAD includes SIFT, GeM includes the network, both include the search.
 """
 
 from __future__ import annotations
@@ -21,19 +21,29 @@ from rich.table import Table
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.evaluation import figures
-from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, baselines, better, gem, vlad
+from spn_model.evaluation.baselines import (
+    GEM,
+    VLAD,
+    Describe,
+    Images,
+    baselines,
+    better_retrieval,
+    gem,
+    vlad,
+)
 from spn_model.evaluation.feature_maps import squeezenet_maps
 from spn_model.evaluation.metrics import Evaluation, axes_of, evaluate, evaluation_frames
 from spn_model.evaluation.tables import header, paper_rows, rows, write_errors, write_metrics
 
 
 class Timed:
-    """A way of describing images that counts its images and CPU seconds."""
+    """Image descriptor that counts its images and CPU seconds."""
 
     def __init__(self, describe: Describe):
         self.describe, self.images, self.seconds = describe, 0, 0.0
 
     def __call__(self, images: Images):
+        """Describe images."""
         start = time.process_time()
         found = self.describe(images)
         self.seconds += time.process_time() - start
@@ -42,6 +52,7 @@ class Timed:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -75,7 +86,7 @@ def main() -> None:
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
         everything = [one for of in found for one in of]
-        best = {of[0].frames.group: better(of[2:]).method for of in found}
+        best = {of[0].frames.group: better_retrieval(of[2:]).method for of in found}
         write_metrics(
             arguments.out / "metrics.json", everything, units=units, retrieval=best, facts=facts
         )
@@ -91,6 +102,7 @@ def main() -> None:
 
 
 def show(evaluations: list[Evaluation]) -> None:
+    """Print the table of one group."""
     titles = header(evaluations)
     group = evaluations[0].frames.group
     table = Table(title=group, title_justify="left", box=None)
@@ -102,6 +114,7 @@ def show(evaluations: list[Evaluation]) -> None:
 
 
 def peak_mb() -> float:
+    """Return the peak memory of this process in MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -1,7 +1,7 @@
-"""The two that `reconstruct.py` compares, each run as `python benchmarks/contestants.py WHO JOB.json`.
+"""The two reconstructions compared by `reconstruct.py`: `python benchmarks/contestants.py WHO JOB.json`.
 
-A process of its own for each: a native abort of one ends neither the other nor the comparison, and its
-cost is that of the process. Modules are imported where they are used, because worker processes import
+Each runs in a separate process, so that a native abort of one ends neither the other nor the comparison, and
+its cost is that of the process. Modules are imported where they are used, because worker processes import
 this file again.
 """
 
@@ -24,7 +24,7 @@ RESULT = "result.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What both are told. `work` is an existing, empty folder."""
+    """Task given to both. `work` is an existing, empty folder."""
 
     area: str
     work: str
@@ -34,7 +34,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What one of them made: a folder with a model, or why there is none, and what it did on the way."""
+    """Result of one of them: the folder with the model, or why there is none, with times and notes."""
 
     model: str | None
     failure: str | None = None
@@ -44,7 +44,7 @@ class Result:
 
 
 def run_ours(frames: FramesToMap, job: Job, stopwatch: Stopwatch) -> tuple[Path, tuple[str, ...]]:
-    """Our reconstruction with its default options."""
+    """Run our reconstruction with its default options."""
     from spn_data.reconstruction.attempts import ReconstructOptions
     from spn_data.reconstruction.reconstruct import reconstruct
 
@@ -56,10 +56,10 @@ def run_ours(frames: FramesToMap, job: Job, stopwatch: Stopwatch) -> tuple[Path,
 def run_pycolmap(
     frames: FramesToMap, chosen: Frames, job: Job, stopwatch: Stopwatch
 ) -> tuple[Path, tuple[str, ...]]:
-    """pycolmap's own pipeline as its documentation has it: default options, but threads and seeds.
+    """Run pycolmap's pipeline as documented, with default options except for threads and seeds.
 
-    It is given what ours is given: the frames, one camera a flight with the same start intrinsics, masks.
-    Video is matched in sequence, photos with a position by distance, other photos exhaustively.
+    It gets the same input as ours: frames, one camera per flight with the same initial intrinsics, masks.
+    Video is matched sequentially, photos with a position spatially, other photos exhaustively.
     """
     import numpy as np
 
@@ -116,8 +116,8 @@ def run_pycolmap(
     with pycolmap.Database.open(database) as native:
         fitting = sum(n > 0 for n in native.read_two_view_geometry_num_inliers()[1])
         pairs = f"{fitting} of {native.num_matched_image_pairs()} pairs fit"
-    told = f"{' and '.join(how)}; models of {', '.join(map(str, sorted(sizes.values())[::-1]))}"
-    return output / str(largest), (told, pairs)
+    summary = f"{' and '.join(how)}; models of {', '.join(map(str, sorted(sizes.values())[::-1]))}"
+    return output / str(largest), (summary, pairs)
 
 
 def _add_camera(native: object, frames: FramesToMap, key: str) -> int:
@@ -128,7 +128,7 @@ def _add_camera(native: object, frames: FramesToMap, key: str) -> int:
 
 
 def _write_priors(database: Path, frames: FramesToMap, located: object) -> None:
-    """Positions as we have them, in place of those that extraction took from EXIF by itself."""
+    """Replace the positions that extraction took from EXIF by ours."""
     from spn_data.colmap import pycolmap
 
     positions = dict(zip(frames.names, frames.positions_m, strict=True))
@@ -147,7 +147,9 @@ def _write_priors(database: Path, frames: FramesToMap, located: object) -> None:
 
 
 def main(who: str, job: Job) -> None:
-    from spn_data.area.area import FRAMES, Area
+    """Run one of the two and write its result to the work folder."""
+    from spn_data.area.area import Area
+    from spn_data.area.names import FRAMES
     from spn_data.capture.frames import read_frames
     from spn_data.errors import StageError
     from spn_data.pipeline.model_stage import frames_to_map
@@ -167,7 +169,7 @@ def main(who: str, job: Job) -> None:
         elif who == PYCOLMAP:
             model, notes = run_pycolmap(to_map, chosen, job, stopwatch)
         else:
-            raise ValueError(f"no contestant {who!r}")
+            raise ValueError(f"unknown contestant {who!r}")
     except StageError as error:
         failure = str(error)
     result = Result(

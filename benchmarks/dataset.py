@@ -1,10 +1,10 @@
-"""What it costs to write a data set: time, memory, size of the file, and whether memory grows with frames.
+"""Cost of writing a dataset: time, memory, file size, and whether memory grows with the number of frames.
 
     python benchmarks/dataset.py AREA [--frames 1000 10000] [--folder DIR] [--json OUT]
 
-The mapping frames of AREA are read from their files, undistorted, reduced and written over and over, each
-with noise of its own (another part of one large field), until there are as many frames as asked for. Each
-number of frames is measured in a process of its own.
+The mapping frames of AREA are read from their files, undistorted, reduced and written repeatedly, each time
+with different noise (another part of one large field), until the requested number of frames is reached. Each
+number of frames is measured in a separate process.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ _READS = 500
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one data set. early_mb, late_mb : resident memory after 100 frames, and after the last."""
+    """Cost of one dataset. early_mb, late_mb : resident memory after 100 frames and after the last one."""
 
     frames: int
     points: int
     early_mb: float
     late_mb: float
-    peak_mb: float  # of the whole process, reading the map included
+    peak_mb: float  # of the whole process, including reading the map
     wall_s: float
     cpu_s: float
-    write_s: float  # of wall_s, in the writer
+    write_s: float  # part of wall_s spent in the writer
     file_gb: float
-    read_ms: float  # one image at random, from a warm page cache
+    read_ms: float  # time to read a random image from a warm page cache
 
 
 def write(area_folder: Path, target: Path, frames: int) -> Cost:
-    """Write `frames` frames, eight of ten for training."""
+    """Write a dataset with `frames` frames, eight of ten for training, and measure the cost."""
     labelled = read_labelled_area(Area(area_folder))
     labels = labelled.mapping.select(np.flatnonzero(labelled.mapping.registered))
     seen = labelled.mapping_seen.select(np.flatnonzero(labelled.mapping.registered))
@@ -135,7 +135,7 @@ def _read_ms(path: Path) -> float:
         assert group.image_size is not None
         out = np.empty((*group.image_size[::-1], 3), np.uint8)
         rows = np.random.default_rng(0).integers(0, len(group), _READS)
-        for row in rows:  # once to have it in memory
+        for row in rows:  # warm the page cache
             group.image(int(row), out)
         begin = time.perf_counter()
         for row in rows:
@@ -149,11 +149,12 @@ def _resident_mb() -> float:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("area", type=Path)
     parser.add_argument("--frames", type=int, nargs="+", default=[1000, 10_000])
-    parser.add_argument("--folder", type=Path, help="where to write; the system's temporary folder")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--folder", type=Path, help="where to write [default: a temporary folder]")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child is not None:

@@ -1,12 +1,13 @@
-"""Georegistration judged as a method: many draws of GNSS and gimbal errors on one reconstruction.
+"""Monte Carlo evaluation of georegistration: many draws of GNSS and gimbal errors on one reconstruction.
 
     python benchmarks/georegister.py [--draws 200] [--seed 1] [--json OUT]
     python benchmarks/georegister.py --area AREA --flights FLIGHTS
 
-Without an area, the model of each draw is the simulator's exact poses with 1 cm and 0.03 degrees of noise,
-its rotations as a whole 0.02 degrees off, in another gauge. With one, its reconstruction is taken, FLIGHTS
-being what `spn-data simulate` wrote; the draws replace its telemetry. The oracle is the plain least-squares
-similarity of the true centres to the same fixes without bursts. Errors are against the truth, unaligned.
+Without an area, the model of each draw consists of the simulator's exact poses with 1 cm and 0.03 degrees
+of noise and a common rotation error of 0.02 degrees, in an arbitrary gauge. With an area, its reconstruction
+is used, FLIGHTS being the output of `spn-data simulate`; the draws replace its telemetry. The oracle is the
+plain least-squares similarity of the true centres to the same fixes without bursts. Errors are relative to
+the ground truth, without alignment.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from spn_data.area.names import FRAMES_TABLE
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
 from spn_data.georegistration import (
@@ -40,7 +42,7 @@ from spn_data.telemetry.track import Telemetry
 FRAMES_PER_S = 1.2
 MODEL_SIGMA_M = 0.01
 MODEL_SIGMA_DEG = 0.03
-# Between a model's rotations as a whole and its positions as a whole; bundle adjustments of exact flights
+# Common rotation of a model's orientations relative to its positions; bundle adjustments of exact flights
 # with 0.5 to 1 px of noise gave 0.003 to 0.05 degrees.
 MODEL_BEND_DEG = 0.02
 FIGURES = ("position_m", "horizontal_m", "vertical_m", "tilt_deg", "heading_deg", "scale")
@@ -48,7 +50,7 @@ FIGURES = ("position_m", "horizontal_m", "vertical_m", "tilt_deg", "heading_deg"
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A reconstruction with its truth: N frames of some flights."""
+    """A reconstruction of N frames of some flights, with its ground truth."""
 
     paths: dict[str, FlightPath]
     sequence: list[str]
@@ -59,7 +61,7 @@ class Model:
 
 
 def simulated_model(options: SimulateOptions, draw: int = 0) -> Model:
-    """The simulator's own poses of about `FRAMES_PER_S` frames, a little off, in a gauge of their own."""
+    """Perturb the simulator's poses at about `FRAMES_PER_S` and move them to an arbitrary gauge."""
     paths = {n: p for n, p in simulate_paths(options).items() if p.role == "mapping"}
     rng = np.random.default_rng([options.seed, draw, 77])
     sequence: list[str] = []
@@ -92,8 +94,9 @@ def simulated_model(options: SimulateOptions, draw: int = 0) -> Model:
 
 
 def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptions]:
-    """A real reconstruction of simulated flights, and the options that these were made with."""
-    from spn_data.area.area import FRAMES, MODEL, Area
+    """Read a real reconstruction of simulated flights, and the options of the simulation."""
+    from spn_data.area.area import Area
+    from spn_data.area.names import FRAMES, MODEL
     from spn_data.capture.frames import read_frames
     from spn_data.colmap.model import read_scene
 
@@ -108,7 +111,7 @@ def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptio
     paths = {n: p for n, p in simulate_paths(options).items() if p.role == "mapping"}
     folder = Area(area)
     scene = read_scene(folder.folder(MODEL))
-    frames = read_frames(folder.folder(FRAMES) / "frames.csv")
+    frames = read_frames(folder.folder(FRAMES) / FRAMES_TABLE)
     row = {name: k for k, name in enumerate(frames.names.tolist())}
     frames = frames.select(np.array([row[name] for name in scene.names]))
     sequence = frames.sequences.tolist()
@@ -122,7 +125,7 @@ def reconstructed_model(area: Path, flights: Path) -> tuple[Model, SimulateOptio
 
 
 def read_as_written(path: FlightPath, options: SimulateOptions, sigma_m: float | None) -> Telemetry:
-    """Telemetry of a draw, rounded as in the subtitle file."""
+    """Return the telemetry of a draw, rounded as in the subtitle file."""
     drawn = simulate_telemetry(path, options)
     return Telemetry.from_columns(
         drawn.time_s,
@@ -137,7 +140,7 @@ def read_as_written(path: FlightPath, options: SimulateOptions, sigma_m: float |
 def fixes_of_draw(
     model: Model, options: SimulateOptions, sigma_m: float | None
 ) -> tuple[Telemetry, Telemetry]:
-    """Telemetry of the frames, and the same without bursts."""
+    """Return the telemetry of the frames, and the same without bursts."""
     calm = replace(options, gnss=replace(options.gnss, burst_interval_s=float("inf")))
     both = []
     for o in (options, calm):
@@ -147,8 +150,8 @@ def fixes_of_draw(
 
 
 def judge(fit: GeoFit, model: Model, options: SimulateOptions, calm: Telemetry) -> dict[str, Any]:
-    """Errors of a fit and of the oracle, and how many sigma the fit is off by its own statement."""
-    # The truth's zero in the fit's frame: both have the same axes within the courtyard.
+    """Return the errors of a fit and of the oracle, and the errors of the fit in stated sigmas."""
+    # Origin of the truth in the frame of the fit: within the courtyard both have the same axes.
     true_origin = np.array([[options.origin.lat_deg, options.origin.lon_deg, 0.0]])
     shift = fit.origin.enu_from_wgs84(true_origin)[0] * [1, 1, 0]
     true = Similarity(
@@ -201,7 +204,7 @@ def draw_many(
     sigma_m: float | None = None,
     fit_options: GeoregisterOptions | None = None,
 ) -> dict[str, Any]:
-    """Judgements of all draws; those refused are counted apart."""
+    """Evaluate all draws; refused ones are counted separately."""
     model = model_of_draw(0)
     judged, refused = [], []
     begin = time.perf_counter()
@@ -258,7 +261,7 @@ def _quantiles(values: np.ndarray) -> dict[str, float]:
 def draw_offsets(
     model: Model, options: SimulateOptions, draws: int, offset_s: float
 ) -> dict[str, Any]:
-    """Errors of the estimated time offset, flight by flight."""
+    """Evaluate the estimated time offset, flight by flight."""
     errors, sigmas, reasons = [], [], []
     sequence = np.array(model.sequence)
     for k in range(draws):
@@ -309,13 +312,14 @@ def show(title: str, figures: dict[str, Any]) -> None:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1, help="of the flights' paths")
-    parser.add_argument("--cases", nargs="*", help="only these (default all)")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of the flight paths")
+    parser.add_argument("--cases", nargs="*", help="run only these cases [default: all]")
     parser.add_argument("--area", type=Path)
     parser.add_argument("--flights", type=Path)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()
     options = preset("standard", seed=args.seed)
     model: Model | None = None

@@ -1,11 +1,11 @@
-"""How the cost of a reconstruction grows with the number of frames, at constant overlap.
+"""Growth of the cost of a reconstruction with the number of frames, at constant overlap.
 
     python benchmarks/growth.py FOLDER [--frames 100 300 1000 3000] [--threads 2] [--json OUT]
 
-For each number, a simulated survey looks down from 45 m on an area that is proportionally larger: parallel
-lines 14 m apart, a frame every 7.5 m, 12 houses a hectare, 960x540 pixels. Flights and frames are kept in
-FOLDER, and used again by the next run; 3,000 frames take minutes to render and half an hour to reconstruct
-on two cores. Counted is what `reconstruct.py` counts, child processes included.
+For each number, a nadir survey is simulated at 45 m over a proportionally larger area: parallel lines 14 m
+apart, a frame every 7.5 m, 12 houses per hectare, 960x540 pixels. Flights and frames are kept in FOLDER and
+reused by the next run; 3,000 frames take minutes to render and half an hour to reconstruct on two cores.
+Costs are measured as in `reconstruct.py`, including child processes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from reconstruct import STAGES, errors_against_truth, machine, run
 from rich.console import Console
 from rich.table import Table
 
-from spn_data.area.area import FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, FRAMES_TABLE
 from spn_data.capture.frames import read_frames
 from spn_data.pipeline.frames_stage import FramesOptions, choose_frames, plan
 from spn_data.simulate.flight import simulate_paths
@@ -31,20 +32,20 @@ from spn_data.simulate.presets import MappingPaths, SimulateOptions, preset
 from spn_data.simulate.produce import simulate
 
 VERSION = 1  # of the JSON
-_STEP_M = 7.5  # between frames; the flight is 5 m/s fast
+_STEP_M = 7.5  # between frames; the flight speed is 5 m/s
 _SPEED_M_S = 5.0
 
 
 def survey(frames: int) -> SimulateOptions:
-    """A flight of about so many frames."""
+    """Return options of a flight with about the given number of frames."""
     options = replace(
         preset("demo"),
         mapping_paths=MappingPaths.NADIR,
         only=("mapping",),
         fps=_SPEED_M_S / _STEP_M,
-        texels_per_m=12.0,  # of 15 pixels a metre
+        texels_per_m=12.0,  # images have 15 pixels per metre
         houses_per_hectare=12.0,
-        blur_share=0.0,  # sharp frames beside it to take instead are not there
+        blur_share=0.0,  # there are no sharp frames nearby to use instead
     )
     low, high = 0.5, 200.0  # area factors
     for _ in range(20):
@@ -55,7 +56,7 @@ def survey(frames: int) -> SimulateOptions:
 
 
 def area_with_frames(folder: Path, frames: int, console: Console) -> tuple[Area, Path]:
-    """An area with its first stage, and the flight; both are made where they are not there yet."""
+    """Return an area with its first stage and the flight; create both if they do not exist yet."""
     flights, area = folder / f"flights-{frames}", Area(folder / f"area-{frames}")
     if not flights.exists():
         with console.status(f"{frames} frames: rendering") as status:
@@ -73,10 +74,10 @@ def area_with_frames(folder: Path, frames: int, console: Console) -> tuple[Area,
 
 
 def measure(area: Area, flights: Path, threads: int) -> dict[str, Any]:
-    """Figures of one reconstruction with our default options."""
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    """Measure one reconstruction with our default options."""
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     chosen = frames.select(frames.chosen)
-    for name in chosen.names.tolist():  # into the page cache
+    for name in chosen.names.tolist():  # warm the page cache
         (area.folder(FRAMES) / name).read_bytes()
     with tempfile.TemporaryDirectory(prefix="growth-") as work:
         folder = area.folder(FRAMES).parent.resolve()
@@ -87,8 +88,8 @@ def measure(area: Area, flights: Path, threads: int) -> dict[str, Any]:
 
 
 def show(rows: list[dict[str, Any]], console: Console) -> None:
-    """Per frame, so that what grows faster than their number is seen at once."""
-    table = Table(title="CPU seconds a frame", title_justify="left", box=None)
+    """Print the cost per frame, which shows what grows faster than their number."""
+    table = Table(title="CPU seconds per frame", title_justify="left", box=None)
     for column in ("frames", "registered", *STAGES, "all", "wall s", "MB", "median cm", "p95 cm"):
         table.add_column(column, justify="right")
     for row in rows:
@@ -110,6 +111,7 @@ def show(rows: list[dict[str, Any]], console: Console) -> None:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

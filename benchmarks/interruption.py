@@ -1,12 +1,12 @@
-"""Kill `spn-data reconstruct` at random moments, let it go on, and compare with an uninterrupted run.
+"""Kill `spn-data reconstruct` at random times, resume it, and compare with an uninterrupted run.
 
     python benchmarks/interruption.py SOURCE [--kills 10] [--seed 0] [--json OUT] [-- OPTIONS...]
 
-SOURCE is a folder of flights; OPTIONS go to `spn-data reconstruct`, with one thread. The moments are drawn
-evenly over the uninterrupted run. A kill is SIGKILL of the main process, or with --victim of one worker or
-of the child that maps. Repeated work is the CPU time of the killed and the resumed run together beyond the
-uninterrupted one's, all processes counted. Differences are between the poses of the finished areas, as
-they are and after the best similarity.
+SOURCE is a folder of flights; OPTIONS are passed to `spn-data reconstruct`, which uses one thread. The times
+are drawn uniformly over the uninterrupted run. A kill is a SIGKILL of the main process, or with --victim of a
+worker or of the mapping process. Repeated work is the CPU time of the killed and the resumed run together
+beyond that of the uninterrupted one, over all processes. Differences are between the poses of the finished
+areas, without alignment and after the best similarity.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area.area import GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import GEO, MODEL
 from spn_data.colmap.model import read_scene
 from spn_data.geometry.pose import Similarity, pose_errors
 
@@ -35,17 +36,17 @@ STEPS = ("analysis", "frames", "features", "matching", "mapping", "refinement", 
 
 @dataclass(frozen=True)
 class Difference:
-    """Of two areas made from the same; lengths in metres, or in units of the model without telemetry."""
+    """Difference of two areas from the same sources; in metres, or in model units without telemetry."""
 
     same_frames: bool
-    largest_as_is_m: float  # distance of two centres, nothing aligned
+    largest_as_is_m: float  # largest distance of two centres without alignment
     position_m: float  # largest after the best similarity
     rotation_deg: float
 
 
 @dataclass(frozen=True)
 class Kill:
-    """One kill and what came of it; repeated_cpu_s : CPU seconds beyond those of the uninterrupted run."""
+    """One kill and its effect. repeated_cpu_s : CPU seconds beyond those of the uninterrupted run."""
 
     after_s: float
     step: str
@@ -56,7 +57,7 @@ class Kill:
 
 
 class Run:
-    """One `spn-data reconstruct` in a process group of its own, as under a terminal."""
+    """A run of `spn-data reconstruct` in its own process group, as under a terminal."""
 
     def __init__(self, sources: list[Path], area: Path, options: list[str]):
         self.log = area.with_suffix(".log")
@@ -72,25 +73,26 @@ class Run:
 
     @property
     def output(self) -> str:
+        """What this run has printed so far."""
         return self.log.read_text()[self._from :]
 
     @property
     def step(self) -> str:
-        """The step that was told last."""
+        """The step reported last."""
         lines = [line.split(":")[0] for line in self.output.splitlines()]
         known = [line for line in lines if line.startswith(STEPS) or line[:2] in ("1-", "2-", "3-")]
         return known[-1] if known else "start"
 
     def wait_for(self, line_start: str, timeout_s: float = 120) -> None:
-        """Until a line of the output begins so."""
+        """Wait until a line of the output starts with the text; raise RuntimeError if it does not appear."""
         deadline = time.monotonic() + timeout_s
         while not any(line.startswith(line_start) for line in self.output.splitlines()):
             if self.process.poll() is not None or time.monotonic() > deadline:
-                raise RuntimeError(f"{line_start!r} did not come:\n{self.output}")
+                raise RuntimeError(f"{line_start!r} did not appear:\n{self.output}")
             time.sleep(0.02)
 
     def family(self) -> list[int]:
-        """Processes below the main one."""
+        """Return the descendants of the main process."""
         parents = {}
         for stat in Path("/proc").glob("[0-9]*/stat"):
             fields = _stat(stat)
@@ -103,7 +105,7 @@ class Run:
         return found
 
     def cpu_s(self) -> float:
-        """CPU seconds so far, of all its processes, those that have ended included."""
+        """Return the CPU seconds of all its processes so far, including those that have ended."""
         ticks = 0
         for pid in (self.process.pid, *self.family()):
             fields = _stat(Path(f"/proc/{pid}/stat"))
@@ -111,7 +113,7 @@ class Run:
         return ticks / _TICKS
 
     def finish(self, timeout_s: float = 600) -> float:
-        """Wait for a good end; CPU seconds of it all."""
+        """Wait for the end and return the CPU seconds of all processes; raise RuntimeError on failure."""
         deadline = time.monotonic() + timeout_s
         while True:
             pid, status, used = os.wait4(self.process.pid, os.WNOHANG)
@@ -119,15 +121,15 @@ class Run:
                 break
             if time.monotonic() > deadline:
                 self.kill()
-                raise RuntimeError(f"not done after {timeout_s:.0f} s:\n{self.output}")
+                raise RuntimeError(f"not finished after {timeout_s:.0f} s:\n{self.output}")
             time.sleep(0.05)
         self.process.returncode = os.waitstatus_to_exitcode(status)
         if self.process.returncode != 0:
-            raise RuntimeError(f"ended with {self.process.returncode}:\n{self.output}")
+            raise RuntimeError(f"ended with exit code {self.process.returncode}:\n{self.output}")
         return used.ru_utime + used.ru_stime
 
     def kill(self) -> int:
-        """SIGKILL to the main process alone; how many others outlive it by two seconds."""
+        """Kill the main process only; return how many others outlive it by two seconds."""
         family = self.family()
         self.process.kill()
         self.process.wait()
@@ -135,7 +137,7 @@ class Run:
 
 
 def outliving(pids: list[int], wait_s: float) -> list[int]:
-    """Those of some processes that still run after some time; zombies do not."""
+    """Return which processes still run after some time; zombies do not count."""
     deadline = time.monotonic() + wait_s
     while True:
         fields = {pid: _stat(Path(f"/proc/{pid}/stat")) for pid in pids}
@@ -146,7 +148,7 @@ def outliving(pids: list[int], wait_s: float) -> list[int]:
 
 
 def _stat(path: Path) -> list[str] | None:
-    """What follows the name in /proc/PID/stat: state, parent, ...; None where the process is gone."""
+    """Read the fields after the name in /proc/PID/stat: state, parent, ...; None if the process is gone."""
     try:
         return path.read_text().rsplit(")", 1)[1].split()
     except OSError:
@@ -154,7 +156,7 @@ def _stat(path: Path) -> list[str] | None:
 
 
 def difference(one: Path, other: Path) -> Difference:
-    """Between the poses of two finished areas."""
+    """Compare the poses of two finished areas."""
     stage = GEO if Area(one).has(GEO) else MODEL
     a, b = read_scene(Area(one).folder(stage)), read_scene(Area(other).folder(stage))
     if a.names != b.names:
@@ -168,7 +170,7 @@ def difference(one: Path, other: Path) -> Difference:
 def measure(
     sources: list[Path], folder: Path, options: list[str], *, kills: int, seed: int, victim: str
 ) -> tuple[float, float, list[Kill]]:
-    """Wall and CPU seconds of an uninterrupted run in `folder`, and what each kill cost."""
+    """Return wall and CPU seconds of an uninterrupted run in `folder`, and the cost of each kill."""
     started = time.monotonic()
     cpu_s = Run(sources, folder / "whole", options).finish()
     wall_s = time.monotonic() - started
@@ -206,6 +208,7 @@ def _row(kill: Kill) -> str:
 
 
 def main() -> None:
+    """Run the benchmark."""
     arguments = sys.argv[1:]
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     parser = argparse.ArgumentParser(

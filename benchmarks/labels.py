@@ -1,12 +1,12 @@
-"""Compare all labels of an area with the exact truth of the simulated flights they were made from.
+"""Compare all labels of an area with the exact ground truth of the simulated flights.
 
     python benchmarks/labels.py AREA FLIGHTS [--json OUT]
 
-FLIGHTS is what `spn-data simulate` wrote, evaluation flights included. The map's own best similarity to
-the truth, over its mapping frames, is taken out first, so that registration alone is judged. A covariance
-is right where e^T C^-1 e is distributed as chi-squared with 6 degrees of freedom: median 5.35 (calibration
-1), 0.1 % above 22.5 (beyond). Frames of one sequence share the map's error, so that the calibration of one
-sequence is hardly more than one draw.
+FLIGHTS is the output of `spn-data simulate`, including evaluation flights. The best similarity of the map to
+the truth, over its mapping frames, is removed first, so that only registration is evaluated. A covariance is
+correct if the NEES e^T C^-1 e is chi-squared with 6 degrees of freedom: median 5.35 (calibration 1), 0.1 %
+above 22.5 (beyond). Frames of one sequence share the error of the map, so that the calibration of one
+sequence is hardly more than a single draw.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WRONG_M, WRONG_DEG = 0.5, 2.0
 
 
 def compare(area: Area, flights: Path) -> dict[str, Any]:
-    """Figures of each kind of label, lengths in metres."""
+    """Return the figures of each kind of label, lengths in metres."""
     labelled = read_labelled_area(area)
     mapping = labelled.mapping.select(labelled.mapping.registered)
     truth = flights / "truth"
@@ -52,6 +52,7 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
 
 
 def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[str, Any]:
+    """Return the errors and the calibration of labels."""
     registered = labels.select(labels.registered)
     figures: dict[str, Any] = {"frames": len(labels), "registered": len(registered)}
     if not len(registered):
@@ -72,11 +73,13 @@ def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[
 
 
 def focal_error(labelled: LabelledArea, name: str, truth: Path) -> float:
+    """Return the relative error of a sequence's focal length."""
     true = read_truth(truth, name).camera
     return labelled.cameras[name].focal_px[0] / true.focal_px[0] - 1
 
 
 def main() -> None:
+    """Run the benchmark."""
     arguments = read_arguments(__doc__)
     figures = compare(Area(arguments.area), arguments.flights)
     table = Table(title="Labels against exact truth", title_justify="left", box=None)

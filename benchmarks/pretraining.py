@@ -1,10 +1,10 @@
-"""What is left of SqueezeNet's pretraining after the paper's changes, on images of a data set.
+"""How much of SqueezeNet's pretraining survives the changes of the paper, on images of a dataset.
 
     python benchmarks/pretraining.py AREA/5-split/dataset.h5 [--images 60]
 
 Compares the pooled features of SqueezePoseNet's trunk with those of the plain network (ReLU, no
-normalisation): their difference in norm, their correlation about their means, and the share of images whose
-nearest other image, by features, is the same.
+normalisation): the norm of their difference, their correlation about their means, and the share of images
+whose nearest other image in feature space is the same.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from spn_model.pretrained.weights import find
 
 
 def training_images(path: Path, count: int) -> Tensor:
-    """(B, 3, H, W) normalised, spread over the training frames."""
+    """Read normalised images (B, 3, H, W) spread over the training frames."""
     with Dataset(path) as dataset:
         group = dataset.of_role(Role.TRAIN)[0]
         rows = np.linspace(0, len(group) - 1, min(count, len(group))).astype(int)
-        # As training draws its batches: neighbours in time would share statistics of their own.
+        # In random order like training batches: neighbours in time would have similar statistics.
         rows = np.random.default_rng(0).permutation(rows)
         images = np.stack([group.image(int(row)) for row in rows])
     values = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
@@ -41,6 +41,7 @@ def training_images(path: Path, count: int) -> Tensor:
 
 
 def squeezeposenet(slope: float, *, normalised: bool) -> Regressor:
+    """Build SqueezePoseNet with pretrained weights, with or without its normalisation layers."""
     network = build("squeezeposenet", {"slope": slope})
     path = find(network.weights_name)
     load_pretrained(network, read_tensors(path), path)
@@ -53,11 +54,12 @@ def squeezeposenet(slope: float, *, normalised: bool) -> Regressor:
 
 
 def nearest(features: Tensor) -> Tensor:
-    """(B,) which other image is nearest."""
+    """Return the index (B,) of the nearest other image."""
     return torch.cdist(features, features).fill_diagonal_(torch.inf).argmin(1)
 
 
 def row(name: str, features: Tensor, plain: Tensor) -> tuple[str, ...]:
+    """Format the comparison of features (B, F) with those of the plain network."""
     away, base = features - features.mean(0), plain - plain.mean(0)
     return (
         name,
@@ -69,6 +71,7 @@ def row(name: str, features: Tensor, plain: Tensor) -> tuple[str, ...]:
 
 @torch.no_grad()
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -87,7 +90,7 @@ def main() -> None:
         leaky = features(squeezeposenet(slope, normalised=False))
         table.add_row(*row(f"slope {slope}", leaky, plain))
     ours = squeezeposenet(0.01, normalised=True)
-    # Statistics of the batch, not running ones: the state in which training would begin.
+    # With batch statistics instead of running ones: the state at the beginning of training.
     table.add_row(*row("slope 0.01, fresh normalisation", features(ours.train()), plain))
     ours = squeezeposenet(0.01, normalised=True)
     initialize_as_identity(ours, images.split(10))

@@ -1,4 +1,4 @@
-"""What a program costs: wall and CPU seconds and memory, of all the processes that it starts."""
+"""Cost of a program including all its child processes: wall time, CPU time and memory."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _SAMPLE_EVERY_S = 0.25
 
 @dataclass(frozen=True)
 class Usage:
-    """Of a process and all its descendants.
+    """Resource usage of a process and all its descendants.
 
-    peak_memory_mb : greatest sum over the processes of what each holds, memory that several share being
-    split among them (Linux' proportional set size, sampled); None where the system does not tell.
+    peak_memory_mb : maximum of the memory summed over the processes, with shared memory split among them
+    (Linux' proportional set size, sampled); None if the system does not report it.
     """
 
     exit_code: int  # negative: minus the signal that ended it
@@ -30,7 +30,7 @@ class Usage:
 
 
 def run_measured(command: list[str], *, threads: int, log: Path) -> Usage:
-    """Run a command to its end, its output going to `log`; libraries of algebra get `threads` threads."""
+    """Run a command to its end with its output in `log`; numerical libraries get `threads` threads."""
     environment = {**os.environ, **dict.fromkeys(THREAD_LIMITS, str(threads))}
     ended = threading.Event()
     peaks_kb: list[int] = []
@@ -44,7 +44,9 @@ def run_measured(command: list[str], *, threads: int, log: Path) -> Usage:
         try:
             _, status, used = os.wait4(process.pid, 0)
             wall_s = time.perf_counter() - begin
-            process.returncode = os.waitstatus_to_exitcode(status)  # else it would be waited for
+            process.returncode = os.waitstatus_to_exitcode(
+                status
+            )  # otherwise Popen would wait for it again
         finally:
             ended.set()
             sampler.join()
@@ -67,19 +69,19 @@ def _sample(pid: int, ended: threading.Event, found_kb: list[int]) -> None:
 
 
 def _tree(pid: int) -> Iterator[int]:
-    """A process and its descendants."""
+    """Yield a process and its descendants."""
     yield pid
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         try:
             found = children.read_text().split()
-        except OSError:  # it has ended since
+        except OSError:  # it has ended in the meantime
             continue
         for child in found:
             yield from _tree(int(child))
 
 
 def _held_kb(pid: int) -> int:
-    """Zero for a process that has ended."""
+    """Return the proportional set size of a process in kB; zero if it has ended."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:

@@ -1,11 +1,11 @@
-"""Our reconstruction beside pycolmap's own pipeline: the same frames, cameras, threads and machine.
+"""Compare our reconstruction with pycolmap's pipeline: same frames, cameras, threads and machine.
 
     python benchmarks/reconstruct.py AREA [--flights FLIGHTS] [--threads 2] [--only ours|pycolmap]
                                      [--seed 0] [--work DIR] [--json OUT]
 
-AREA needs its stage 1-frames and is only read. FLIGHTS is what `spn-data simulate` wrote: with it, both are
-judged against the exact truth after the best similarity. Counted is all that the user waits for once the
-frames are chosen, child processes included. The baseline is `run_pycolmap` in `contestants.py`.
+AREA needs its stage 1-frames and is only read. FLIGHTS is the output of `spn-data simulate`: with it, both
+are compared with the exact ground truth after the best similarity. Costs cover everything after the choice of
+frames, including child processes. The baseline is `run_pycolmap` in `contestants.py`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from rich.console import Console
 from rich.table import Table
 from truth import error_figures, true_of_scene
 
-from spn_data.area.area import FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, load_native, scene_of
 from spn_data.errors import GeometryError, SpnError, StageError
@@ -43,7 +44,7 @@ STAGES = ("features", "pairs", "matching", "mapping", "refinement")
 def run(
     who: str, area: Path, work: Path, threads: int, seed: int
 ) -> tuple[dict[str, Any], Scene | None]:
-    """Figures of one contestant, and what it made."""
+    """Run one contestant; return its figures and its reconstruction."""
     work.mkdir()
     job = work.with_suffix(".json")
     job.write_text(
@@ -83,12 +84,12 @@ def _read_result(work: Path, usage: Usage, log: Path) -> Result:
 
 
 def _by_stage(seconds: dict[str, float], total: float) -> dict[str, float]:
-    """Seconds of the stages, of all else (starting, reading, diagnosis), and in all."""
+    """Return the seconds of the stages, of everything else (starting, reading, diagnosis), and in total."""
     return {**seconds, "other": total - sum(seconds.values()), "total": total}
 
 
 def errors_against_truth(scene: Scene, chosen: Frames, flights: Path) -> dict[str, Any]:
-    """Figures of `error_figures` after the best similarity, or why there are none."""
+    """Return the figures of `error_figures` after the best similarity, or why there are none."""
     true = true_of_scene(scene, chosen, flights)
     try:
         world_from_model = Similarity.fit(scene.poses.centers, true.centers)
@@ -101,9 +102,9 @@ def errors_against_truth(scene: Scene, chosen: Frames, flights: Path) -> dict[st
 
 
 def difference(ours: Scene, theirs: Scene) -> dict[str, Any]:
-    """Between two scenes after the best similarity, over the images of both.
+    """Compare two scenes after the best similarity, over their common images.
 
-    Positions as shares of the diagonal of the box about the cameras: neither scene has a metre.
+    Positions are relative to the diagonal of the bounding box of the cameras, since neither scene is metric.
     """
     a, b = common_poses(ours, theirs)
     try:
@@ -122,7 +123,7 @@ def difference(ours: Scene, theirs: Scene) -> dict[str, Any]:
 
 
 def common_poses(a: Scene, b: Scene) -> tuple[Poses, Poses]:
-    """Poses of the images of both, in one order."""
+    """Return the poses of the common images in the same order."""
     row_a = {name: k for k, name in enumerate(a.names)}
     row_b = {name: k for k, name in enumerate(b.names)}
     both = [name for name in a.names if name in row_b]
@@ -133,7 +134,7 @@ def common_poses(a: Scene, b: Scene) -> tuple[Poses, Poses]:
 
 
 def only(scene: Scene, names: set[str]) -> Scene:
-    """The scene without the poses of all other images."""
+    """Restrict a scene to the poses of some images."""
     keep = np.array([name in names for name in scene.names], dtype=bool)
     return replace(
         scene,
@@ -144,7 +145,7 @@ def only(scene: Scene, names: set[str]) -> Scene:
 
 
 def machine() -> dict[str, Any]:
-    """What the seconds were measured on."""
+    """Describe the machine and the versions in use."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -160,13 +161,13 @@ def machine() -> dict[str, Any]:
 def compare(
     area: Path, flights: Path | None, work: Path, *, who: Iterable[str], threads: int, seed: int
 ) -> dict[str, Any]:
-    """All figures of the contestants `who`, run one after the other in `work`."""
+    """Run the contestants `who` one after the other in `work` and return all figures."""
     folder = Area(area).folder(FRAMES)
     if not folder.is_dir():
         raise StageError(f"{folder} is missing; run spn-data reconstruct first")
     frames = read_frames(folder / "frames.csv")
     chosen = frames.select(frames.chosen)
-    for name in chosen.names.tolist():  # so that neither finds them on the disk only
+    for name in chosen.names.tolist():  # warm the page cache for both
         (folder / name).read_bytes()
     figures: dict[str, Any] = {
         "version": VERSION,
@@ -184,7 +185,7 @@ def compare(
             scenes[one] = scene
             if flights is not None:
                 figures[one]["errors"] = errors_against_truth(scene, chosen, flights)
-    if len(scenes) == 2:  # what failed early has no seconds to compare
+    if len(scenes) == 2:  # times of an early failure are not comparable
         figures["baseline_over_ours"] = {
             unit: figures[PYCOLMAP][unit]["total"] / figures[OURS][unit]["total"]
             for unit in ("wall_s", "cpu_s")
@@ -192,7 +193,7 @@ def compare(
         figures["difference"] = difference(scenes[OURS], scenes[PYCOLMAP])
         ours, theirs = scenes[OURS], scenes[PYCOLMAP]
         if flights is not None and ours.names != theirs.names:
-            # Whoever leaves out the difficult frames would look better than it is.
+            # Leaving out difficult frames would make a result look better than it is.
             for name, mine, other in ((OURS, ours, theirs), (PYCOLMAP, theirs, ours)):
                 figures[name]["errors_of_common"] = errors_against_truth(
                     only(mine, set(other.names)), chosen, flights
@@ -201,7 +202,7 @@ def compare(
 
 
 def show(figures: dict[str, Any], console: Console) -> None:
-    """Two tables, seconds and results, and what else there is to say."""
+    """Print the tables of seconds and results, followed by notes and differences."""
     who = [name for name in (OURS, PYCOLMAP) if name in figures]
     on = figures["machine"]
     used = on["versions"]
@@ -280,17 +281,18 @@ def _show_difference(of: dict[str, Any], console: Console) -> None:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("area", type=Path)
-    parser.add_argument("--flights", type=Path, help="with the exact truth")
+    parser.add_argument(
+        "--flights", type=Path, help="output of spn-data simulate, with the ground truth"
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only", choices=(OURS, PYCOLMAP))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--work", type=Path, help="new folder to keep databases, models and logs in"
-    )
+    parser.add_argument("--work", type=Path, help="new folder for databases, models and logs")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     who = (OURS, PYCOLMAP) if arguments.only is None else (arguments.only,)
@@ -300,7 +302,7 @@ def main() -> None:
         else:
             work = arguments.work.resolve()
             if work.exists():
-                parser.error(f"--work {work} exists already: name a new folder")
+                parser.error(f"--work {work} already exists; choose a new folder")
             work.mkdir(parents=True)
         try:
             figures = compare(

@@ -1,22 +1,21 @@
-"""Images a second of the training loop, of the computing alone, and of a loader that decodes JPEGs.
+"""Throughput of the training loop, of the computation alone, and of a loader that decodes JPEGs.
 
     python benchmarks/training_speed.py AREA [--recipe default] [--steps 24] [--rounds 3] [--threads N]
         [--device auto] [--precision auto] [--json FILE]
 
-Four loops take the same steps of a recipe's last stage in turns, so that what else the machine does meets all
-of them:
+Four loops run the same steps of a recipe's last stage alternately, so that other load on the machine affects
+all of them:
 
-loop      `spn_model.training.train.run_stage`, as `spn-model train` runs it: batches made ahead, log,
-          state saved
-bare      the same batches, made before and kept in memory: the limit that computing sets
-in turns  each batch is made, then used: what making ahead saves
-plain     as published PoseNet code feeds a network: each image of a batch is read from its JPEG in
-          1-frames, decoded, resized to the batch's size and normalised, every time that it is used; no
-          augmentation
+loop      `spn_model.training.train.run_stage`, as run by `spn-model train`: batches are made ahead, with
+          log and saved state
+bare      the same batches, made in advance and kept in memory: the limit set by the computation
+in turns  each batch is made, then used: shows what making ahead saves
+plain     like published PoseNet code: each image of a batch is read from its JPEG in 1-frames, decoded,
+          resized to the batch's size and normalised every time it is used; no augmentation
 
-Beside images a second stand milliseconds of processor time for an image, of the thread that steps and of all
-threads: on a machine that has other work to do too, they say more. Neither judging nor writing the state
-counts, as in a training's own log. Steps are spread over the whole stage, as kinds of networks vary their
+In addition to images per second, the CPU time per image is reported, of the stepping thread and of all
+threads: it is more meaningful on a machine with other load. Neither validation nor writing the state counts,
+as in a training's log. Steps are spread over the whole stage, because some kinds of networks vary their
 images with it.
 """
 
@@ -58,7 +57,7 @@ from spn_model.training.training_state import Position
 
 @dataclass(frozen=True)
 class Round:
-    """One loop over all steps. Milliseconds of processor time an image: of the stepping thread, of all."""
+    """One loop over all steps. stepping_ms, all_threads_ms : CPU time per image."""
 
     images_per_s: float
     stepping_ms: float
@@ -66,17 +65,18 @@ class Round:
 
 
 class Silent:
-    """Follows a training without a word."""
+    """Follower of a training that ignores everything."""
 
     def row(self, values: Mapping[str, Any]) -> None:
-        """Nothing."""
+        """Ignore a row of the log."""
 
     def wants_stop(self) -> bool:
+        """Never request a stop."""
         return False
 
 
 class Contest:
-    """Loops over the same steps of one stage."""
+    """Alternative loops over the same steps of one stage."""
 
     def __init__(
         self,
@@ -96,52 +96,58 @@ class Contest:
         self.shown = sum(len(next(iter(part.values()))) for parts in self.batches for part in parts)
 
     def parts(self, k: int) -> list[Batch]:
-        """The batch of step k in its parts, as the loop has it."""
+        """Make the batch of step k in its parts, as the training loop does."""
         first = k * self.stage.parts
         return [self.part(number) for number in range(first, first + self.stage.parts)]
 
     def part(self, number: int) -> Batch:
+        """Make one part of a batch on the device."""
         made = make_part(self.model, self.images, self.stage, 0, number, 0, Ranks(), 0.0)
         return {name: tensor.to(self.machine.device) for name, tensor in made.items()}
 
     def step(self, gradient: Gradients, parts: list[Batch]) -> None:
-        """What one step computes."""
+        """Compute one step."""
         gradient.compute(parts)
         nn.utils.clip_grad_norm_(self.parameters, self.stage.clip or float("inf"))
         self.optimizer.step()
 
     def computing(self) -> AbstractContextManager[Gradients]:
+        """Start the workers that compute gradients."""
         return gradient_workers(self.model, self.parameters, self.stage.parts, self.machine)
 
     def loop(self, record: Record) -> None:
+        """Run the training loop of `spn-model train`."""
         run_stage(
             *(self.stage, 0, self.images, self.model, self.optimizer, record.position),
             *(self.machine, Ranks(), record, Silent(), 0, 1),
         )
 
     def bare(self) -> None:
+        """Run the steps on batches made in advance."""
         with self.computing() as gradient:
             for parts in self.batches:
                 self.step(gradient, parts)
 
     def in_turns(self) -> None:
+        """Make each batch, then use it."""
         with self.computing() as gradient:
             for k in range(self.steps):
                 self.step(gradient, self.parts(k))
 
     def plain(self) -> None:
+        """Decode the JPEGs of each batch before its step."""
         with self.computing() as gradient:
             for k, parts in enumerate(self.batches):
                 for part in parts:
                     images = part["images"]
                     rows = rows_of_step(len(self.images), len(images), k, 0, 0)
                     loaded = np.stack([self.decoded(int(row), images.shape[1:3]) for row in rows])
-                    # The member normalises by itself: this is here for the time that it takes.
+                    # The model normalises its images itself: this only takes its time.
                     assert loaded.shape == (len(rows), 3, *images.shape[1:3])
                 self.step(gradient, parts)
 
     def decoded(self, row: int, size: tuple[int, int]) -> np.ndarray:
-        """(3, h, w) float32 of the JPEG of a training image."""
+        """Decode the JPEG of a training image to (3, h, w) float32."""
         image = cv2.imread(str(self.jpegs[row]), cv2.IMREAD_COLOR_RGB)
         small = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
         scaled = (small.astype(np.float32) / 255 - MEAN) / np.asarray(STD, np.float32)
@@ -151,7 +157,7 @@ class Contest:
 def measure(
     area: Path, recipe_name: str, machine: Machine, steps: int, rounds: int
 ) -> dict[str, Any]:
-    """Images a second of each loop, round by round."""
+    """Measure the throughput of each loop, round by round."""
     recipe = read_recipe(recipe_name)
     stage = recipe.stages[-1]
     model = make(recipe.kind, recipe.options)
@@ -193,7 +199,7 @@ def measure(
         }
         if jpegs[0].is_file() and "images" in contest.batches[0][0]:
             loops["plain"] = contest.plain
-        contest.bare()  # nothing is made for the first time later on
+        contest.bare()  # warm-up
         found: dict[str, list[Round]] = {name: [] for name in loops}
         for _ in range(rounds):
             for name, run in loops.items():
@@ -202,7 +208,7 @@ def measure(
 
 
 def timed(run: Callable[[], float | None], images: int, machine: Machine) -> Round:
-    """By the loop's own clock, where it has one."""
+    """Time one loop, by its own clock if it returns seconds."""
     wall, mine, every = time.perf_counter(), time.thread_time(), time.process_time()
     seconds = run()
     if machine.device.type == "cuda":
@@ -215,6 +221,7 @@ def timed(run: Callable[[], float | None], images: int, machine: Machine) -> Rou
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("area", type=Path)
     parser.add_argument("--recipe", default="default")
@@ -229,7 +236,7 @@ def main() -> None:
     with limited_threads(machine):
         found = measure(given.area, given.recipe, machine, given.steps, given.rounds)
     loops = found["loops"]
-    columns = ("loop", "images/s", "of bare", "ms an image, stepping", "all threads")
+    columns = ("loop", "images/s", "of bare", "ms per image, stepping", "all threads")
     table = Table(*columns, title=f"{given.recipe}: {machine.plain()}")
     for name, rounds in loops.items():
         of_bare = [

@@ -1,9 +1,9 @@
-"""Compare an area with the exact truth of the simulated flights that it was made from.
+"""Compare an area with the exact ground truth of the simulated flights it was made from.
 
     python benchmarks/truth.py AREA FLIGHTS [--json OUT]
 
-FLIGHTS is what `spn-data simulate` wrote. Positions and rotations are judged twice: after the best
-similarity (the reconstruction alone), and as they are (the georegistration too, nothing aligned).
+FLIGHTS is the output of `spn-data simulate`. Positions and rotations are compared twice: after the best
+similarity (reconstruction only), and without alignment (including georegistration).
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from spn_data.area.area import FRAMES, GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, FRAMES_TABLE, GEO, GEO_FIT, MODEL
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
@@ -29,7 +30,7 @@ from spn_data.storage.json_files import read_json
 
 
 def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:
-    """(N,) exact poses of frames, by their place in the video."""
+    """Return the exact poses of N frames by their index in the video."""
     true = Poses.unknown(len(frames))
     for sequence in np.unique(frames.sequences).tolist():
         rows = np.flatnonzero(frames.sequences == sequence)
@@ -39,7 +40,7 @@ def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:
 
 
 def at_origin(true: Poses, true_origin: GeoOrigin, origin: GeoOrigin) -> Poses:
-    """True poses about another origin. Heights above take-off are the simulator's up coordinates."""
+    """Move true poses to another origin. Heights above take-off are the simulator's up coordinates."""
     lat_lon_alt = true_origin.wgs84_from_enu(true.centers)
     if origin.height_reference == HeightReference.TAKEOFF:
         lat_lon_alt[:, 2] = true.centers[:, 2]
@@ -47,8 +48,8 @@ def at_origin(true: Poses, true_origin: GeoOrigin, origin: GeoOrigin) -> Poses:
 
 
 def compare(area: Area, flights: Path) -> dict[str, Any]:
-    """All figures, lengths in metres."""
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    """Return all figures, lengths in metres."""
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     chosen = frames.select(frames.chosen)
     scene = read_scene(area.folder(MODEL))
     true = true_of_scene(scene, chosen, flights)
@@ -60,7 +61,7 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
     }
     if area.has(GEO):
         geo = read_scene(area.folder(GEO))
-        origin = GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")).origin
+        origin = GeoFit.from_json(read_json(area.folder(GEO) / GEO_FIT)).origin
         there = at_origin(true, read_truth(flights / "truth", chosen.sequences[0]).origin, origin)
         true_from_geo = Similarity.fit(geo.poses.centers, there.centers)
         figures["georegistered"] = error_figures(geo.poses, there)
@@ -71,14 +72,14 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
 
 
 def true_of_scene(scene: Scene, chosen: Frames, flights: Path) -> Poses:
-    """Exact poses of a scene's images, in its order."""
+    """Return the exact poses of a scene's images in its order."""
     row = {name: k for k, name in enumerate(chosen.names.tolist())}
     registered = chosen.select(np.array([row[name] for name in scene.names]))
     return true_poses(registered, flights / "truth")
 
 
 def error_figures(poses: Poses, true: Poses) -> dict[str, float]:
-    """Quantiles of the errors of poses as they are, nothing aligned."""
+    """Return quantiles of the errors of poses without alignment."""
     error_m, error_deg = pose_errors(poses, true)
     return {
         "position_median_m": float(np.median(error_m)),
@@ -90,7 +91,7 @@ def error_figures(poses: Poses, true: Poses) -> dict[str, float]:
 
 
 def read_arguments(description: str | None) -> argparse.Namespace:
-    """area, flights, and json: where to write the figures."""
+    """Parse the arguments area, flights and json (where to write the figures)."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -101,6 +102,7 @@ def read_arguments(description: str | None) -> argparse.Namespace:
 
 
 def main() -> None:
+    """Run the benchmark."""
     arguments = read_arguments(__doc__)
     figures = compare(Area(arguments.area), arguments.flights)
     table = Table(title="Against exact truth", title_justify="left", box=None)

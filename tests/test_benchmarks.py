@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spn_data.area.area import FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES
 from spn_data.capture.selection import SelectionOptions
 from spn_data.colmap.model import Scene
 from spn_data.geometry.pose import Poses, Similarity, rotations_from_vectors

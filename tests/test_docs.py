@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from spn_data import errors
-from spn_data.area.area import STAGES
+from spn_data.area.names import STAGES
 from spn_data.capture.selection import SelectionOptions
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.diagnosis import FrameRegistration

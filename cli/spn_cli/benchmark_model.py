@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spn_cli import console, options
+from spn_data.area.names import DATASET
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_benchmark import BundleCost
@@ -67,8 +68,8 @@ def run(
     threads: int,
     as_json: bool,
 ) -> None:
-    from spn_data.area import area as names_of
-    from spn_model.export.bundle_benchmark import BenchmarkOptions, flown_frames
+    from spn_data.area import names as names_of
+    from spn_model.export.bundle_benchmark import BenchmarkOptions, render_flight_frames
     from spn_model.export.bundle_benchmark import benchmark as work
 
     if (bundle is None) == (name is None):
@@ -82,8 +83,8 @@ def run(
     with tempfile.TemporaryDirectory(prefix="spn-benchmark-") as scratch:
         images, camera = list(frames), camera_file
         if camera is None:
-            source = area.folder(names_of.SPLIT) / "dataset.h5"
-            images, camera = flown_frames(folder, source, Path(scratch), wanted.frames)
+            source = area.folder(names_of.SPLIT) / DATASET
+            images, camera = render_flight_frames(folder, source, Path(scratch), wanted.frames)
         found = work(folder, images, camera, wanted)
     if as_json:
         plain = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in found}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spn_cli import console, options
+from spn_data.area.names import DATASET
 
 if TYPE_CHECKING:
     from spn_model.export.exported import ExportedBundle
@@ -57,12 +58,12 @@ def run(
     calibration_images: int,
     overwrite: bool,
 ) -> None:
-    from spn_data.area import area as names_of
+    from spn_data.area import names as names_of
     from spn_data.errors import StageError
     from spn_data.storage.fingerprints import content_fingerprint
     from spn_model.export.bundle_checks import BundleOptions
     from spn_model.export.bundle_export import export as work
-    from spn_model.export.bundle_export import is_made_of
+    from spn_model.export.bundle_export import is_up_to_date
     from spn_model.models.checkpoint import load
 
     area = options.open_area(area_folder)
@@ -72,12 +73,12 @@ def run(
             f"{file.parent} holds no trained network; run spn-model train --run {name} first"
         )
     folder = target or area.run_folder(name) / names_of.BUNDLE
-    source = dataset or area.folder(names_of.SPLIT) / "dataset.h5"
+    source = dataset or area.folder(names_of.SPLIT) / DATASET
     fingerprint = content_fingerprint(file)
     metrics = _evaluation(area.run_folder(name) / names_of.METRICS, name, fingerprint)
     wanted = BundleOptions(int8=int8, calibration_images=calibration_images)
     facts = {"run": name, "checkpoint": fingerprint, "evaluated": metrics is not None}
-    if not overwrite and is_made_of(folder, facts, wanted):
+    if not overwrite and is_up_to_date(folder, facts, wanted):
         console.out.print(f"{folder}: stands already, made of the same.")
         return
     network = load(file)
@@ -116,12 +117,12 @@ def _evaluation(path: Path, name: str, fingerprint: str) -> dict[str, Any] | Non
 
 
 def _show(made: ExportedBundle) -> None:
-    from spn_model.export.model_card import loss_percent
+    from spn_model.export.model_card import int8_error_increase
 
     unit = "m" if made.units == "m" else "units"
     rows = []
     for one in made.errors:
-        percent = loss_percent(made.errors, one.group) if one.precision == "int8" else None
+        percent = int8_error_increase(made.errors, one.group) if one.precision == "int8" else None
         told = ("", "") if percent is None else (_percent(percent[0]), _percent(percent[1]))
         rows.append(
             (

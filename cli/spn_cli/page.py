@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spn_cli import console
-from spn_data.area.area import FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES
 from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:

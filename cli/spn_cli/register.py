@@ -91,7 +91,7 @@ def run(
     import os
 
     from spn_cli import page, show
-    from spn_data.area.area import EVALUATION, GEO
+    from spn_data.area.names import EVALUATION, GEO
     from spn_data.pipeline.evaluation_stage import RegisterStageOptions
     from spn_data.pipeline.evaluation_stage import register as stage
     from spn_data.pipeline.tracking_stage import sequences_with_video, track_sequence

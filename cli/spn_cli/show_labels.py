@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from spn_cli import console
-from spn_data.area.area import EVALUATION, SPLIT, TRACKED
+from spn_data.area.names import EVALUATION, SPLIT, TRACKED
 from spn_data.storage.stage_record import StageRecord
 
 

@@ -126,8 +126,8 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
     Example:
         spn-data split --area fields/north
     """
-    from spn_data.area.area import SPLIT
-    from spn_data.pipeline.area_audit import AUDIT, read_audit
+    from spn_data.area.names import AUDIT, SPLIT
+    from spn_data.pipeline.area_audit import read_audit
     from spn_data.pipeline.split_stage import split_area
 
     area = options.open_area(area_folder)

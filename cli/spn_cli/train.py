@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spn_cli import console, options
+from spn_data.area.names import DATASET
 from spn_data.errors import StageError
 from spn_data.storage.files import LOCK, locked
 
@@ -98,7 +99,7 @@ def run(
 ) -> None:
     from spn_cli import page
     from spn_cli.show_training import Following, errors_table
-    from spn_data.area import area as names
+    from spn_data.area import names
     from spn_data.dataset.hdf5_reader import Dataset
     from spn_data.errors import InputError
     from spn_data.storage.fingerprints import content_fingerprint
@@ -191,12 +192,12 @@ def run(
 
 def _dataset(area: Area, given: Path | None) -> Path:
     """Raises StageError where the area's own is missing or stale."""
-    from spn_data.area.area import SPLIT
+    from spn_data.area.names import SPLIT
 
     if given is not None:
         return given
     area.check_fresh(SPLIT)
-    return area.folder(SPLIT) / "dataset.h5"
+    return area.folder(SPLIT) / DATASET
 
 
 def _standing(

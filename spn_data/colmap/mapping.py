@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.colmap.job import MappingJob
-from spn_data.errors import FormatError
 from spn_data.work import child
 
 
@@ -35,15 +34,12 @@ def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) 
 
 def latest_snapshot(snapshots: Path) -> Path | None:
     """The newest snapshot that is complete; an interrupted write is passed over."""
-    from spn_data.colmap.model import count_registered
+    from spn_data.colmap.model import count_registered, is_whole
 
     folders = [f for f in snapshots.iterdir() if f.is_dir()] if snapshots.is_dir() else []
     for folder in sorted(folders, key=lambda f: f.name, reverse=True):
-        try:
-            if count_registered(folder) > 0:
-                return folder
-        except FormatError:
-            continue
+        if is_whole(folder) and count_registered(folder) > 0:
+            return folder
     return None
 
 

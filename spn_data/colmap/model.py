@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 
 from spn_data.colmap import pycolmap
+from spn_data.colmap.model_files import (
+    PointTable,
+    check_whole,
+    count_images,
+    read_keypoints,
+    read_points,
+)
 from spn_data.errors import FormatError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity
@@ -49,55 +56,78 @@ class MapObservations:
 
 
 def load_native(folder: Path) -> pycolmap.Reconstruction:
-    """Raises FormatError where a file is missing or cut short, which COLMAP itself passes over."""
-    try:
-        _check_whole(folder / "images.bin", _end_of_image)
-        _check_whole(folder / "points3D.bin", _end_of_point)
+    """Load a model as pycolmap's object.
+
+    Raises FormatError if a file is missing or cut short, which COLMAP itself ignores.
+    """
+    with _reading(folder):
+        check_whole(folder)
         return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError, OSError) as error:
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError, KeyError, IndexError, OSError) as error:
         raise FormatError(f"{folder}: not a complete COLMAP model ({error})") from error
 
 
-def _check_whole(path: Path, end_of: Callable[[bytes, int], int]) -> None:
-    """ValueError unless the file holds just the number of records that its head says."""
-    data = path.read_bytes()
-    try:
-        (count,) = struct.unpack_from("<Q", data)
-        offset = 8
-        for _ in range(count):
-            offset = end_of(data, offset)
-    except (struct.error, ValueError):
-        offset = -1
-    if offset != len(data):
-        raise ValueError(f"{path.name} is cut short or damaged")
-
-
-def _end_of_image(data: bytes, offset: int) -> int:
-    """Id, pose (7 doubles), camera id, name, then 24 bytes a point."""
-    end_of_name = data.index(b"\0", offset + 64) + 1
-    (points,) = struct.unpack_from("<Q", data, end_of_name)
-    return int(end_of_name + 8 + 24 * points)
-
-
-def _end_of_point(data: bytes, offset: int) -> int:
-    """Id, position (3 doubles), colour (3 bytes), error, then 8 bytes a track element."""
-    (length,) = struct.unpack_from("<Q", data, offset + 43)
-    return int(offset + 51 + 8 * length)
-
-
 def count_registered(folder: Path) -> int:
-    """Number of images with a pose."""
-    return int(load_native(folder).num_reg_images())
+    """Read the number of images with a pose from a file's header.
+
+    Raises FormatError if the file is missing or empty.
+    """
+    with _reading(folder):
+        return count_images(folder)
+
+
+def is_whole(folder: Path) -> bool:
+    """Return whether a model is complete: all files are there and none is cut short."""
+    try:
+        load_native(folder)
+    except FormatError:
+        return False
+    return True
 
 
 def read_scene(folder: Path) -> Scene:
-    return scene_of(load_native(folder))
+    """Read a model without its measurements.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of a COLMAP model in binary format.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    FormatError
+        If a file is missing, cut short or damaged.
+    """
+    with _reading(folder):
+        return _scene(load_native(folder), read_points(folder))
 
 
 def scene_of(native: pycolmap.Reconstruction) -> Scene:
+    """Return the values of a pycolmap reconstruction in memory."""
+    points = [(i, native.points3D[i]) for i in sorted(native.points3D)]
+    table = PointTable(
+        np.array([i for i, _ in points], np.int64),
+        np.array([p.xyz for _, p in points]).reshape(-1, 3),
+        np.array([p.color for _, p in points], np.uint8).reshape(-1, 3),
+        np.array([p.error for _, p in points]),
+        np.array([p.track.length() for _, p in points], dtype=np.int64),
+    )
+    return _scene(native, table)
+
+
+def _scene(native: pycolmap.Reconstruction, points: PointTable) -> Scene:
     images = sorted(registered_images(native), key=lambda image: image.name)
     rigid = [image.cam_from_world() for image in images]
-    points = [native.points3D[i] for i in sorted(native.points3D)]
     return Scene(
         tuple(image.name for image in images),
         Poses.from_cam_from_world(
@@ -106,62 +136,78 @@ def scene_of(native: pycolmap.Reconstruction) -> Scene:
         ),
         np.array([image.camera_id for image in images], dtype=np.int64),
         {i: from_native_camera(camera) for i, camera in native.cameras.items()},
-        np.array([p.xyz for p in points]).reshape(-1, 3),
-        np.array([p.error for p in points]),
-        np.array([p.track.length() for p in points], dtype=np.int64),
+        points.xyz,
+        points.errors_px,
+        points.track_lengths,
     )
 
 
-def read_observations(folder: Path) -> tuple[Scene, MapObservations]:
-    """The scene with all its measurements."""
-    native = load_native(folder)
-    scene = scene_of(native)
-    return scene, observations_of(native, scene)
-
-
 def read_map(folder: Path) -> tuple[Scene, MapObservations, MapPoints]:
-    """The scene, its measurements, and its points with ids and colours, in the order of Scene.points."""
-    return _map_of(load_native(folder))
+    """Read a model with its measurements and the ids and colours of its points.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of a COLMAP model in binary format.
+
+    Returns
+    -------
+    scene : Scene
+    observations : MapObservations
+    points : MapPoints
+        In the order of ``scene.points``.
+
+    Raises
+    ------
+    FormatError
+        If a file is missing, cut short or damaged.
+    """
+    scene, observations, points, _ = read_map_with_keypoints(folder)
+    return scene, observations, points
 
 
-def read_map_with_features(
+def read_observations(folder: Path) -> tuple[Scene, MapObservations]:
+    """Read a model with its measurements. Raises FormatError as `read_map` does."""
+    return read_map(folder)[:2]
+
+
+def read_map_with_keypoints(
     folder: Path,
 ) -> tuple[Scene, MapObservations, MapPoints, dict[str, np.ndarray]]:
-    """As `read_map`, and the point id of every feature (K,) by image name, -1 where it is no point.
+    """Read a model as `read_map` does, and which keypoints are points of it.
 
-    Features are in the order of the database.
+    Returns
+    -------
+    scene : Scene
+    observations : MapObservations
+    points : MapPoints
+    point_ids : dict of str to ndarray, shape (K,)
+        By image name, the point of each keypoint in the order of the database; -1 if it has none.
+
+    Raises
+    ------
+    FormatError
+        If a file is missing, cut short or damaged.
     """
-    native = load_native(folder)
-    of_features = {
-        image.name: np.array(
-            [p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64
-        )
-        for image in registered_images(native)
-    }
-    return *_map_of(native), of_features
+    with _reading(folder):
+        table, keypoints = read_points(folder), read_keypoints(folder)
+        scene = _scene(load_native(folder), table)
+        points = MapPoints(table.ids, table.xyz, table.colors, table.track_lengths)
+        observations = _observations(scene, points, keypoints)
+    return scene, observations, points, {name: ids for name, (_, ids) in keypoints.items()}
 
 
-def _map_of(native: pycolmap.Reconstruction) -> tuple[Scene, MapObservations, MapPoints]:
-    scene = scene_of(native)
-    ids = sorted(native.points3D)
-    colors = np.array([native.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
-    points = MapPoints(np.array(ids, np.int64), scene.points, colors, scene.track_lengths)
-    return scene, observations_of(native, scene), points
-
-
-def observations_of(native: pycolmap.Reconstruction, scene: Scene) -> MapObservations:
-    point_position = {point_id: k for k, point_id in enumerate(sorted(native.points3D))}
+def _observations(
+    scene: Scene, points: MapPoints, keypoints: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> MapObservations:
     image_idx, point_idx, pixels, residuals = [], [], [], []
-    by_name = {image.name: image for image in registered_images(native)}
     for k, name in enumerate(scene.names):
-        image = by_name[name]
-        seen = image.get_observation_points2D()
-        if not seen:
+        xy, point_ids = keypoints[name]
+        seen = point_ids >= 0
+        if not seen.any():
             continue
-        index = np.array([point_position[p.point3D_id] for p in seen])
-        measured = np.array([p.xy for p in seen])
-        pose = scene.poses[k : k + 1]
-        in_camera = (scene.points[index] - pose.centers[0]) @ pose.rotations[0].T
+        index, measured = points.rows_of(point_ids[seen]), xy[seen]
+        in_camera = scene.poses.to_camera(scene.points[index], k)
         projected = scene.cameras[int(scene.camera_ids[k])].project(in_camera)
         image_idx.append(np.full(len(index), k))
         point_idx.append(index)

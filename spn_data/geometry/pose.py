@@ -6,8 +6,9 @@ Up once a model is georeferenced; camera axes are x right, y down, z forward.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -336,6 +337,23 @@ class Similarity:
         rotation = (u * sign) @ vt  # eq. 40
         scale = float((singular * sign).sum() / (w @ (source_0**2).sum(axis=1)))  # eq. 42
         return cls(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON: scale, rotation (3 rows) and translation."""
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Similarity:
+        """Return the similarity of `to_json`. Raises KeyError, TypeError or ValueError for other values."""
+        return cls(
+            float(value["scale"]),
+            np.array(value["rotation"], np.float64).reshape(3, 3),
+            np.array(value["translation"], np.float64).reshape(3),
+        )
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Transform points (..., 3) into the target frame."""

@@ -102,9 +102,8 @@ class GeoFit:
             "version": VERSION,
             "origin": asdict(self.origin),
             "world_from_model": {
-                "scale": self.world_from_model.scale,
-                "rotation": self.world_from_model.rotation,
-                "translation_m": self.world_from_model.translation,
+                **self.world_from_model.to_json(),
+                "translation_m": self.world_from_model.translation,  # the name in version 0.1
             },
             "vertical_offsets_m": self.vertical_offsets_m,
             "gimbal_bias_deg": self.gimbal_bias_deg,
@@ -144,11 +143,7 @@ class GeoFit:
             origin, similarity = value["origin"], value["world_from_model"]
             stated = value["uncertainty"]
             return cls(
-                Similarity(
-                    float(similarity["scale"]),
-                    np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
-                    np.array(similarity["translation_m"], dtype=np.float64).reshape(3),
-                ),
+                Similarity.from_json({**similarity, "translation": similarity["translation_m"]}),
                 GeoOrigin(
                     float(origin["lat_deg"]),
                     float(origin["lon_deg"]),

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import (
+    CAMERA,
+    EVALUATION,
+    FRAMES,
+    FRAMES_TABLE,
+    GEO,
+    GEO_FIT,
+    MODEL,
+    OBSERVATIONS,
+    POSES,
+    REGISTRATION,
+    TRACKED,
+)
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.errors import FormatError
@@ -18,17 +30,10 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelObservations, Labels, read_label_observations, read_labels
-from spn_data.labels.map_points import MapPoints, covered_share
+from spn_data.labels.map_points import MapPoints
+from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.storage.json_files import read_json
-from spn_data.uncertainty.map_covariance import MapCovariance
-
-POSES, SEEN, CAMERA, REGISTRATION = (
-    "poses.csv",
-    "observations.npz",
-    "camera.json",
-    "registration.json",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +87,9 @@ def read_labelled_area(
             area.check_fresh(stage)
     scene, observations, points = read_map(map_folder(area))
     chosen = chosen_frames(area)
-    mapping, mapping_seen = _mapping_labels(area, scene, observations, points, chosen)
-    if mapping_covariance:
-        mapping = _with_covariance(mapping, scene, observations)
+    mapping, mapping_seen = _mapping_labels(
+        area, scene, observations, points, chosen, covariance=mapping_covariance
+    )
     cameras = {
         str(key): scene.cameras[int(scene.camera_ids[scene.names.index(name)])]
         for key, name in _camera_samples(chosen, scene).items()
@@ -123,35 +128,19 @@ def read_labelled_area(
 
 def chosen_frames(area: Area) -> Frames:
     """The mapping flights' frames that went into reconstruction."""
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     return frames.select(frames.chosen)
 
 
 def read_geo(area: Area) -> GeoFit | None:
     """How the area was put into the world; None where it is not georegistered."""
-    return GeoFit.from_json(read_json(area.folder(GEO) / "geo.json")) if area.has(GEO) else None
+    return GeoFit.from_json(read_json(area.folder(GEO) / GEO_FIT)) if area.has(GEO) else None
 
 
 def read_world_from_model(area: Area) -> Similarity:
     """From COLMAP's gauge to the frame that labels are in: the identity where there is no 3-geo."""
     geo = read_geo(area)
     return Similarity.identity() if geo is None else geo.world_from_model
-
-
-def similarity_to_json(similarity: Similarity) -> dict[str, Any]:
-    return {
-        "scale": similarity.scale,
-        "rotation": similarity.rotation.tolist(),
-        "translation": similarity.translation.tolist(),
-    }
-
-
-def similarity_from_json(value: dict[str, Any]) -> Similarity:
-    return Similarity(
-        float(value["scale"]),
-        np.array(value["rotation"], np.float64).reshape(3, 3),
-        np.array(value["translation"], np.float64).reshape(3),
-    )
 
 
 def _camera_samples(chosen: Frames, scene: Scene) -> dict[str, str]:
@@ -162,47 +151,22 @@ def _camera_samples(chosen: Frames, scene: Scene) -> dict[str, str]:
 
 
 def _mapping_labels(
-    area: Area, scene: Scene, observations: MapObservations, points: MapPoints, chosen: Frames
+    area: Area,
+    scene: Scene,
+    map_observations: MapObservations,
+    points: MapPoints,
+    chosen: Frames,
+    *,
+    covariance: bool,
 ) -> tuple[Labels, LabelObservations]:
-    """The model's own frames; those that mapping left out have no pose."""
-    n = len(chosen)
-    row_of = {name: k for k, name in enumerate(chosen.names.tolist())}
-    rows = np.array([row_of[name] for name in scene.names], dtype=np.int64)
-    inliers, coverage, error_px = np.zeros(n, np.int64), np.zeros(n), np.full(n, np.nan)
-    ends = np.searchsorted(observations.image_idx, np.arange(len(scene.names) + 1))
-    squared = (observations.residuals_px**2).sum(axis=1)
-    for k, row in enumerate(rows):
-        mine = slice(ends[k], ends[k + 1])
-        camera = scene.cameras[int(scene.camera_ids[k])]
-        inliers[row] = mine.stop - mine.start
-        coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
-        error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
-    reasons = read_reasons(area.folder(MODEL))
-    labels = Labels.of_frames(
-        chosen,
-        scene.poses.at_rows(rows, n),
-        tracked=False,
-        reason=[reasons.get(name, "") for name in chosen.names.tolist()],
-        covariance=np.full((n, 6, 6), np.nan),
-        inliers=inliers,
-        coverage=coverage,
-        error_px=error_px,
+    """Return the labels that the model stage wrote; compute those of an area that was made before it did."""
+    folder = area.folder(MODEL)
+    if (folder / POSES).exists():
+        labels = read_labels(folder / POSES).transformed(read_world_from_model(area))
+        return labels, read_label_observations(folder / OBSERVATIONS)
+    return mapping_labels(
+        chosen, scene, map_observations, points, read_reasons(folder), covariance=covariance
     )
-    order = np.argsort(rows[observations.image_idx], kind="stable")
-    seen = LabelObservations(
-        rows[observations.image_idx][order],
-        points.ids[observations.point_idx[order]],
-        observations.pixels[order],
-    )
-    return labels, seen
-
-
-def _with_covariance(labels: Labels, scene: Scene, observations: MapObservations) -> Labels:
-    covariance = labels.covariance.copy()
-    row_of = {name: k for k, name in enumerate(labels.names.tolist())}
-    rows = [row_of[name] for name in scene.names]
-    covariance[rows] = MapCovariance.of(scene, observations).pose_covariances()
-    return replace(labels, covariance=covariance)
 
 
 def _read_stage(
@@ -212,10 +176,10 @@ def _read_stage(
     folder = area.folder(stage)
     labels = read_labels(folder / POSES)
     there = read_json(folder / REGISTRATION)["world_from_model"]
-    written = similarity_from_json(there)
-    if similarity_to_json(written) != similarity_to_json(world_from_model):
+    written = Similarity.from_json(there)
+    if written.to_json() != world_from_model.to_json():
         labels = labels.transformed(world_from_model @ written.inverse())
-    return labels, read_label_observations(folder / SEEN)
+    return labels, read_label_observations(folder / OBSERVATIONS)
 
 
 def together(parts: list[tuple[Labels, LabelObservations]]) -> tuple[Labels, LabelObservations]:

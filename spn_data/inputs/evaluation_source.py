@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area.area import FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, FRAMES_TABLE, TRACK
 from spn_data.capture.candidates import analyse, build_frames
 from spn_data.capture.extraction import estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, FrameStatus, write_frames
@@ -24,8 +25,6 @@ from spn_data.split.groups import GROUPS
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.timing import Progress
-
-FRAMES_FILE, TRACK = "frames.csv", "telemetry.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ def take_frames(
     starts = start_cameras(frames, candidates.photos, fov, {} if given is None else {"*": given})
     # One lens, whatever the source calls it: its key is the sequence's name.
     frames = replace(frames, cameras=frames.sequences)
-    write_frames(folder / FRAMES_FILE, frames)
+    write_frames(folder / FRAMES_TABLE, frames)
     extract_chosen(
         source,
         frames,

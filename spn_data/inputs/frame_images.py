@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, FRAMES
 from spn_data.capture import video
 from spn_data.errors import InputError
 from spn_data.inputs.source_videos import find_videos

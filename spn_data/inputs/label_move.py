@@ -6,13 +6,11 @@ import os
 import shutil
 from pathlib import Path
 
-from spn_data.area.area import EVALUATION, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, POSES, REGISTRATION, TRACKED
+from spn_data.geometry.pose import Similarity
 from spn_data.inputs.area_labels import (
-    POSES,
-    REGISTRATION,
     read_world_from_model,
-    similarity_from_json,
-    similarity_to_json,
 )
 from spn_data.labels.labels import read_labels, write_labels
 from spn_data.storage.json_files import read_json, write_json
@@ -35,9 +33,9 @@ def move_labels(area: Area) -> tuple[str, ...]:
 def _move(area: Area, stage: str) -> bool:
     folder = area.folder(stage)
     registration = read_json(folder / REGISTRATION)
-    there = similarity_from_json(registration["world_from_model"])
+    there = Similarity.from_json(registration["world_from_model"])
     now = read_world_from_model(area)
-    if similarity_to_json(there) == similarity_to_json(now):
+    if there.to_json() == now.to_json():
         return False
     labels = read_labels(folder / POSES).transformed(now @ there.inverse())
     new = folder.with_name(f".moved-{folder.name}")
@@ -49,7 +47,7 @@ def _move(area: Area, stage: str) -> bool:
         ignore=lambda _, names: {POSES, REGISTRATION} & set(names),
     )
     write_labels(new / POSES, labels)
-    write_json(new / REGISTRATION, {**registration, "world_from_model": similarity_to_json(now)})
+    write_json(new / REGISTRATION, {**registration, "world_from_model": now.to_json()})
     area.put_in_place(stage, new)
     return True
 

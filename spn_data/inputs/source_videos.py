@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from spn_data.area.area import EVALUATION, FRAMES, Area
+from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, FRAMES
 from spn_data.capture.sources import VIDEO_SUFFIXES, discover
 from spn_data.errors import InputError, StageError
 from spn_data.storage.fingerprints import content_fingerprint

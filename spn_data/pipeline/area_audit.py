@@ -7,13 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, MODEL, SPLIT, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import (
+    CAMBRIDGE,
+    DATASET,
+    EVALUATION,
+    FRAMES,
+    MODEL,
+    REGISTRATION,
+    SPLIT,
+    SPLIT_FILE,
+    TRACKED,
+)
 from spn_data.colmap.model import read_scene
 from spn_data.dataset.cambridge import NVM, read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm
 from spn_data.errors import FormatError, SpnError
-from spn_data.inputs.area_labels import REGISTRATION, LabelledArea, read_labelled_area
+from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.cambridge_contents import image_name, list_of
 from spn_data.labels.labels import Labels
 from spn_data.labels.map_hash import map_hash
@@ -43,8 +54,6 @@ from spn_data.split.audit_files import (
 from spn_data.split.groups import TRAIN, Split
 from spn_data.split.split_file import read_split
 from spn_data.storage.json_files import VERSION, read_json, write_json
-
-SPLIT_FILE, DATASET, AUDIT, CAMBRIDGE = "split.json", "dataset.h5", "audit.json", "cambridge"
 
 
 def audit(area: Area) -> tuple[AuditFinding, ...]:

@@ -10,7 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, GEO, MODEL, SPLIT, Area, command_of
+from spn_data.area.area import Area, command_of
+from spn_data.area.names import (
+    AUDIT,
+    COVERAGE,
+    EVALUATION,
+    FRAMES,
+    FRAMES_TABLE,
+    GEO,
+    GEO_FIT,
+    MODEL,
+    PLANNED_COVERAGE,
+    REPORT,
+    SPLIT,
+    SPLIT_FILE,
+)
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.coverage.sequence_table import read_strata
 from spn_data.errors import FormatError, InputError, StageError
@@ -21,7 +35,7 @@ from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.network_runs import read_runs
 from spn_data.labels.labels import Labels, sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
-from spn_data.pipeline.area_audit import AUDIT, SPLIT_FILE, read_audit
+from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.verdict import AreaVerdict, verdict
@@ -29,8 +43,6 @@ from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import read_json
 from spn_data.storage.stage_record import versions
-
-FILE = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +60,7 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
     FormatError or InputError for a damaged file.
     """
     options = options or ReportOptions()
-    path, data = area.root / FILE, report_data(area)
+    path, data = area.root / REPORT, report_data(area)
     html = render(data, max_points=options.max_points, max_frames=options.max_frames)
     write_atomically(path, html)
     return path, verdict(data)
@@ -84,7 +96,7 @@ def report_data(area: Area) -> ReportData:
     labelled = read_labelled_area(fresh) if fresh.has(MODEL) else None
     geo, residuals = None, {}
     if fresh.has(GEO):
-        path = fresh.folder(GEO) / "geo.json"
+        path = fresh.folder(GEO) / GEO_FIT
         value = read_json(path)
         geo = GeoFit.from_json(value)
         residuals = _residuals(path, value, geo)
@@ -94,7 +106,7 @@ def report_data(area: Area) -> ReportData:
         path = fresh.folder(SPLIT) / AUDIT
         checks = read_audit(path) if path.exists() else None
     groups = dict(zip(split.names.tolist(), split.group.tolist(), strict=True)) if split else {}
-    candidates = read_frames(area.folder(FRAMES) / "frames.csv")
+    candidates = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     frames = frame_table(candidates, labelled, residuals, _strata(area), groups)
     runs, broken_runs = read_runs(area)
     return ReportData(
@@ -111,8 +123,8 @@ def report_data(area: Area) -> ReportData:
         frames=frames,
         points=labelled.points if labelled else None,
         fov_tan={} if labelled is None else {k: _tangents(c) for k, c in labelled.cameras.items()},
-        coverage=_coverage(area, coverage_stage.EVALUATED),
-        plan=_coverage(area, coverage_stage.PLANNED),
+        coverage=_coverage(area, COVERAGE),
+        plan=_coverage(area, PLANNED_COVERAGE),
         split=split,
         audit=checks,
         evaluation_records={
@@ -241,7 +253,7 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
 def _strata(area: Area) -> dict[str, str]:
     """Stratum of each evaluation frame by name, where coverage was measured."""
     strata: dict[str, str] = {}
-    folder = area.folder(coverage_stage.EVALUATED)
+    folder = area.folder(COVERAGE)
     try:
         for table in sorted(folder.glob("*.csv")):
             strata |= read_strata(table)

@@ -36,7 +36,7 @@ from spn_data.labels.labels import Labels, sigmas, write_label_observations, wri
 from spn_data.labels.map_hash import map_hash
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
-from spn_data.registration.register import Registered, labels_of, register_sequence
+from spn_data.registration.register import RegisteredSequence, labels_of, register_sequence
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.storage.json_files import VERSION, read_json, write_json
 from spn_data.storage.stage_record import StageRecord
@@ -172,7 +172,7 @@ def _register(
     )
 
 
-def _misfit(found: Registered) -> list[str]:
+def _misfit(found: RegisteredSequence) -> list[str]:
     """A word where the sequence fits the map much worse than the map fits itself."""
     if found.covariance is None:
         return []

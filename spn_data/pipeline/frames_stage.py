@@ -11,7 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import CAMERAS, EVALUATION, FRAMES, FRAMES_TABLE, MASKS, TELEMETRY, TRACKED
 from spn_data.capture.candidates import Candidates, analyse, build_frames
 from spn_data.capture.extraction import ExtractionCost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames
@@ -39,7 +40,7 @@ from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.work.timing import Progress, Stopwatch
 
 # Names beside the folders of the sequences.
-_RESERVED = ("telemetry", "masks", "frames.csv", "cameras.json", "stage.json", "started.json")
+_RESERVED = (TELEMETRY, MASKS, FRAMES_TABLE, CAMERAS, "stage.json", "started.json")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +82,7 @@ def plan(
     names = set(_RESERVED)
     held: set[str] = set()
     if extended is not None:
-        frames = read_frames(extended.folder(FRAMES) / "frames.csv")
+        frames = read_frames(extended.folder(FRAMES) / FRAMES_TABLE)
         names |= {name.lower() for name in np.unique(frames.sequences).tolist()}
         held = set(extended.record(FRAMES).inputs.values())
     evaluated = {} if tested is None else _evaluated(tested)
@@ -179,7 +180,7 @@ def choose_frames(
     check_space(work.path, found.cost.disk_bytes)
     stopwatch = Stopwatch()
     notes: list[str] = []
-    for name in ("telemetry", "masks", ".analysis"):
+    for name in (TELEMETRY, MASKS, ".analysis"):
         (work.path / name).mkdir(exist_ok=True)
     cameras: dict[str, dict[str, object]] = {}
     kept: list[Frames] = []
@@ -206,10 +207,10 @@ def choose_frames(
         frames = build_frames(one, choice, focal=zoom)
         if track is not None:
             frames = frames.with_telemetry(track.at(frames.time_s))
-            write_track(work.path / "telemetry" / f"{one.source.sequence}.csv", track)
+            write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", track)
         cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
-            _write_mask(masks[one.source.sequence], frames, work.path / "masks")
+            _write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:
             notes.append(f"{one.source.sequence}: no mask of that name")
         with stopwatch.step("frames"):
@@ -222,8 +223,8 @@ def choose_frames(
         done_before += int(choice.chosen.sum())
         parts.append(frames)
     frames = Frames.concatenate([*kept, *parts])
-    write_frames(work.path / "frames.csv", frames)
-    write_json(work.path / "cameras.json", {"version": 1, "cameras": cameras})
+    write_frames(work.path / FRAMES_TABLE, frames)
+    write_json(work.path / CAMERAS, {"version": 1, "cameras": cameras})
     return work.finish(
         counts={
             "candidates": len(frames),
@@ -241,9 +242,9 @@ def choose_frames(
 def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict[str, object]]]:
     """The frames of an area, linked rather than copied where the disk allows."""
     folder = extend.folder(FRAMES)
-    frames = read_frames(folder / "frames.csv")
+    frames = read_frames(folder / FRAMES_TABLE)
     chosen = [folder / name for name in frames.names[frames.chosen].tolist()]
-    others = [*(folder / "telemetry").glob("*.csv"), *(folder / "masks").glob("*.png")]
+    others = [*(folder / TELEMETRY).glob("*.csv"), *(folder / MASKS).glob("*.png")]
     for path in [*chosen, *others]:
         link = target / path.relative_to(folder)
         link.parent.mkdir(exist_ok=True)
@@ -254,7 +255,7 @@ def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict
                 copy = link.with_name(f"{link.name}.part")
                 shutil.copy2(path, copy)
                 copy.replace(link)
-    return [frames], dict(read_json(folder / "cameras.json")["cameras"])
+    return [frames], dict(read_json(folder / CAMERAS)["cameras"])
 
 
 def _analyse(source: Source, folder: Path, cost: ExtractionCost, progress: Progress) -> Candidates:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import FRAMES, GEO, MODEL, Area, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.names import FRAMES, FRAMES_TABLE, GEO, GEO_FIT, MODEL, TELEMETRY
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene, write_transformed
 from spn_data.errors import FormatError, GeometryError
@@ -63,7 +64,7 @@ def has_fixes(area: Area) -> bool:
 
 def read_tracks(area: Area) -> dict[str, Telemetry]:
     """Telemetry of each sequence, as it was read, by sequence."""
-    folder = area.folder(FRAMES) / "telemetry"
+    folder = area.folder(FRAMES) / TELEMETRY
     return {path.stem: read_track(path) for path in sorted(folder.glob("*.csv"))}
 
 
@@ -111,7 +112,7 @@ def _georegister(
     with stopwatch.step("write"):
         write_transformed(area.folder(MODEL), work.path, result.world_from_model)
         write_json(
-            work.path / "geo.json",
+            work.path / GEO_FIT,
             {
                 **result.to_json(),
                 "frames": list(scene.names),
@@ -128,7 +129,7 @@ def _georegister(
 
 def registered_frames(area: Area, scene: Scene) -> Frames:
     """Rows of frames.csv of the scene's images, in the scene's order."""
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     row = {name: k for k, name in enumerate(frames.names.tolist())}
     return frames.select(np.array([row[name] for name in scene.names], dtype=np.int64))
 

@@ -10,25 +10,35 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import FRAMES, MODEL, Area, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.names import (
+    CAMERAS,
+    DATABASE,
+    FRAMES,
+    FRAMES_TABLE,
+    MASKS,
+    MODEL,
+    OBSERVATIONS,
+    POSES,
+)
 from spn_data.capture.frames import Frames, read_frames
-from spn_data.colmap.model import Scene, read_observations
-from spn_data.errors import FormatError
+from spn_data.colmap.model import Scene
+from spn_data.errors import FormatError, GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
+from spn_data.labels.labels import write_label_observations, write_labels
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.contradiction import focal_changes
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.diagnosis import missing_passages
+from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.storage.json_files import read_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
-
-DATABASE = "database.db"
 
 
 def build_model(
@@ -48,14 +58,15 @@ def build_model(
     if isinstance(work, StageRecord):
         return work
     notes = () if extend is None else _take_over(extend, work)
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     chosen = frames.select(frames.chosen)
     stopwatch = Stopwatch()
     to_map = frames_to_map(area, chosen)
     result = reconstruct(to_map, work.path, options, progress, stopwatch)
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
-    shutters = _shutters(result.model, chosen, stopwatch)
+    shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
+    unlabelled = _write_labels(work.path, result, chosen, stopwatch)
     _name_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen, shutters),
@@ -65,8 +76,9 @@ def build_model(
             *notes,
             *result.attempts,
             *passages,
+            *unlabelled,
             *_focal_remarks(result.scene, to_map),
-            *(told for shutter in shutters if (told := shutter.tell())),
+            *(told for shutter in shutters if (told := shutter.describe())),
         ),
     )
 
@@ -92,8 +104,8 @@ def _take_over(extend: Area, work: StageWork) -> tuple[str, ...]:
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
     """What reconstruction needs of the chosen frames, from stage 1."""
     folder = area.folder(FRAMES)
-    start = read_json(folder / "cameras.json")["cameras"]
-    masks = {p.stem: p for p in sorted((folder / "masks").glob("*.png"))}
+    start = read_json(folder / CAMERAS)["cameras"]
+    masks = {p.stem: p for p in sorted((folder / MASKS).glob("*.png"))}
     return FramesToMap(
         folder=folder,
         names=tuple(chosen.names.tolist()),
@@ -111,9 +123,7 @@ def _start_camera(key: str, start: Mapping[str, dict[str, Any]]) -> tuple[Camera
     try:
         return camera_from_json(start[key]), bool(start[key]["focal_is_known"])
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(
-            f"cameras.json: camera {key!r} is missing or damaged ({error})"
-        ) from error
+        raise FormatError(f"{CAMERAS}: camera {key!r} is missing or damaged ({error})") from error
 
 
 def rough_positions(frames: Frames) -> np.ndarray:
@@ -143,15 +153,35 @@ def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
     ]
 
 
-def _shutters(model: Path, chosen: Frames, stopwatch: Stopwatch) -> tuple[ShutterDiagnosis, ...]:
+def _write_labels(
+    work: Path, result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
+) -> tuple[str, ...]:
+    """Write the labels of the mapping frames in the model's gauge; return a note if that is impossible."""
+    reasons = {row.name: row.reason for row in result.registrations}
+    model = (result.scene, result.observations, result.points)
+    try:
+        with stopwatch.step("covariance"):
+            labels, seen = mapping_labels(chosen, *model, reasons)
+    except GeometryError as error:
+        return (f"no covariance of the mapping frames: {error}",)
+    write_labels(work / POSES, labels)
+    write_label_observations(work / OBSERVATIONS, seen)
+    return ()
+
+
+def _shutters(
+    result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
+) -> tuple[ShutterDiagnosis, ...]:
     """Rolling shutter and stabilisation of each video; photos are taken too far apart to tell."""
     with stopwatch.step("shutter"):
-        scene, observations = read_observations(model)
+        scene = result.scene
         row = {name: k for k, name in enumerate(chosen.names.tolist())}
         rows = np.array([row[name] for name in scene.names], dtype=np.int64)
         if not (chosen.video_frame[rows] >= 0).any():
             return ()
-        return diagnose_shutter(scene, observations, chosen.sequences[rows], chosen.time_s[rows])
+        return diagnose_shutter(
+            scene, result.observations, chosen.sequences[rows], chosen.time_s[rows]
+        )
 
 
 def _name_results(work: Path, result: ReconstructResult) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import FRAMES, SPLIT, Area, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.names import AUDIT, CAMBRIDGE, DATASET, FRAMES, MASKS, SPLIT, SPLIT_FILE
 from spn_data.dataset.hdf5_schema import DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import GeometryError
@@ -24,14 +25,7 @@ from spn_data.inputs.dataset_contents import (
     target_cameras,
 )
 from spn_data.inputs.frame_images import frame_images
-from spn_data.pipeline.area_audit import (
-    AUDIT,
-    CAMBRIDGE,
-    DATASET,
-    SPLIT_FILE,
-    audit_folder,
-    write_audit,
-)
+from spn_data.pipeline.area_audit import audit_folder, write_audit
 from spn_data.split.audit import AuditFinding, AuditVerdict
 from spn_data.split.groups import LEFT_OUT, OPTIMISTIC, TRAIN, VALIDATION, Split, SplitOptions
 from spn_data.split.holdout import make_split
@@ -106,7 +100,7 @@ def _split(
         targets = target_cameras(
             labelled, frames.labels, native=options.native, width_px=options.width_px
         )
-        rendered = RenderedFrames(labelled, frames, targets, area.folder(FRAMES) / "masks")
+        rendered = RenderedFrames(labelled, frames, targets, area.folder(FRAMES) / MASKS)
         images = frame_images(area, frames.labels, video_folder=video_folder)
         info = _info(
             area, labelled, split, None if options.native else next(iter(targets.values()))

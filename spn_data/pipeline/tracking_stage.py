@@ -8,23 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import EVALUATION, FRAMES, MODEL, TRACKED, Area
+from spn_data.area.area import Area
+from spn_data.area.names import (
+    CAMERA,
+    EVALUATION,
+    FRAMES,
+    FRAMES_TABLE,
+    MODEL,
+    OBSERVATIONS,
+    POSES,
+    REGISTRATION,
+    TRACKED,
+)
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import read_map
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.inputs.area_labels import (
-    CAMERA,
-    POSES,
-    REGISTRATION,
-    SEEN,
     LabelledArea,
     map_folder,
     read_labelled_area,
     read_world_from_model,
-    similarity_to_json,
 )
-from spn_data.inputs.evaluation_source import FRAMES_FILE
 from spn_data.inputs.source_videos import find_videos
 from spn_data.labels.labels import LabelObservations, Labels, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
@@ -46,10 +51,10 @@ from spn_data.work.timing import Progress, Stopwatch
 def sequences_with_video(area: Area) -> list[str]:
     """Mapping and evaluation sequences that are made of video. StageError where nothing is mapped."""
     area.record(MODEL)
-    frames = read_frames(area.folder(FRAMES) / "frames.csv")
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     names = np.unique(frames.sequences[frames.video_frame >= 0]).tolist()
     for name in area.sequences(EVALUATION):
-        own = read_frames(area.folder(f"{EVALUATION}/{name}") / FRAMES_FILE)
+        own = read_frames(area.folder(f"{EVALUATION}/{name}") / FRAMES_TABLE)
         names += [name] if (own.video_frame >= 0).any() else []
     return [str(name) for name in names]
 
@@ -95,7 +100,7 @@ def track_sequence(
         labels = _with_covariances(area, labelled, labels, seen, sequence)
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
-        write_label_observations(work.path / SEEN, seen)
+        write_label_observations(work.path / OBSERVATIONS, seen)
         after = map_hash(area.folder(MODEL))
         if after != before:
             raise StageError(f"{area.root}: the map changed while {sequence} was labelled")
@@ -103,7 +108,7 @@ def track_sequence(
             work.path / REGISTRATION,
             {
                 "version": VERSION,
-                "world_from_model": similarity_to_json(read_world_from_model(area)),
+                "world_from_model": read_world_from_model(area).to_json(),
                 "map_before": before,
                 "map_after": after,
             },
@@ -117,9 +122,9 @@ def track_sequence(
 
 def _frames_of(area: Area, sequence: str) -> Frames:
     if area.has(f"{EVALUATION}/{sequence}"):
-        frames = read_frames(area.folder(f"{EVALUATION}/{sequence}") / FRAMES_FILE)
+        frames = read_frames(area.folder(f"{EVALUATION}/{sequence}") / FRAMES_TABLE)
     else:
-        frames = read_frames(area.folder(FRAMES) / "frames.csv")
+        frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
         frames = frames.select(frames.sequences == sequence)
     if not len(frames):
         left = f"{TRACKED}/{sequence}"

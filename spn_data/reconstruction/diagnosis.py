@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from spn_data.colmap.database import MapDatabase
-from spn_data.colmap.model import read_observations
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.reconstruction.correspondences import FramesToMap
 
 
@@ -26,10 +25,9 @@ class FrameRegistration:
 
 
 def diagnose(
-    database: MapDatabase, frames: FramesToMap, model: Path
+    database: MapDatabase, frames: FramesToMap, scene: Scene, seen: MapObservations
 ) -> tuple[FrameRegistration, ...]:
     """What became of each frame, and for the missing ones why."""
-    scene, seen = read_observations(model)
     position = {name: k for k, name in enumerate(scene.names)}
     partners: dict[str, dict[str, int]] = {name: {} for name in frames.names}
     for (a, b), inliers in database.verified_pairs().items():

@@ -12,8 +12,15 @@ from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.job import MappingJob
 from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
-from spn_data.colmap.model import Scene, count_registered, read_scene
+from spn_data.colmap.model import (
+    MapObservations,
+    Scene,
+    count_registered,
+    read_map,
+    read_scene,
+)
 from spn_data.errors import StageError
+from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
 from spn_data.reconstruction.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
@@ -82,6 +89,8 @@ class ReconstructResult:
     pairs_tried: int
     pairs_verified: int
     scene: Scene
+    observations: MapObservations
+    points: MapPoints
 
 
 # Measured on drone video and photos of 0.5 to 2 megapixels, two cores, 4,096 features an image.
@@ -125,8 +134,9 @@ def reconstruct(
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
         raise StageError(_no_model(work, frames, 0 if best is None else best.registered, story))
     refined = _refine(run, best.model, story)
+    scene, observations, points = read_map(refined)
     with MapDatabase.open(work / best.database) as database:
-        registrations = diagnose(database, frames, refined)
+        registrations = diagnose(database, frames, scene, observations)
         verified = len(database.verified_pairs())
         tried = database.num_pairs()
     return ReconstructResult(
@@ -137,7 +147,9 @@ def reconstruct(
         tuple(story),
         tried,
         verified,
-        read_scene(refined),
+        scene,
+        observations,
+        points,
     )
 
 

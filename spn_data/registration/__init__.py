@@ -1,1 +1,1 @@
-"""Evaluation frames in a frozen map: their poses, how far to trust them, and which of them failed."""
+"""Registration of evaluation frames in a frozen map: poses, covariances, and rejection of wrong poses."""

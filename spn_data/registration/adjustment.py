@@ -1,6 +1,6 @@
-"""Least squares over a sequence in a frozen map: its poses, its lens, and the points that only it sees.
+"""Bundle adjustment of a sequence in a frozen map: its poses, its lens, and the points that only it observes.
 
-Map points stay where they are.
+Map points stay fixed.
 """
 
 from __future__ import annotations
@@ -24,15 +24,22 @@ from spn_data.geometry.pose import Poses, rotations_from_vectors
 
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost
-_FAR_PX = 1e3  # residual of a point at or behind the camera: it counts as an outlier
+_BEHIND_PX = 1e3  # residual of a point at or behind the camera, which makes it an outlier
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceObservations:
     """M measurements in N frames.
 
-    frame : (M,) row of the frame, ascending; pixels : (M, 2); map_xyz : (M, 3) the map point's place, NaN
-    where it is a point of the sequence's own; own : (M,) row of that point, -1 for a map point.
+    Attributes
+    ----------
+    frame : ndarray, shape (M,)
+        Row of the frame, ascending.
+    pixels : ndarray, shape (M, 2)
+    map_xyz : ndarray, shape (M, 3)
+        Position of the map point; NaN if the measurement belongs to one of the sequence's own points.
+    own : ndarray, shape (M,)
+        Row of that own point; -1 for a map point.
     """
 
     frame: np.ndarray
@@ -41,6 +48,7 @@ class SequenceObservations:
     own: np.ndarray
 
     def select(self, index: np.ndarray) -> SequenceObservations:
+        """Return some of the measurements."""
         return SequenceObservations(
             self.frame[index], self.pixels[index], self.map_xyz[index], self.own[index]
         )
@@ -48,7 +56,17 @@ class SequenceObservations:
 
 @dataclass(frozen=True, eq=False)
 class SequenceState:
-    """poses : (N); camera : shared; own_points : (P, 3) points that only the sequence sees."""
+    """Unknowns of the bundle adjustment.
+
+    Attributes
+    ----------
+    poses : Poses
+        N poses.
+    camera : Camera
+        Shared by all frames.
+    own_points : ndarray, shape (P, 3)
+        Points that only the sequence observes.
+    """
 
     poses: Poses
     camera: Camera
@@ -57,10 +75,22 @@ class SequenceState:
 
 @dataclass(frozen=True, eq=False)
 class Linearized:
-    """The observations at a state.
+    """Observations linearized at a state.
 
-    residuals_px : (M, 2) projected minus measured; by_pose : (M, 2, 6); by_lens : (M, 2, L); by_point :
-    (M, 2, 3); lens : names of the L parameters. Points behind the camera have residuals of 1,000 px.
+    Points behind the camera have residuals of 1,000 px.
+
+    Attributes
+    ----------
+    residuals_px : ndarray, shape (M, 2)
+        Projected minus measured.
+    by_pose : ndarray, shape (M, 2, 6)
+        Jacobian by the pose.
+    by_lens : ndarray, shape (M, 2, L)
+        Jacobian by the L estimated intrinsics.
+    by_point : ndarray, shape (M, 2, 3)
+        Jacobian by the point.
+    lens : tuple of str
+        Names of the estimated intrinsics.
     """
 
     residuals_px: np.ndarray
@@ -71,13 +101,24 @@ class Linearized:
 
 
 def lens_parameters(camera: Camera) -> tuple[str, ...]:
-    """The parameters that a sequence can tell: focal length and radial distortion."""
+    """Return the names of the intrinsics that a sequence can determine: focal length and radial distortion.
+
+    Parameters
+    ----------
+    camera : Camera
+
+    Returns
+    -------
+    tuple of str
+        Those of "f", "fx", "fy", "k1", "k2" that the camera model has.
+    """
     return tuple(name for name in MODELS[camera.model] if name in ("f", "fx", "fy", "k1", "k2"))
 
 
 def linearize(
     state: SequenceState, observations: SequenceObservations, lens: tuple[str, ...]
 ) -> Linearized:
+    """Compute residuals and Jacobians at a state; `lens` names the estimated intrinsics."""
     rotations = state.poses.rotations[observations.frame]
     places = np.where(
         (observations.own >= 0)[:, None],
@@ -89,7 +130,7 @@ def linearize(
     behind = in_camera[:, 2] <= 1e-6 * np.linalg.norm(in_camera, axis=1)
     safe = np.where(behind[:, None], np.array([0.0, 0.0, 1.0]), in_camera)
     residuals = state.camera.project(safe) - observations.pixels
-    residuals[behind] = _FAR_PX
+    residuals[behind] = _BEHIND_PX
     by_camera_point, by_all = projection_jacobians(state.camera, safe)
     by_camera_point[behind] = 0.0
     by_point = by_camera_point @ rotations
@@ -100,10 +141,18 @@ def linearize(
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Of poses and lens, own points eliminated.
+    """Normal equations of poses and lens; own points are eliminated (Schur complement).
 
-    matrix : sparse (6N+L, 6N+L); right : (6N+L,); point_inverse : (P, 3, 3); coupling : sparse (6N+L, 3P);
-    point_right : (P, 3).
+    Attributes
+    ----------
+    matrix : sparse, shape (6N+L, 6N+L)
+    right : ndarray, shape (6N+L,)
+    point_inverse : ndarray, shape (P, 3, 3)
+        Inverse normal matrices of the own points.
+    coupling : sparse, shape (6N+L, 3P)
+        Block between poses and lens and the own points.
+    point_right : ndarray, shape (P, 3)
+        Right-hand sides of the own points.
     """
 
     matrix: sparse.csc_matrix
@@ -116,7 +165,7 @@ class NormalEquations:
 def jacobian(
     linearized: Linearized, frame: np.ndarray, frames: int, weights: np.ndarray
 ) -> sparse.csr_matrix:
-    """Sparse (2M, 6N+L) by poses and lens, each row times the root of its weight."""
+    """Return the sparse Jacobian (2M, 6N+L) by poses and lens, each row times the root of its weight."""
     m, lens = len(frame), linearized.by_lens.shape[2]
     values = np.concatenate([linearized.by_pose, linearized.by_lens], axis=2)
     of_lens = np.broadcast_to(POSE * frames + np.arange(lens), (m, lens))
@@ -132,32 +181,33 @@ def normal_equations(
     weights: np.ndarray,
     damping: float = 0.0,
 ) -> NormalEquations:
-    """damping : share by which the information of every unknown is raised (Marquardt's).
+    """Build the normal equations, with damping as the factor by which the diagonal is raised (Marquardt).
 
-    Own points are damped like the others: one of little parallax would else overshoot however small the step.
+    Own points are damped like the other unknowns: one with little parallax would otherwise overshoot, however
+    small the step.
     """
-    by_unknown = jacobian(linearized, observations.frame, frames, weights)
+    weighted_jacobian = jacobian(linearized, observations.frame, frames, weights)
     residuals = (linearized.residuals_px * np.sqrt(weights)[:, None]).ravel()
-    matrix = (by_unknown.T @ by_unknown).tocsc()
+    matrix = (weighted_jacobian.T @ weighted_jacobian).tocsc()
     if damping:
         diagonal = matrix.diagonal()
         matrix = (matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())).tocsc()
-    right = -(by_unknown.T @ residuals)
-    mine = np.flatnonzero(observations.own >= 0)
-    point_of = observations.own[mine]
-    root = np.sqrt(weights[mine])[:, None]
-    by_point = linearized.by_point[mine] * root[..., None]
+    right = -(weighted_jacobian.T @ residuals)
+    own = np.flatnonzero(observations.own >= 0)
+    point_of = observations.own[own]
+    root = np.sqrt(weights[own])[:, None]
+    by_point = linearized.by_point[own] * root[..., None]
     v = np.zeros((own_points, 3, 3))
     np.add.at(v, point_of, by_point.transpose(0, 2, 1) @ by_point)
     v += damping * v * np.eye(3)
     v += 1e-12 * np.eye(3) * (1 + np.trace(v, axis1=1, axis2=2)[:, None, None])
     inverse = np.linalg.inv(v)
     point_right = np.zeros((own_points, 3))
-    weighted = linearized.residuals_px[mine] * root
+    weighted = linearized.residuals_px[own] * root
     np.add.at(point_right, point_of, -np.einsum("mij,mi->mj", by_point, weighted))
     of_points = rows_to_sparse(by_point, 3 * point_of[:, None] + np.arange(3), 3 * own_points)
-    rows = (2 * mine[:, None] + np.arange(2)).ravel()
-    coupling = (by_unknown[rows].T @ of_points).tocsr()
+    rows = (2 * own[:, None] + np.arange(2)).ravel()
+    coupling = (weighted_jacobian[rows].T @ of_points).tocsr()
     if own_points:
         weighted_coupling = coupling @ sparse.block_diag(list(inverse), format="csr")
         matrix = (matrix - weighted_coupling @ coupling.T).tocsc()
@@ -172,7 +222,10 @@ def adjust(
     scale_px: float,
     lens: tuple[str, ...],
 ) -> SequenceState:
-    """The state of least robust cost (Cauchy, of this scale), from a good start (Levenberg, Marquardt)."""
+    """Minimize the robust cost (Cauchy loss with scale `scale_px`) from a good start by Levenberg-Marquardt.
+
+    `lens` names the intrinsics to estimate.
+    """
     damping = 1e-6
     linearized = linearize(state, observations, lens)
     cost = _cost(linearized, scale_px)

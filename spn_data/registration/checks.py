@@ -1,10 +1,10 @@
-"""Which poses become labels. A wrong pose is worse than none.
+"""Checks that decide which poses become labels. A wrong pose is worse than none.
 
-A pose has two kinds of witnesses: the map points that the frame itself found, and its neighbours in the
-sequence, whose relative pose is known from their common features without the map. A frame that the map
-places well, and in one place only, stands by itself. A frame that it places badly, or in two places, needs a
-neighbour that stands and agrees. Where a frame and its neighbours contradict each other, the majority
-holds; where there is none, all of them fail.
+There is evidence of two kinds for a pose: the map points that the frame itself matched, and its neighbours in
+the sequence, whose relative pose is known from common features without the map. A frame whose matches clearly
+determine one pose is accepted on its own. A frame with few or ambiguous matches needs an accepted neighbour
+that agrees with it. If a frame and its neighbours contradict each other, the majority decides; without a
+majority, all of them fail.
 """
 
 from __future__ import annotations
@@ -21,19 +21,35 @@ from spn_data.labels.map_points import covered_share
 from spn_data.registration.register_options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import SequenceSolution, UnsolvedSequence, reprojection_errors
 
-_MIN_SHARED = 10  # map points that two frames both show, to compare their poses by
+_MIN_SHARED = 10  # map points that two frames must share to compare their poses
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What speaks for each of N poses.
+    """Evidence for each of N poses.
 
-    direct : (N,) int, map points that the frame itself found and that agree; putative : (N,) int, that it
-    found in all; inliers : (N,) int, agreeing map points, those that neighbours brought included;
-    coverage : (N,) share of the image that these cover; rival : (N,) int, inliers of the best pose elsewhere;
-    depth : (N,) median distance of the points, in the map's unit; sigma : (N,), sigma_deg : (N,) stated.
-    pairs : (P, 2) neighbours, i < j; matches : (P,) of them; agreement : (P,) share of the matches that both
-    poses explain, NaN where one has no pose (see `_agreement`).
+    Attributes
+    ----------
+    direct : ndarray, shape (N,), int
+        Number of agreeing map points that the frame itself matched.
+    putative : ndarray, shape (N,), int
+        Number of its features that were matched with the map.
+    inliers : ndarray, shape (N,), int
+        Number of agreeing map points, including those propagated from neighbours.
+    coverage : ndarray, shape (N,)
+        Share of the image that they cover.
+    rival : ndarray, shape (N,), int
+        Inliers of the best pose elsewhere.
+    depth : ndarray, shape (N,)
+        Median distance of the points in the map's unit.
+    sigma, sigma_deg : ndarray, shape (N,)
+        Standard deviations of position and rotation by the covariance.
+    pairs : ndarray, shape (P, 2)
+        Neighbours, i < j.
+    matches : ndarray, shape (P,)
+        Number of their matches.
+    agreement : ndarray, shape (P,)
+        Share of the matches that both poses explain (see `_agreement`); NaN if one of them has no pose.
     """
 
     direct: np.ndarray
@@ -56,7 +72,11 @@ def gather_evidence(
     pairs: dict[tuple[int, int], np.ndarray],
     options: RegisterOptions,
 ) -> Evidence:
-    """covariances : (N, 6, 6), NaN where there is no pose; pairs : verified matches (K, 2) of neighbours."""
+    """Collect the evidence for the poses of a solution.
+
+    The covariances (N, 6, 6) are NaN for frames without a pose; `pairs` holds the verified matches (K, 2) of
+    neighbours.
+    """
     n = len(solution.posed)
     direct, inliers, rival = (np.zeros(n, np.int64) for _ in range(3))
     coverage, depth = np.zeros(n), np.full(n, np.nan)
@@ -64,15 +84,15 @@ def gather_evidence(
     for row in np.flatnonzero(solution.posed).tolist():
         feature, point = solution.inliers(row)
         pixels = sequence.pixels[row][feature]
-        found = set(map(tuple, sequence.putative[row].tolist()))
-        own = [pair in found for pair in zip(feature.tolist(), point.tolist(), strict=True)]
+        matched = set(map(tuple, sequence.putative[row].tolist()))
+        own = [pair in matched for pair in zip(feature.tolist(), point.tolist(), strict=True)]
         direct[row] = len(set(feature[own].tolist()))
         inliers[row] = len(np.unique(feature))
         if len(feature):
             coverage[row] = covered_share(pixels, camera.width, camera.height)
             away = sequence.map_xyz[point] - solution.poses.centers[row]
             depth[row] = np.median(np.linalg.norm(away, axis=1))
-            rival[row] = _rival(sequence, solution, row, depth[row], options)
+            rival[row] = _rival_inliers(sequence, solution, row, depth[row], options)
     shown = [_points_of_features(sequence, solution, row) for row in range(n)]
     sigma, sigma_deg = sigmas(covariances)
     keys = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
@@ -96,14 +116,14 @@ def gather_evidence(
     )
 
 
-def _rival(
+def _rival_inliers(
     sequence: UnsolvedSequence,
     solution: SequenceSolution,
     row: int,
     depth: float,
     options: RegisterOptions,
 ) -> int:
-    """Inliers of the best pose among the matches that the pose leaves unexplained, if it lies elsewhere."""
+    """Return the inliers of the best other pose from the matches that the pose does not explain."""
     matches = sequence.putative[row]
     pixels = sequence.pixels[row][matches[:, 0]]
     points = sequence.map_xyz[matches[:, 1]]
@@ -124,7 +144,7 @@ def _rival(
 
 
 def same_pose(a: Poses, b: Poses, depth: float, options: CheckOptions) -> bool:
-    """Whether two poses are one, at the distance at which points are seen."""
+    """Return whether two poses are equal within the tolerances, given the distance of the points."""
     apart = float(np.linalg.norm(a.centers[0] - b.centers[0]))
     turned_deg = float(rotation_errors_deg(a.quats_wxyz, b.quats_wxyz)[0])
     return apart <= options.same_place * depth and turned_deg <= options.same_rotation_deg
@@ -133,7 +153,7 @@ def same_pose(a: Poses, b: Poses, depth: float, options: CheckOptions) -> bool:
 def _points_of_features(
     sequence: UnsolvedSequence, solution: SequenceSolution, row: int
 ) -> np.ndarray:
-    """(K,) row of the map point that the pose agrees with, of each feature of a frame; -1 for none."""
+    """Return for each feature (K,) of a frame the row of its agreeing map point; -1 for none."""
     shown = np.full(len(sequence.pixels[row]), -1)
     feature, point = solution.inliers(row)
     shown[feature] = point
@@ -149,11 +169,12 @@ def _agreement(
     j: int,
     options: RegisterOptions,
 ) -> float:
-    """Share of the matches of two frames that both poses explain: by what they say least.
+    """Return the share of the matches of two frames that both poses explain.
 
-    Matches lie on each other's epipolar lines (Sampson's error); and the map point that one frame shows lies
-    where the other has the match. The first says nothing of an error along the line between the frames, as
-    of one window in a facade that they pass; the second needs map points.
+    It is the smallest of up to three shares. Matches must be near each other's epipolar lines (Sampson
+    error), and a map point that one frame observes must project near the match in the other frame, in both
+    directions. The epipolar error is blind to a pose error along the baseline, such as one window in a facade
+    that the camera passes; the other two need map points.
     """
     if not (solution.posed[i] and solution.posed[j]) or not len(matches):
         return float("nan")
@@ -190,21 +211,28 @@ def _epipolar_share(
 
 @dataclass(frozen=True, eq=False)
 class PoseVerdict:
-    """accepted : (N,) bool; reason : N sentences, empty where accepted."""
+    """Result of the checks.
+
+    Attributes
+    ----------
+    accepted : ndarray, shape (N,), bool
+    reason : tuple of str
+        Why a pose was rejected; empty if it was accepted.
+    """
 
     accepted: np.ndarray
     reason: tuple[str, ...]
 
 
-def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> PoseVerdict:
-    """Accept or refuse each of N poses."""
+def check_poses(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> PoseVerdict:
+    """Accept or reject each of N poses."""
     n = len(posed)
     reason = ["" if posed[k] else _unposed_reason(evidence, k) for k in range(n)]
     possible = posed.copy()
     for k in np.flatnonzero(posed).tolist():
-        reason[k] = _weakness(evidence, k, options)
+        reason[k] = _rejection_reason(evidence, k, options)
         possible[k] = not reason[k]
-    agrees, contradicts = _testimony(evidence, possible, options)
+    agrees, contradicts = _neighbour_votes(evidence, possible, options)
     for k in np.flatnonzero(possible).tolist():
         if len(contradicts[k]) > 0 and len(contradicts[k]) >= len(agrees[k]):
             possible[k] = False
@@ -214,7 +242,7 @@ def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> PoseV
             )
     accepted = np.zeros(n, bool)
     for k in np.flatnonzero(possible).tolist():
-        accepted[k] = not _needs_support(evidence, k, options)
+        accepted[k] = not _doubt(evidence, k, options)
     while True:
         supported = [
             k for k in np.flatnonzero(possible & ~accepted) if any(accepted[j] for j in agrees[k])
@@ -223,7 +251,7 @@ def judge(posed: np.ndarray, evidence: Evidence, options: CheckOptions) -> PoseV
             break
         accepted[supported] = True
     for k in np.flatnonzero(possible & ~accepted).tolist():
-        reason[k] = _needs_support(evidence, k, options) + ", and no neighbour confirms its pose"
+        reason[k] = _doubt(evidence, k, options) + ", and no neighbour confirms its pose"
     return PoseVerdict(accepted, tuple("" if accepted[k] else reason[k] for k in range(n)))
 
 
@@ -233,8 +261,8 @@ def _unposed_reason(evidence: Evidence, k: int) -> str:
     return f"no pose agrees with its {evidence.putative[k]} matches with the map"
 
 
-def _weakness(evidence: Evidence, k: int, options: CheckOptions) -> str:
-    """What no neighbour can make good, or nothing."""
+def _rejection_reason(evidence: Evidence, k: int, options: CheckOptions) -> str:
+    """Return why a pose is rejected regardless of its neighbours, or an empty string."""
     if evidence.inliers[k] < options.min_inliers:
         return f"only {evidence.inliers[k]} map points agree ({options.min_inliers} are needed)"
     if evidence.coverage[k] < options.min_coverage:
@@ -249,8 +277,8 @@ def _weakness(evidence: Evidence, k: int, options: CheckOptions) -> str:
     return ""
 
 
-def _needs_support(evidence: Evidence, k: int, options: CheckOptions) -> str:
-    """Why the map alone does not settle a pose, or nothing."""
+def _doubt(evidence: Evidence, k: int, options: CheckOptions) -> str:
+    """Return why a pose needs confirmation by a neighbour, or an empty string."""
     direct = int(evidence.direct[k])
     if evidence.rival[k] > options.max_rival * direct:
         return f"ambiguous: {direct} map points agree with the pose and {evidence.rival[k]} with another"
@@ -261,10 +289,10 @@ def _needs_support(evidence: Evidence, k: int, options: CheckOptions) -> str:
     return ""
 
 
-def _testimony(
+def _neighbour_votes(
     evidence: Evidence, possible: np.ndarray, options: CheckOptions
 ) -> tuple[list[list[int]], list[list[int]]]:
-    """Neighbours that agree with each frame, and those that contradict it."""
+    """Return for each frame the neighbours that agree with it and those that contradict it."""
     agrees: list[list[int]] = [[] for _ in possible]
     contradicts: list[list[int]] = [[] for _ in possible]
     for (i, j), matches, share in zip(

@@ -1,7 +1,7 @@
-"""How uncertain single frames are, relative to the map, when their lens is known from elsewhere.
+"""Covariance of single frames relative to the map, if their lens is known from elsewhere.
 
-The same sum as in `covariance`, for frames that share nothing but the lens: noise of the frame's own
-measurements, errors of the map's points, and of the lens (a mapping lens together with the map's points).
+The same sum as in `covariance`, for frames that share only the lens: noise of the frame's own measurements,
+errors of the map points, and errors of the lens (for a mapping lens, correlated with the map points).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from spn_data.registration.adjustment import (
     lens_parameters,
     linearize,
 )
-from spn_data.registration.covariance import bend_factor
+from spn_data.registration.covariance import misfit_factor
 from spn_data.registration.solution import SCALE_PX
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
@@ -29,7 +29,15 @@ _FRAMES_AT_ONCE = 32
 
 @dataclass(frozen=True, eq=False)
 class LensUncertainty:
-    """camera_id : of the map, where it is a mapping lens; else covariance (L, L) over `lens_parameters`."""
+    """Uncertainty of the intrinsics.
+
+    Attributes
+    ----------
+    camera_id : int or None
+        Camera of the map, if the lens is a mapping lens.
+    covariance : ndarray, shape (L, L), or None
+        Otherwise the covariance of the intrinsics named by `lens_parameters`.
+    """
 
     camera_id: int | None = None
     covariance: np.ndarray | None = None
@@ -37,7 +45,16 @@ class LensUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class PointObservations:
-    """What one frame sees. pixels : (K, 2); point_rows : (K,) of the map's points; xyz : (K, 3)."""
+    """Map points observed in one frame.
+
+    Attributes
+    ----------
+    pixels : ndarray, shape (K, 2)
+    point_rows : ndarray, shape (K,)
+        Rows of the map points.
+    xyz : ndarray, shape (K, 3)
+        Positions of the map points.
+    """
 
     pixels: np.ndarray
     point_rows: np.ndarray
@@ -51,27 +68,47 @@ def frame_covariances(
     lens: LensUncertainty,
     map_covariance: MapCovariance,
 ) -> np.ndarray:
-    """(N, 6, 6) as in Labels, for poses (N) estimated from the points of each frame alone."""
+    """Compute the covariance of poses that were estimated from the map points of each frame alone.
+
+    Parameters
+    ----------
+    poses : Poses
+        N poses.
+    camera : Camera
+    frames : sequence of PointObservations
+        One per pose.
+    lens : LensUncertainty
+    map_covariance : MapCovariance
+
+    Returns
+    -------
+    ndarray, shape (N, 6, 6)
+        As in Labels.
+    """
     covariance = np.empty((len(frames), POSE, POSE))
     for first in range(0, len(frames), _FRAMES_AT_ONCE):
         some = range(first, min(first + _FRAMES_AT_ONCE, len(frames)))
-        noise, functionals, bent = [], [], []
+        noise, functionals, misfit = [], [], []
         for k in some:
-            own, functional, sigma_px = _one(poses[k : k + 1], camera, frames[k], lens)
+            own, functional, sigma_px = _frame_covariance(poses[k : k + 1], camera, frames[k], lens)
             noise.append(own)
             functionals.append(functional)
-            bent.append(bend_factor(sigma_px, map_covariance))
+            misfit.append(misfit_factor(sigma_px, map_covariance))
         of_map = map_covariance.functional_covariances(functionals)
-        for k, own, b, through in zip(some, noise, bent, of_map, strict=True):
+        for k, own, b, through in zip(some, noise, misfit, of_map, strict=True):
             both = own + b * through
             covariance[k] = 0.5 * (both + both.T)
     return covariance
 
 
-def _one(
+def _frame_covariance(
     pose: Poses, camera: Camera, frame: PointObservations, lens: LensUncertainty
 ) -> tuple[np.ndarray, Functional, float]:
-    """Covariance by noise and a lens of its own; what the map does to the pose; deviation of a residual."""
+    """Return the parts of a frame's covariance.
+
+    These are the covariance due to noise and the frame's own lens, the Jacobian of the pose by the map, and
+    the standard deviation of one residual component.
+    """
     m = len(frame.pixels)
     observations = SequenceObservations(
         np.zeros(m, np.int64), frame.pixels, frame.xyz, np.full(m, -1)

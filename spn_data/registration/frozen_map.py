@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from spn_data.colmap.map_features import MapFeatures
-from spn_data.colmap.model import MapObservations, Scene, read_map_with_features
+from spn_data.colmap.model import MapObservations, Scene, read_map_with_keypoints
 from spn_data.errors import FormatError
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
@@ -35,7 +35,7 @@ class FrozenMap:
         self.scene: Scene
         self.observations: MapObservations
         self.points: MapPoints
-        self.scene, self.observations, self.points, self._feature_points = read_map_with_features(
+        self.scene, self.observations, self.points, self._feature_points = read_map_with_keypoints(
             folder
         )
         self._features = features

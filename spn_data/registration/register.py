@@ -1,4 +1,4 @@
-"""From images of a sequence to its labels in the frozen map, in the map's own gauge."""
+"""Registration of a sequence: from its images to labels in the frozen map, in the map's own gauge."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
 from spn_data.reconstruction.correspondences import FramesToMap, extract_missing, match_missing
-from spn_data.registration.checks import gather_evidence, judge
+from spn_data.registration.checks import check_poses, gather_evidence
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
-from spn_data.registration.lookup import look_up_missing
+from spn_data.registration.map_matching import match_missing_to_map
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import (
     SequenceSolution,
     UnsolvedSequence,
-    free_lens,
-    settle,
-    without,
+    adjust_inliers,
+    estimated_intrinsics,
+    remove_frames,
 )
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
@@ -36,10 +36,27 @@ _MATCHES = ".matches"
 
 
 @dataclass(frozen=True, eq=False)
-class Registered:
-    """solution : of the frames that were accepted; reason : N sentences, why the others failed; inliers,
-    coverage : (N,) of map points that agree; covariances : (N, 6, 6), NaN without a pose; covariance : None
-    where none was accepted; seen : map points of each frame; map_sigma_px : residuals of the map itself.
+class RegisteredSequence:
+    """Result of registering N frames.
+
+    Attributes
+    ----------
+    solution : SequenceSolution
+        Contains the accepted frames.
+    reason : tuple of str
+        Why each frame was rejected; empty if it was accepted.
+    inliers : ndarray, shape (N,)
+        Number of agreeing map points.
+    coverage : ndarray, shape (N,)
+        Share of the image that they cover.
+    covariance : SequenceCovariance or None
+        None if no frame was accepted.
+    covariances : ndarray, shape (N, 6, 6)
+        NaN for frames without a pose.
+    seen : LabelObservations
+        Map points that each frame observes.
+    map_sigma_px : float
+        Standard deviation of the map's own residuals.
     """
 
     solution: SequenceSolution
@@ -61,13 +78,36 @@ def register_sequence(
     *,
     dispatch: Dispatch,
     stopwatch: Stopwatch,
-) -> Registered:
-    """Poses of N frames of one lens. The map's files are only read.
+) -> RegisteredSequence:
+    """Register N frames of one lens in a frozen map. The map's files are only read.
 
-    folder : holds the features and matches that were found before; map_folder : a model and its database.
+    Parameters
+    ----------
+    to_match : FramesToMap
+        The frames; they share one camera.
+    folder : Path
+        Working folder, which may contain features and matches of an earlier run.
+    map_folder : Path
+        Folder of a model and its database.
+    options : RegisterOptions
+    progress : Progress
+    dispatch : Dispatch
+        Runs the work on workers.
+    stopwatch : Stopwatch
+
+    Returns
+    -------
+    RegisteredSequence
+
+    Raises
+    ------
+    FormatError
+        If the map or a database is damaged.
+    StageError
+        If the disk is full.
     """
     names = to_match.names
-    near = sorted(
+    neighbours = sorted(
         sequence_pairs(to_match.sequences, PairOptions(overlap=options.neighbors, far_steps=0))
     )
     with MapDatabase.open(folder / DATABASE) as database:
@@ -78,46 +118,46 @@ def register_sequence(
         with stopwatch.step("features"):
             extract_missing(database, to_match, options.features, dispatch, progress)
         with stopwatch.step("neighbours"):
-            match_missing(database, to_match, near, options.matching, dispatch, progress)
+            match_missing(database, to_match, neighbours, options.matching, dispatch, progress)
         with FrozenMap.open(map_folder, map_folder / DATABASE) as frozen:
             with stopwatch.step("map"):
-                putative = look_up_missing(
+                putative = match_missing_to_map(
                     names, database, frozen, folder / _MATCHES, options, dispatch, progress
                 )
             scene, observations, points = frozen.scene, frozen.observations, frozen.points
         pixels = [
             database.read_features(name).keypoints[:, :2].astype(np.float64) for name in names
         ]
-        pairs = {(i, j): database.read_inliers(names[i], names[j]) for i, j in near}
+        pairs = {(i, j): database.read_inliers(names[i], names[j]) for i, j in neighbours}
     progress("poses", 0, len(names))
     with stopwatch.step("poses"):
         tracks = find_tracks(pairs, [len(p) for p in pixels])
         sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
         (start,) = to_match.start_cameras.values()
         solution = solve(sequence, *start, options)
-        found = accept(
+        registered = accept_poses(
             sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
         )
     progress("poses", len(names), len(names))
-    return found
+    return registered
 
 
-def accept(
+def accept_poses(
     sequence: UnsolvedSequence,
     solution: SequenceSolution,
     pairs: dict[tuple[int, int], np.ndarray],
     map_covariance: MapCovariance,
     points: MapPoints,
     options: RegisterOptions,
-) -> Registered:
-    """The frames that stand. What fails leaves the least squares, and the others are judged anew."""
+) -> RegisteredSequence:
+    """Drop poses that fail the checks, adjust the rest and check it again, until none fails."""
     n = len(solution.posed)
     reason, inliers, coverage = [""] * n, np.zeros(n, np.int64), np.zeros(n)
-    settled = np.zeros(n, bool)  # what is told of a frame is what held when it failed
+    settled = np.zeros(n, bool)  # a rejected frame keeps the reason and figures from when it failed
     while True:
         covariance, covariances = _covariances(sequence, solution, map_covariance, options)
         evidence = gather_evidence(sequence, solution, covariances, pairs, options)
-        verdict = judge(solution.posed, evidence, options.checks)
+        verdict = check_poses(solution.posed, evidence, options.checks)
         for row in np.flatnonzero(~settled):
             reason[row] = verdict.reason[row]
             inliers[row], coverage[row] = evidence.inliers[row], evidence.coverage[row]
@@ -125,14 +165,14 @@ def accept(
         failing = solution.posed & ~verdict.accepted
         if not failing.any():
             break
-        solution = settle(sequence, without(solution, failing), options)
+        solution = adjust_inliers(sequence, remove_frames(solution, failing), options)
     of_map = np.flatnonzero(solution.point_row >= 0)
     seen = LabelObservations(
         solution.frame[of_map],
         points.ids[solution.point_row[of_map]],
         sequence.pixels_of(solution.frame[of_map], solution.feature[of_map]),
     )
-    return Registered(
+    return RegisteredSequence(
         solution=solution,
         reason=tuple(reason),
         inliers=inliers,
@@ -150,24 +190,35 @@ def _covariances(
     map_covariance: MapCovariance,
     options: RegisterOptions,
 ) -> tuple[SequenceCovariance | None, np.ndarray]:
-    """Of the posed frames; and (N, 6, 6) of all, NaN where there is no pose."""
-    everything = np.full((len(solution.posed), 6, 6), np.nan)
+    """Return the covariance of the posed frames, and (N, 6, 6) of all frames, NaN without a pose."""
+    covariances = np.full((len(solution.posed), 6, 6), np.nan)
     if not solution.posed.any():
-        return None, everything
+        return None, covariances
     state, observations = solution.least_squares(sequence)
     covariance = sequence_covariance(
         state,
         observations,
         solution.point_row,
         map_covariance,
-        free_lens(solution.camera, len(state.poses), options),
+        estimated_intrinsics(solution.camera, len(state.poses), options),
     )
-    everything[solution.posed] = covariance.poses
-    return covariance, everything
+    covariances[solution.posed] = covariance.poses
+    return covariance, covariances
 
 
-def labels_of(chosen: Frames, registered: Registered) -> Labels:
-    """The frames (N), in the order in which they were registered, as labels in the map's gauge."""
+def labels_of(chosen: Frames, registered: RegisteredSequence) -> Labels:
+    """Convert registered frames to labels in the map's gauge.
+
+    Parameters
+    ----------
+    chosen : Frames
+        The N frames, in the order in which they were registered.
+    registered : RegisteredSequence
+
+    Returns
+    -------
+    Labels
+    """
     solution, covariance = registered.solution, registered.covariance
     n = len(chosen)
     error_px = np.full(n, np.nan)

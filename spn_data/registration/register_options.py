@@ -1,4 +1,4 @@
-"""All that registering a sequence depends on."""
+"""Options of registration."""
 
 from __future__ import annotations
 
@@ -10,32 +10,75 @@ from spn_data.matching.putative import MatchOptions
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions:
-    """When a pose becomes a label. Lengths are shares of the median distance of the points that are seen."""
+    """Thresholds of the checks. Lengths are relative to the median distance of the observed points.
 
-    min_inliers: int = 30  # map points that agree with the pose
-    # Of the features that match the map, so that a pose stands without a neighbour. True poses have 0.2 and
-    # more where the image is sharp; in another place with the same window grid, wrong ones reach 0.10.
+    Attributes
+    ----------
+    min_inliers : int
+        Minimum number of map points that agree with the pose.
+    min_inlier_ratio : float
+        Minimum share of the features matched with the map that are inliers, for a pose that no neighbour
+        confirms. In sharp images, correct poses reach at least 0.2; wrong ones, in another place with the
+        same window grid, up to 0.10.
+    min_coverage : float
+        Minimum share of the image's cells that contain an inlier.
+    max_rival : float
+        Maximum number of inliers of the second-best pose, relative to the best one's.
+    same_place, same_rotation_deg : float
+        Poses are the same if they are closer than this in position and rotation.
+    min_pair_matches : int
+        Minimum number of matches with a neighbour for it to count as evidence.
+    min_pair_agreement : float
+        Minimum share of these matches that both poses explain.
+    max_sigma : float
+        Maximum standard deviation of the position.
+    max_sigma_deg : float
+        Maximum standard deviation of the rotation.
+    """
+
+    min_inliers: int = 30
     min_inlier_ratio: float = 0.15
-    min_coverage: float = 0.08  # share of the image's cells that hold an inlier
-    max_rival: float = 0.5  # inliers of the second-best pose, as a share of the best one's
-    same_place: float = 0.025  # poses nearer than this, and
-    same_rotation_deg: float = 2.0  # turned by less, are one
-    min_pair_matches: int = 30  # with a neighbour, so that it can testify
-    min_pair_agreement: float = 0.5  # share of them that the two poses explain
-    max_sigma: float = 0.0125  # of the position
-    max_sigma_deg: float = 0.5  # of the rotation
+    min_coverage: float = 0.08
+    max_rival: float = 0.5
+    same_place: float = 0.025
+    same_rotation_deg: float = 2.0
+    min_pair_matches: int = 30
+    min_pair_agreement: float = 0.5
+    max_sigma: float = 0.0125
+    max_sigma_deg: float = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegisterOptions:
-    """How a sequence is registered."""
+    """Options of the registration of a sequence.
 
-    rate_hz: float = 2.0  # frames taken of a video, whatever they show
-    map_frames: int = 12  # most similar map frames that a frame is matched with
-    neighbors: int = 3  # following frames of its sequence that it is matched with
-    hold_lens: bool = False  # keep the lens that is given as it is
-    start_error_px: float = 12.0  # of an inlier while the lens is being found
-    max_error_px: float = 4.0  # of an inlier afterwards
+    Attributes
+    ----------
+    rate_hz : float
+        Frames taken from a video per second, regardless of their content.
+    map_frames : int
+        Number of most similar map frames with which a frame is matched.
+    neighbors : int
+        Number of following frames of its sequence with which a frame is matched.
+    hold_lens : bool
+        Keep the given intrinsics fixed.
+    start_error_px : float
+        Maximum reprojection error of an inlier while the intrinsics are estimated.
+    max_error_px : float
+        Maximum reprojection error of an inlier afterwards.
+    features : FeatureOptions
+    matching : MatchOptions
+    checks : CheckOptions
+    seed : int
+        Random seed.
+    """
+
+    rate_hz: float = 2.0
+    map_frames: int = 12
+    neighbors: int = 3
+    hold_lens: bool = False
+    start_error_px: float = 12.0
+    max_error_px: float = 4.0
     features: FeatureOptions = field(default_factory=FeatureOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     checks: CheckOptions = field(default_factory=CheckOptions)

@@ -1,4 +1,4 @@
-"""What a sequence is before it has poses, and its solution in the frozen map: one least squares."""
+"""A sequence before it has poses, and its solution in the frozen map: one bundle adjustment."""
 
 from __future__ import annotations
 
@@ -20,16 +20,24 @@ from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.tracks import Tracks
 
 SCALE_PX = 0.5  # of the Cauchy loss
-_FRAMES_FOR_LENS = 3  # fewer do not tell a lens
-_FOR_A_POSE = 4  # measurements; with fewer it is not determined
+_MIN_FRAMES_FOR_LENS = 3  # to determine the intrinsics
+_MIN_MEASUREMENTS = 4  # to determine a pose
 
 
 @dataclass(frozen=True, eq=False)
 class UnsolvedSequence:
-    """What is known of N frames before they have poses.
+    """Measurements of N frames before they have poses.
 
-    pixels : N arrays (K, 2) of features; putative : N arrays (M, 2) of feature and map point row;
-    tracks : of features that frames share; map_xyz : (P, 3) the map's points.
+    Attributes
+    ----------
+    pixels : list of ndarray, shape (K, 2)
+        Keypoints of each frame.
+    putative : list of ndarray, shape (M, 2)
+        Matches of each frame with the map: feature and map point row.
+    tracks : Tracks
+        Features that frames share.
+    map_xyz : ndarray, shape (P, 3)
+        Map points.
     """
 
     pixels: list[np.ndarray]
@@ -38,7 +46,7 @@ class UnsolvedSequence:
     map_xyz: np.ndarray
 
     def pixels_of(self, frame: np.ndarray, feature: np.ndarray) -> np.ndarray:
-        """(M, 2) of features (M,) of frames (M,)."""
+        """Return the pixels (M, 2) of features (M,) in frames (M,)."""
         first = np.concatenate([[0], np.cumsum([len(p) for p in self.pixels])])
         return np.concatenate(self.pixels)[first[frame] + feature]
 
@@ -47,9 +55,19 @@ class UnsolvedSequence:
 class SequenceSolution:
     """N frames in the map.
 
-    posed : (N,) bool; poses : (N), NaN where there is none; camera : of all of them.
-    frame, feature, point_row, own : (M,) the measurements that agree; point_row -1 where it is a point of
-    the sequence's own, whose row is `own`, else -1. own_points : (P, 3).
+    Attributes
+    ----------
+    posed : ndarray, shape (N,), bool
+        Whether the frame has a pose.
+    poses : Poses
+        N poses; NaN for frames without one.
+    camera : Camera
+        Shared by all frames.
+    frame, feature, point_row, own : ndarray, shape (M,)
+        Inlier measurements. For a map point, `point_row` is its row and `own` is -1; for one of the
+        sequence's own points, `point_row` is -1 and `own` is its row.
+    own_points : ndarray, shape (P, 3)
+        Points that only the sequence observes.
     """
 
     posed: np.ndarray
@@ -62,20 +80,20 @@ class SequenceSolution:
     own_points: np.ndarray
 
     def inliers(self, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """(feature (K,), map point row (K,)) of the map points that one frame's pose agrees with."""
+        """Return the features (K,) of a frame that are map points, and the rows (K,) of these points."""
         first, last = np.searchsorted(self.frame, [row, row + 1])
         mine = first + np.flatnonzero(self.point_row[first:last] >= 0)
         return self.feature[mine], self.point_row[mine]
 
-    def with_measurements(self, stay: np.ndarray) -> SequenceSolution:
-        """Only some of the measurements (M,) bool, and own points numbered anew: those that are left."""
-        own = self.own[stay]
+    def select_measurements(self, keep: np.ndarray) -> SequenceSolution:
+        """Keep some measurements (M,) bool; renumber the own points that are left."""
+        own = self.own[keep]
         used = np.unique(own[own >= 0])
         return replace(
             self,
-            frame=self.frame[stay],
-            feature=self.feature[stay],
-            point_row=self.point_row[stay],
+            frame=self.frame[keep],
+            feature=self.feature[keep],
+            point_row=self.point_row[keep],
             own=np.where(own >= 0, np.searchsorted(used, own), -1),
             own_points=self.own_points[used],
         )
@@ -83,7 +101,7 @@ class SequenceSolution:
     def least_squares(
         self, sequence: UnsolvedSequence
     ) -> tuple[SequenceState, SequenceObservations]:
-        """The posed frames, numbered 0, 1, ..., and their measurements."""
+        """Return state and measurements of the posed frames, numbered 0, 1, ..., for bundle adjustment."""
         rows = np.flatnonzero(self.posed)
         position = np.full(len(self.posed), -1)
         position[rows] = np.arange(len(rows))
@@ -95,20 +113,23 @@ class SequenceSolution:
         return SequenceState(self.poses[rows], self.camera, self.own_points), observations
 
 
-def refine(
+def adjust_sequence(
     sequence: UnsolvedSequence,
-    found: dict[int, Resection],
+    resections: dict[int, Resection],
     camera: Camera,
     putative: list[np.ndarray],
     own: np.ndarray,
     own_points: np.ndarray,
     options: RegisterOptions,
 ) -> SequenceSolution:
-    """All frames, their lens and their own points together; measurements that do not agree are left out."""
+    """Adjust all frames, their lens and their own points together from single resections.
+
+    Measurements that do not agree are dropped.
+    """
     n = len(sequence.pixels)
     posed = np.zeros(n, bool)
-    posed[list(found)] = True
-    poses = Poses.concatenate(one.pose for one in found.values()).at_rows(list(found), n)
+    posed[list(resections)] = True
+    poses = Poses.concatenate(one.pose for one in resections.values()).at_rows(list(resections), n)
     matches = np.concatenate(putative)
     frame = np.repeat(np.arange(n), [len(m) for m in putative])
     table = np.concatenate(
@@ -121,70 +142,70 @@ def refine(
     table = table[np.lexsort(table.T[::-1])]
     frame, feature, point_row, own_row = table.T
     start = SequenceSolution(posed, poses, camera, frame, feature, point_row, own_row, own_points)
-    return settle(sequence, start, options)
+    return adjust_inliers(sequence, start, options)
 
 
-def settle(
+def adjust_inliers(
     sequence: UnsolvedSequence, solution: SequenceSolution, options: RegisterOptions
 ) -> SequenceSolution:
-    """The least squares of a solution's frames, and which of its measurements agree with it.
+    """Alternate between bundle adjustment and the selection of inliers.
 
-    A frame of which hardly any agree has no pose any more.
+    A frame with hardly any inliers loses its pose.
     """
     rows = np.flatnonzero(solution.posed)
     if not len(rows):
         return solution
     state, everything = solution.least_squares(sequence)
-    lens = free_lens(solution.camera, len(rows), options)
-    agree = _agree(state, everything, options.max_error_px)
+    lens = estimated_intrinsics(solution.camera, len(rows), options)
+    agree = _inlier_mask(state, everything, options.max_error_px)
     for _ in range(3):
         state = adjust(state, everything.select(agree), scale_px=SCALE_PX, lens=lens)
-        before, agree = agree, _agree(state, everything, options.max_error_px)
+        before, agree = agree, _inlier_mask(state, everything, options.max_error_px)
         if np.array_equal(before, agree):
             break
-    settled = replace(
+    adjusted = replace(
         solution,
         poses=state.poses.at_rows(rows, len(solution.posed)),
         camera=state.camera,
         own_points=state.own_points,
-    ).with_measurements(agree)
-    left = np.bincount(settled.frame, minlength=len(solution.posed))
-    open_ = solution.posed & (left < _FOR_A_POSE)
-    return without(settled, open_) if open_.any() else settled
+    ).select_measurements(agree)
+    left = np.bincount(adjusted.frame, minlength=len(solution.posed))
+    undetermined = solution.posed & (left < _MIN_MEASUREMENTS)
+    return remove_frames(adjusted, undetermined) if undetermined.any() else adjusted
 
 
-def free_lens(camera: Camera, frames: int, options: RegisterOptions) -> tuple[str, ...]:
-    """The intrinsics that so many frames are to tell."""
-    tells = frames >= _FRAMES_FOR_LENS and not options.hold_lens
-    return lens_parameters(camera) if tells else ()
+def estimated_intrinsics(camera: Camera, frames: int, options: RegisterOptions) -> tuple[str, ...]:
+    """Return the names of the intrinsics to estimate from a number of frames."""
+    determined = frames >= _MIN_FRAMES_FOR_LENS and not options.hold_lens
+    return lens_parameters(camera) if determined else ()
 
 
-def without(solution: SequenceSolution, refused: np.ndarray) -> SequenceSolution:
-    """The solution without some frames (N,) bool, nor points that only one frame sees then."""
-    stay = ~refused[solution.frame]
-    seen = np.bincount(solution.own[stay & (solution.own >= 0)], minlength=len(solution.own_points))
-    stay &= (solution.own < 0) | (np.append(seen, 0)[solution.own] >= 2)
+def remove_frames(solution: SequenceSolution, refused: np.ndarray) -> SequenceSolution:
+    """Remove some frames (N,) bool, and own points that fewer than two frames observe then."""
+    keep = ~refused[solution.frame]
+    seen = np.bincount(solution.own[keep & (solution.own >= 0)], minlength=len(solution.own_points))
+    keep &= (solution.own < 0) | (np.append(seen, 0)[solution.own] >= 2)
     kept = np.flatnonzero(~refused)
     poses = solution.poses[kept].at_rows(kept, len(refused))
     left = replace(solution, posed=solution.posed & ~refused, poses=poses)
-    return left.with_measurements(stay)
+    return left.select_measurements(keep)
 
 
-def _agree(
+def _inlier_mask(
     state: SequenceState, observations: SequenceObservations, max_error_px: float
 ) -> np.ndarray:
     residuals = linearize(state, observations, ()).residuals_px
     agree = np.linalg.norm(residuals, axis=1) <= max_error_px
-    # A point of the sequence's own takes two frames.
-    mine = observations.own >= 0
-    seen = np.bincount(observations.own[mine & agree], minlength=len(state.own_points))
-    return agree & (~mine | (seen[np.maximum(observations.own, 0)] >= 2 if len(seen) else False))
+    # One of the sequence's own points needs two frames.
+    own = observations.own >= 0
+    seen = np.bincount(observations.own[own & agree], minlength=len(state.own_points))
+    return agree & (~own | (seen[np.maximum(observations.own, 0)] >= 2 if len(seen) else False))
 
 
 def reprojection_errors(
     pose: Poses, camera: Camera, points: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
-    """(M,) pixels; infinite behind the camera."""
+    """Return reprojection errors (M,) in pixels; infinite behind the camera."""
     in_camera = (points - pose.centers[0]) @ pose.rotations[0].T
     error_px = np.linalg.norm(camera.project(in_camera) - pixels, axis=1)
     return np.where(np.isfinite(error_px), error_px, np.inf)

@@ -1,4 +1,4 @@
-"""Poses and lens of a sequence in the frozen map: from putative matches to one least-squares solution."""
+"""Poses and intrinsics of a sequence in the frozen map: from putative matches to one bundle adjustment."""
 
 from __future__ import annotations
 
@@ -14,43 +14,56 @@ from spn_data.registration.adjustment import (
     SequenceState,
     adjust,
 )
-from spn_data.registration.carry import carry
+from spn_data.registration.propagation import propagate_poses
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import (
     SCALE_PX,
     SequenceSolution,
     UnsolvedSequence,
-    free_lens,
-    refine,
+    adjust_sequence,
+    estimated_intrinsics,
 )
 
-_LENS_FRAMES = 60  # that the lens is first found from
-_FOCAL_FRAMES = 12  # that a focal length is guessed from
+_LENS_FRAMES = 60  # used for the initial intrinsics
+_FOCAL_FRAMES = 12  # used for the initial focal length
 
 
 def solve(
     sequence: UnsolvedSequence, start: Camera, focal_is_known: bool, options: RegisterOptions
 ) -> SequenceSolution:
-    """Poses where there is any agreement with the map; whether they are good enough, `checks` says.
+    """Estimate the poses of all frames that agree with the map at all.
 
-    start : intrinsics to begin with, of which only the principal point is kept (all with `hold_lens`).
+    Whether they are good enough is decided in `checks`.
+
+    Parameters
+    ----------
+    sequence : UnsolvedSequence
+    start : Camera
+        Initial intrinsics. All but the principal point are re-estimated, none with `hold_lens`.
+    focal_is_known : bool
+        If false, the focal length is first estimated by resections.
+    options : RegisterOptions
+
+    Returns
+    -------
+    SequenceSolution
     """
     camera = start if options.hold_lens else radial(start)
     if not (focal_is_known or options.hold_lens):
         camera = _guess_focal(sequence, camera, options)
     if not options.hold_lens:
         camera = _find_lens(sequence, camera, options)
-    found = {}
+    resections = {}
     for row in range(len(sequence.pixels)):
         pose = _resect(sequence, row, camera, options, max_error_px=options.max_error_px)
         if pose is not None:
-            found[row] = pose
-    putative, own_points, own = carry(sequence, found, camera, options)
-    return refine(sequence, found, camera, putative, own, own_points, options)
+            resections[row] = pose
+    putative, own_points, own = propagate_poses(sequence, resections, camera, options)
+    return adjust_sequence(sequence, resections, camera, putative, own, own_points, options)
 
 
 def radial(camera: Camera) -> Camera:
-    """The camera with two terms of radial distortion, or as it is where it has them."""
+    """Return the camera with two radial distortion terms, unchanged if it has them already."""
     if camera.model in ("RADIAL", "OPENCV"):
         return camera
     k1 = float(camera.opencv_distortion[0])
@@ -65,12 +78,13 @@ def _with_focal(camera: Camera, focal_px: float) -> Camera:
 
 
 def _strongest(sequence: UnsolvedSequence, count: int) -> list[int]:
-    """Frames with most putative matches, spread by nothing else."""
+    """Return the frames with most putative matches."""
     sizes = np.array([len(m) for m in sequence.putative])
     return [int(row) for row in np.argsort(-sizes, kind="stable")[:count]]
 
 
 def _guess_focal(sequence: UnsolvedSequence, camera: Camera, options: RegisterOptions) -> Camera:
+    """Return the camera with the median focal length of resections, weighted by their inliers."""
     focals, weights = [], []
     for row in _strongest(sequence, _FOCAL_FRAMES):
         found = _resect(
@@ -87,7 +101,7 @@ def _guess_focal(sequence: UnsolvedSequence, camera: Camera, options: RegisterOp
 
 
 def _find_lens(sequence: UnsolvedSequence, camera: Camera, options: RegisterOptions) -> Camera:
-    """Focal length and distortion from the frames that agree best with the map, by growing strictness."""
+    """Estimate focal length and distortion from the frames that agree best, with decreasing thresholds."""
     rows = _strongest(sequence, _LENS_FRAMES)
     for max_error_px in (options.start_error_px, options.start_error_px / 2, options.max_error_px):
         poses: list[Poses] = []
@@ -110,7 +124,7 @@ def _find_lens(sequence: UnsolvedSequence, camera: Camera, options: RegisterOpti
             np.full(sum(map(len, frame)), -1),
         )
         state = SequenceState(Poses.concatenate(poses), camera, np.zeros((0, 3)))
-        lens = free_lens(camera, len(poses), options)
+        lens = estimated_intrinsics(camera, len(poses), options)
         camera = adjust(state, observations, scale_px=SCALE_PX, lens=lens).camera
     return camera
 
@@ -124,7 +138,7 @@ def _resect(
     max_error_px: float,
     find_focal: bool = False,
 ) -> Resection | None:
-    """By all that a frame itself matches of the map."""
+    """Resect a frame from its own matches with the map."""
     matches = sequence.putative[row]
     return resect(
         sequence.pixels[row][matches[:, 0]],

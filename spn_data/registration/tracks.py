@@ -1,4 +1,4 @@
-"""Features that the frames of a sequence share, and what they carry from one frame to the next."""
+"""Tracks of features through the frames of a sequence, and their triangulation."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from spn_data.geometry.pose import Poses
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """T tracks of features: each the same spot of the scene, at most once in a frame.
+    """T tracks: features of the same scene point, at most one per frame.
 
-    frame, feature, track : (M,) of every member, sorted by track.
+    Attributes
+    ----------
+    frame, feature, track : ndarray, shape (M,)
+        Of every member, sorted by track.
     """
 
     frame: np.ndarray
@@ -25,13 +28,15 @@ class Tracks:
 
     @property
     def count(self) -> int:
+        """Number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
 
 def find_tracks(pairs: dict[tuple[int, int], np.ndarray], features: list[int]) -> Tracks:
-    """From verified matches (K, 2) of pairs of frames; features : how many each frame has.
+    """Build tracks from the verified matches (K, 2) of pairs of frames.
 
-    A track that meets a frame twice is contradictory and left out.
+    `features` is the number of features of each frame. A track with two features in one frame is
+    contradictory and is dropped.
     """
     first = np.concatenate([[0], np.cumsum(features)])
     ends_a = [first[i] + matches[:, 0] for (i, _), matches in pairs.items()]
@@ -63,10 +68,11 @@ def triangulate(
     max_error_px: float,
     min_angle_deg: float,
 ) -> np.ndarray:
-    """Points (T, 3) of tracks seen at pixels (M, 2) by frames with poses; NaN where they are not determined.
+    """Triangulate tracks from pixels (M, 2) in frames with poses; return points (T, 3), NaN if undetermined.
 
-    Least squares of the distances from the rays; a point is kept where its rays meet at `min_angle_deg` and
-    it lies within `max_error_px` in every frame and before it.
+    Minimizes the squared distances from the rays. A point is kept if its triangulation angle is at least
+    `min_angle_deg`, it is in front of all cameras, and its reprojection error is at most `max_error_px` in
+    every frame.
     """
     rays = np.column_stack([camera.unproject(pixels), np.ones(len(pixels))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

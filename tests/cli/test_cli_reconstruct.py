@@ -17,7 +17,8 @@ from click.testing import CliRunner, Result
 from spn_cli.data import main
 
 import spn_data.reconstruction.reconstruct
-from spn_data.area.area import FRAMES, GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, GEO, MODEL
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import load_native, read_scene, write_native
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange

@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner
 from spn_cli.data import main
 
-from spn_data.area.area import MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import MODEL
 from spn_data.simulate import preset, simulate
 
 

@@ -16,7 +16,8 @@ import pytest
 from click.testing import CliRunner, Result
 from spn_cli.data import main
 
-from spn_data.area.area import FRAMES, MODEL, SPLIT, Area
+from spn_data.area.area import Area
+from spn_data.area.names import FRAMES, MODEL, SPLIT
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm

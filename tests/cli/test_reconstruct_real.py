@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner
 from spn_cli.data import main
 
-from spn_data.area.area import GEO, MODEL, Area
+from spn_data.area.area import Area
+from spn_data.area.names import GEO, MODEL
 
 
 def reconstruct(source: Path, area: Path) -> Area:

@@ -1,4 +1,4 @@
-"""Coverage: nearest frames and strata, views with points, where to fly again."""
+"""Coverage: nearest frames, strata, view shares, and reflight planning."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class TestNearest:
         assert found.stratum.tolist() == ["medium"]
         assert found.distance[0] == pytest.approx(np.sqrt(10))
         assert found.angle_deg[0] == pytest.approx(10)
-        assert found.height[0] == pytest.approx(-1)  # the query lies 1 m below the frame
+        assert found.height[0] == pytest.approx(-1)  # the query is 1 m below the frame
 
     def test_the_better_stratum_counts_before_the_smaller_sum(self):
         """1.9 m and 14 degrees is high; 0.1 m and 16 degrees is less in sum, but medium: the best answer."""
@@ -101,7 +101,7 @@ class TestNearest:
         assert found.answer_angle_deg[0] == pytest.approx(16)
 
     def test_q_and_minus_q_are_one_direction(self):
-        """The sign of a quaternion says nothing."""
+        """q and -q give the same result."""
         mapping = looking((0, 0, 0, 170))
         turned = Poses(mapping.centers, -mapping.quats_wxyz)
         assert nearest_frames(mapping, turned).angle_deg[0] < 1e-6
@@ -126,7 +126,7 @@ class TestNearest:
         assert coverage_strata(queries, mapping).tolist() == ["", "low"]
 
     def test_without_mapping_frames_there_is_no_answer(self):
-        """Nothing to compare with is an error, not infinity."""
+        """Without mapping frames an error is raised."""
         with pytest.raises(GeometryError, match="no mapping frame"):
             nearest_frames(looking((0, 0, 0)), looking((0, 0, 0))[:0])
 
@@ -306,7 +306,7 @@ class TestReflightPlan:
             np.testing.assert_array_equal(found.query_stop >= 0, needy)
 
     def test_the_margin_is_kept(self, flights):
-        """Each frame lies within 0.7 of the limits of the stop that serves it."""
+        """Each frame is within 0.7 of the limits of the stop that serves it."""
         mapping, evaluation = flights[1]
         queries = evaluation["low"]
         found = plan_reflight(queries, coverage_strata(queries, mapping))
@@ -324,7 +324,7 @@ class TestReflightPlan:
         np.testing.assert_allclose(found.angles_deg[:, 1:], [[-10, 0]] * 2, atol=1e-9)
 
     def test_stops_that_became_superfluous_are_left_out(self):
-        """The stop in the middle serves most and is taken first; the two beside it make it needless."""
+        """The stop in the middle serves most and is chosen first; the two next to it make it redundant."""
         queries = looking(*[(x, 0, 3) for x in (0.0, -1.3, 1.3, -0.9, 0.9, -2.5, 2.5)])
         found = plan_reflight(queries, np.full(7, "low"))
         assert sorted(found.poses.centers[:, 0].tolist()) == [-1.3, 1.3]
@@ -401,7 +401,7 @@ class TestTable:
         assert ",".join(rows[1][:8]) == expected
         assert rows[3] == ["e/3.jpg", "failed", *[""] * (len(COLUMNS) - 3), "ambiguous"]
 
-    def test_heights_that_were_never_mapped_are_told(self):
+    def test_heights_that_were_never_mapped_are_reported(self):
         """A frame 3 m above the highest mapping frame is named with that figure."""
         sentences = coverage_notes("e", self.table(options=CoverageOptions()))
         assert any("1 of 3 frames failed" in s for s in sentences)
@@ -418,8 +418,8 @@ class TestTable:
         assert found.summary()["heights"] is None
         assert not any("are above" in s for s in coverage_notes("e", found))
 
-    def test_a_plan_of_another_place_is_told(self):
-        """Frames kilometres away are rather a wrong sign than a plan."""
+    def test_a_plan_of_another_place_is_reported(self):
+        """Frames kilometres away suggest a wrong sign in the coordinates."""
         found = self.table(options=CoverageOptions())
         far = replace(found, distance=found.distance + 7000.0)
         assert any("7 km away" in s for s in coverage_notes("e", far))

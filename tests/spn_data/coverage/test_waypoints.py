@@ -15,7 +15,7 @@ from spn_data.storage.files import write_csv
 
 LAT, LON = 49.0153, 8.4250
 TAKEOFF = WaypointFrame(GeoOrigin(LAT, LON, 0.0, HeightReference.TAKEOFF), 0.0)
-# An area above the ellipsoid whose zero lies 2 m above the point of take-off.
+# An area above the ellipsoid whose zero is 2 m above the take-off point.
 ELLIPSOID = WaypointFrame(GeoOrigin(LAT, LON, 112.0, HeightReference.ELLIPSOID), -2.0)
 HEADER = "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg"
 GOOD = f"{LAT},{LON},10,90,-30"
@@ -47,7 +47,7 @@ class TestReading:
         assert read(tmp_path, text, ELLIPSOID).poses.centers[0, 2] == pytest.approx(up, abs=1e-6)
 
     def test_east_north_up_roll_and_camera(self, tmp_path):
-        """x, y, z, a roll and the key of a camera, in any order, beside columns that are not known."""
+        """x, y, z, a roll and the key of a camera, in any order, among unknown columns."""
         text = "note,Camera,z,y,x,roll,pitch,heading\nhello,wide,3,2,1,5,-10,350\n"
         found = read(tmp_path, text)
         assert found.poses.centers.tolist() == [[1.0, 2.0, 3.0]]

@@ -40,7 +40,7 @@ def test_a_real_list_is_written_again_to_the_last_digit(
     assert np.array_equal(again.poses.quats_wxyz, found.poses.quats_wxyz)
 
 
-def test_the_outlier_in_great_court_is_told_and_kept(shared_data: Path) -> None:
+def test_the_outlier_in_great_court_is_reported_and_kept(shared_data: Path) -> None:
     found = read_cambridge(shared_data / "cambridge/GreatCourt/dataset_train.txt")
     row = found.names.index("seq5/frame00297.png")
     assert found.poses.centers[row, 0] == 3117382476.41
@@ -50,7 +50,7 @@ def test_the_outlier_in_great_court_is_told_and_kept(shared_data: Path) -> None:
 
 
 def test_a_position_is_far_beyond_20_times_what_is_usual() -> None:
-    """Nine of ten lie within 1; 15 may be a distant view, 30 is none; nine are too few."""
+    """90 % are within 1; 15 may be a distant view, 30 is an outlier; nine centres are too few."""
     usual = np.zeros((20, 3))
     usual[:, 0] = np.linspace(-1, 1, 20)
     for distance, is_far in ((15.0, False), (30.0, True)):
@@ -102,7 +102,7 @@ def test_a_list_of_no_images_is_read_as_such(tmp_path: Path) -> None:
     assert find_anomalies(found) == []
 
 
-def test_a_turned_or_long_quaternion_is_told_and_the_second_round_trip_is_the_same(
+def test_a_flipped_or_long_quaternion_is_reported_and_round_trips(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "list.txt"
@@ -110,8 +110,8 @@ def test_a_turned_or_long_quaternion_is_told_and_the_second_round_trip_is_the_sa
     path.write_text(HEADER + "\n".join(rows))
     found = read_cambridge(path)
     assert found.poses.quats_wxyz.tolist() == [[0.5, -0.5, -0.5, -0.5], [1, 0, 0, 0], [1, 0, 0, 0]]
-    told = find_anomalies(found)
-    assert [sentence.split(":")[0] for sentence in told] == ["a/2.png", "a/1.png", "a/3.png"]
+    sentences = find_anomalies(found)
+    assert [sentence.split(":")[0] for sentence in sentences] == ["a/2.png", "a/1.png", "a/3.png"]
     write_cambridge(tmp_path / "first.txt", found.names, found.poses)
     second = read_cambridge(tmp_path / "first.txt")
     write_cambridge(tmp_path / "second.txt", second.names, second.poses)

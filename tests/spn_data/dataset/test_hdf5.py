@@ -1,4 +1,4 @@
-"""dataset.h5: what is written comes back, grows in no memory, and a damaged file is refused."""
+"""dataset.h5: round trips, constant memory, and rejection of damaged files."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_images_are_stored_one_a_chunk_as_they_are(written):
 
 
 def test_the_same_frames_make_the_same_bytes(tmp_path):
-    """No times of writing lie in the file."""
+    """The file contains no time stamps."""
     for name in ("a.h5", "b.h5"):
         with DatasetWriter(tmp_path / name, INFO, GROUPS) as writer:
             for k in range(70):
@@ -230,7 +230,7 @@ with DatasetWriter(Path(sys.argv[1]), INFO, {"train": Role.TRAIN}) as writer:
 
 
 def test_an_error_leaves_no_file(tmp_path):
-    """Neither the file nor an unfinished one is left, and what stood there before stays."""
+    """Neither the file nor an unfinished one is left, and the previous file is kept."""
     path = tmp_path / "dataset.h5"
     path.write_text("before")
     with pytest.raises(KeyError, match="no such"):
@@ -240,7 +240,7 @@ def test_an_error_leaves_no_file(tmp_path):
 
 
 def test_a_killed_run_leaves_what_the_next_replaces(tmp_path):
-    """Of a killed writer there is a .part at most; the next run makes the file all the same."""
+    """A killed writer leaves at most a .part file; the next run succeeds."""
     path = tmp_path / "dataset.h5"
     code = (
         "import os, sys; from pathlib import Path; from tests.spn_data.dataset.test_hdf5 import *\n"
@@ -256,8 +256,8 @@ def test_a_killed_run_leaves_what_the_next_replaces(tmp_path):
     assert os.listdir(tmp_path) == ["dataset.h5"]
 
 
-def test_a_full_disk_is_told(tmp_path):
-    """Where no more can be written, one line says so, and nothing is left."""
+def test_a_full_disk_is_reported(tmp_path):
+    """A full disk gives an error of one line and leaves no file."""
     code = (
         "import signal, resource, sys; from pathlib import Path\n"
         "from tests.spn_data.dataset.test_hdf5 import *\n"
@@ -284,7 +284,7 @@ def test_a_full_disk_is_told(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path):
+def test_a_missing_folder_is_reported(tmp_path):
     """No traceback of HDF5 reaches the user."""
     from spn_data.errors import StageError
 
@@ -293,14 +293,14 @@ def test_a_folder_that_is_not_there_is_told(tmp_path):
 
 
 def test_two_frames_of_one_name_are_refused(tmp_path):
-    """Also where they are in different groups: a frame must not train and validate."""
+    """Names are unique across groups: a frame must not be used for both training and validation."""
     one = frame("train", 0)
     with pytest.raises(InputError, match="two frames are named"):
         write(tmp_path / "d.h5", [("train", one), ("validation", one)])
 
 
 def test_images_of_two_sizes_are_refused(tmp_path):
-    """A group is one array: the user is told to render into one camera."""
+    """All images of a group are one array, so they must have the same size."""
     other = replace(
         frame("train", 1), image=np.zeros((20, 48, 3), np.uint8), point_pixels=np.zeros((1, 2))
     )
@@ -412,7 +412,7 @@ def damage(path: Path, change: str) -> None:
     ],
 )
 def test_a_damaged_or_hostile_file_is_refused(written, tmp_path, change, message):
-    """Nothing outside the file is read, nothing is allocated on its word, and the reason is told."""
+    """Nothing outside the file is read, claimed sizes are not trusted, and the reason is stated."""
     path = tmp_path / "damaged.h5"
     shutil.copy(written, path)
     damage(path, change)
@@ -461,7 +461,7 @@ for seed in range(first, last):
     if seed % 4 == 0:
         del data[rng.randrange(len(data)):]
     for _ in range(rng.choice((1, 5, 40)) if seed % 4 else 0):
-        # Most of a file are pixels: change what lies between them, in the first and last part.
+        # Most of a file are pixels: change the bytes between them, in the first and last part.
         where = rng.randrange(min(len(data), 60_000))
         data[where if rng.random() < 0.7 else -1 - where] = rng.randrange(256)
     target.write_bytes(data)

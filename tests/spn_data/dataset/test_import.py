@@ -1,4 +1,4 @@
-"""Folders of Cambridge Landmarks become data sets: every pose to the last digit, every oddity told."""
+"""Import of Cambridge Landmarks folders: exact poses, and all anomalies reported."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def test_lists_alone_say_what_they_lack(shared_data, tmp_path):
     assert done.counts == {"train": 231, "test": 103}
     assert not done.has_images
     assert done.with_focal == 0
-    told = "\n".join(done.notes)
+    notes = "\n".join(done.notes)
     for part in (
         "no known origin and no known up",
         "no image of the lists",
         "focal lengths are unknown",
     ):
-        assert part in told
+        assert part in notes
     with Dataset(tmp_path / "dataset.h5") as dataset:
         assert dataset.info.origin is None
         assert not dataset.info.up_is_known
@@ -91,13 +91,13 @@ def test_lists_alone_say_what_they_lack(shared_data, tmp_path):
         assert train.sequences[0] == "seq2"
 
 
-def test_the_outlier_of_great_court_is_left_out_and_told(shared_data, tmp_path):
-    """The frame three million kilometres away would wreck any training; it never goes in silence."""
+def test_the_outlier_of_great_court_is_left_out_and_reported(shared_data, tmp_path):
+    """The frame three million kilometres away would ruin any training; leaving it out is reported."""
     done = run(shared_data / "cambridge" / "GreatCourt", tmp_path / "dataset.h5")
     assert done.counts == {"train": 1531, "test": 760}
-    told = [note for note in done.notes if OUTLIER in note]
-    assert any("from the median position" in note for note in told)
-    assert f"{OUTLIER}: left out for that position; --keep-outliers keeps it" in told
+    notes = [note for note in done.notes if OUTLIER in note]
+    assert any("from the median position" in note for note in notes)
+    assert f"{OUTLIER}: left out for that position; --keep-outliers keeps it" in notes
     with Dataset(tmp_path / "dataset.h5") as dataset:
         assert OUTLIER not in dataset.groups["train"].names
         assert np.abs(dataset.groups["train"].poses.centers).max() < 1000
@@ -186,7 +186,7 @@ def test_points_for_training_are_seen_by_two_training_frames(scene, tmp_path):
 
 
 def test_points_of_another_world_are_left_out(scene, tmp_path):
-    """A model whose poses are not the lists' keeps its lenses, loses its points, and that is told."""
+    """A model whose poses are not the lists' keeps its cameras and loses its points, which is reported."""
     moved = Poses(poses().centers + np.array([0, 0, 5.0]), poses().quats_wxyz)
     for name, rows in (("train", TRAIN), ("test", TEST)):
         write_cambridge(
@@ -213,7 +213,7 @@ def test_without_a_model_images_are_reduced_and_the_focal_length_is_unknown(scen
         assert (two.groups["train"].image(1) == one.groups["train"].image(1)).all()
 
 
-def test_a_missing_image_is_left_out_and_told(scene, tmp_path):
+def test_a_missing_image_is_left_out_and_reported(scene, tmp_path):
     """The other images are taken; one that was converted to JPEG is found."""
     (scene / NAMES[1]).unlink()
     image = cv2.imread(str(scene / NAMES[2]))

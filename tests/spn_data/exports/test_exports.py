@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from spn_cli.data import main
 from spn_cli.export import FORMATS
 
-from spn_data.area.area import EVALUATION, Area, StageWork
+from spn_data.area.area import Area, StageWork
+from spn_data.area.names import CAMERA, EVALUATION, OBSERVATIONS, POSES, REGISTRATION
 from spn_data.colmap import pycolmap
 from spn_data.dataset.nvm import read_nvm
 from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
@@ -35,14 +36,9 @@ from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.inputs.area_labels import (
-    CAMERA,
-    POSES,
-    REGISTRATION,
-    SEEN,
     LabelledArea,
     read_labelled_area,
     read_world_from_model,
-    similarity_to_json,
 )
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import (
@@ -100,12 +96,12 @@ def add_evaluation(root: Path) -> None:
     write_labels(work.path / POSES, labels)
     kept = seen.frame_idx != 5
     write_label_observations(
-        work.path / SEEN,
+        work.path / OBSERVATIONS,
         LabelObservations(seen.frame_idx[kept], seen.point_ids[kept], seen.pixels[kept]),
     )
     lens = Camera("OPENCV", 320, 180, np.array([210.0, 211, 160.5, 89, -0.05, 0.01, 1e-3, -1e-3]))
     write_json(work.path / CAMERA, {"version": VERSION, **camera_to_json(lens)})
-    moved = similarity_to_json(read_world_from_model(area))
+    moved = read_world_from_model(area).to_json()
     write_json(work.path / REGISTRATION, {"version": VERSION, "world_from_model": moved})
     work.finish(counts={}, seconds={}, cpu_seconds={})
     for k in range(4):

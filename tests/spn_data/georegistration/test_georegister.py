@@ -120,7 +120,7 @@ def test_gnss_bias_limits_the_position_and_the_gimbal_the_tilt(standard, standar
 
 
 def test_noise_levels_are_found_from_the_residuals(standard_fit):
-    """The drifting bias of 0.7/1.1 m and the white noise of 0.08 m are told apart, not assumed."""
+    """The drifting bias of 0.7/1.1 m and the white noise of 0.08 m are estimated separately, not assumed."""
     bias, white = standard_fit.noise_m["horizontal"]
     assert 0.45 < bias < 1.1
     assert 0.05 < white < 0.13
@@ -162,7 +162,7 @@ def test_any_place_on_earth_gives_the_same_fit(standard, standard_fit, lat, lon)
 
 
 def test_a_take_off_twelve_metres_lower_becomes_the_flight_s_offset(standard):
-    """Heights of the second flight count from 12 m below: its offset is found, shape and zero stay."""
+    """The second flight's heights start 12 m lower: its offset is found, shape and zero are unchanged."""
     second = np.array(standard.sequence) == "flight2"
     heights = standard.telemetry.rel_alt_m + np.where(second, 12.0, 0.0)
     fit = replace(standard, telemetry=replace(standard.telemetry, rel_alt_m=heights)).fit()
@@ -173,7 +173,7 @@ def test_a_take_off_twelve_metres_lower_becomes_the_flight_s_offset(standard):
 
 
 def test_take_offs_that_differ_within_the_errors_pass_as_one(standard, standard_fit):
-    """Two flights from one place: offsets stay within the 0.3 m between take-offs that pass as one."""
+    """Two flights from one place: offsets stay within the 0.3 m allowed between equal take-offs."""
     assert abs(standard_fit.vertical_offsets_m["flight2"]) < 0.6
     assert not any("its heights are offset by" in note for note in standard_fit.notes)
 
@@ -199,7 +199,7 @@ def test_without_gimbal_angles_heights_and_level_cameras_give_the_vertical():
 
 
 def test_a_hovering_drone_is_refused(standard):
-    """Fixes within their own noise fix neither scale nor heading."""
+    """Fixes that spread no more than their noise determine neither scale nor heading."""
     hover = replace(standard.telemetry, lat_lon_deg=standard.telemetry.lat_lon_deg.copy())
     rng = np.random.default_rng(1)
     hover.lat_lon_deg[:] = hover.lat_lon_deg[0] + 3e-6 * rng.standard_normal((len(hover), 2))
@@ -227,7 +227,7 @@ def test_telemetry_of_another_flight_is_refused(standard):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_two_flights_with_each_other_s_telemetry_are_refused_for_it(seed):
-    """Of the same length, so that only the angles and positions tell."""
+    """Flights of the same length, so that only angles and positions reveal the swap."""
     drawn = draw(replace(STANDARD, seed=seed))
     first = np.array(drawn.sequence) == "flight1"
     n = min(first.sum(), (~first).sum())
@@ -267,7 +267,7 @@ def test_frames_without_telemetry_change_nothing(standard):
 
 
 def test_a_flight_with_rtk_leads_one_without():
-    """One flight of 3 cm and one of a metre: the place is that of the better one, and so is the statement."""
+    """One flight of 3 cm and one of a metre: the result and its uncertainty are those of the better one."""
     mixed = draw(STANDARD, sigma_m={"flight1": 0.03, "flight2": 1.0})
     exact = draw(
         replace(STANDARD, gnss=GnssOptions.rtk()), sigma_m={"flight1": 0.03, "flight2": 0.03}
@@ -283,7 +283,7 @@ def test_a_flight_with_rtk_leads_one_without():
 
 
 def test_rtk_that_the_source_does_not_state_shows_in_the_residuals():
-    """3 cm noise under an assumed sigma of 1 m: the fit is good to 5 cm all the same."""
+    """With 3 cm noise and an assumed sigma of 1 m, the fit is still accurate to 5 cm."""
     exact = draw(replace(STANDARD, gnss=GnssOptions.rtk()))
     fit = exact.fit()
     assert exact.errors(fit).position_m < 0.05
@@ -291,7 +291,7 @@ def test_rtk_that_the_source_does_not_state_shows_in_the_residuals():
 
 
 def test_fixes_left_out_in_blocks_fit_worse_than_those_used(standard_fit):
-    """Errors that last a minute flatter a fit on its own fixes; blocks of a minute show it."""
+    """Correlated errors make residuals look too small; held-out blocks of a minute reveal it."""
     held_out, summary = standard_fit.held_out_blocks, standard_fit.summary
     assert held_out.folds == 3
     assert held_out.horizontal_rmse_m > 1.1 * summary.horizontal_rmse_m
@@ -299,7 +299,7 @@ def test_fixes_left_out_in_blocks_fit_worse_than_those_used(standard_fit):
 
 
 def test_gimbal_angles_that_move_otherwise_than_the_camera_are_refused_by_name(standard):
-    """Without the angles of both flights the fit goes on."""
+    """The fit succeeds without the gimbal angles of both flights."""
     gimbal = standard.telemetry.gimbal_deg.copy()
     second = np.array(standard.sequence) == "flight2"
     gimbal[second, 1:] = np.random.default_rng(2).uniform(-60, 60, (second.sum(), 2))
@@ -375,7 +375,7 @@ def test_json_holds_the_whole_fit(standard_fit):
 
 @pytest.mark.slow
 def test_the_stated_uncertainty_contains_the_truth():
-    """In 15 draws, 70 to 100 % of the errors lie within twice what is stated (95 % are meant to)."""
+    """In 15 draws, 70 to 100 % of the errors are within two sigma (nominally 95 %)."""
     inside = []
     for seed in range(200, 215):
         one = draw(replace(STANDARD, seed=seed))

@@ -1,4 +1,4 @@
-"""Errors that are correlated in time, and what a georegistration says of its own errors."""
+"""Errors correlated in time, and the uncertainty of a georegistration."""
 
 from __future__ import annotations
 

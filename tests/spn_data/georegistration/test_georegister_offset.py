@@ -92,7 +92,7 @@ def _even_flight(speed_m_s: float) -> tuple[Poses, np.ndarray, Telemetry]:
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 2.0])
 def test_a_hover_and_an_even_line_leave_the_offset_undetermined(speed_m_s):
-    """Nothing that a shift in time would change: no number is made up, and the reason is told."""
+    """If a time shift changes nothing, no offset is returned and the reason is stated."""
     found = estimate_time_offset(*_even_flight(speed_m_s))
     assert found.offset_s is None
     assert found.applied_s == 0.0
@@ -107,7 +107,7 @@ def test_a_straight_line_without_gimbal_angles_leaves_it_undetermined():
 
 
 def test_too_little_telemetry_leaves_it_undetermined(path):
-    """No fix at all, and five frames, are told as what they are."""
+    """No fix at all, or only five frames, leave the offset undetermined with a reason."""
     model, time_s = _frames(path)
     track = _track(path, 1, 0.0)
     empty = replace(track, lat_lon_deg=np.full((len(track), 2), np.nan))
@@ -116,7 +116,7 @@ def test_too_little_telemetry_leaves_it_undetermined(path):
     assert found.reason.startswith("5 frames")
 
 
-def test_an_offset_is_told_with_its_sigma():
+def test_an_offset_is_described_with_its_sigma():
     """One sentence, in seconds, with the sign of what is added to the telemetry's times."""
     sentence = TimeOffset(0.4, 0.02).describe("flight1")
     assert sentence == "flight1: time offset of the telemetry +0.40 s (sigma 0.02 s)."

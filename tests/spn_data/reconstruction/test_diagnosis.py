@@ -9,7 +9,7 @@ import pytest
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.database import DatabaseImage, MapDatabase
-from spn_data.colmap.model import write_native
+from spn_data.colmap.model import read_observations, write_native
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
@@ -61,7 +61,10 @@ def registrations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FrameRe
             {"a": (CAMERA, True)},
             {},
         )
-        return {row.name: row for row in diagnose(database, frames, folder / "model")}
+        return {
+            row.name: row
+            for row in diagnose(database, frames, *read_observations(folder / "model"))
+        }
 
 
 def test_registered_frames_have_observations_and_an_error_but_no_reason(

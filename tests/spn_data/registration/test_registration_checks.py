@@ -10,10 +10,21 @@ import pytest
 
 from spn_data.geometry.pose import pose_errors
 from spn_data.labels.map_points import MapPoints
-from spn_data.registration.checks import Evidence, PoseVerdict, gather_evidence, judge, same_pose
-from spn_data.registration.register import accept
+from spn_data.registration.checks import (
+    Evidence,
+    PoseVerdict,
+    check_poses,
+    gather_evidence,
+    same_pose,
+)
+from spn_data.registration.register import accept_poses
 from spn_data.registration.register_options import CheckOptions, RegisterOptions
-from spn_data.registration.solution import SequenceSolution, UnsolvedSequence, settle, without
+from spn_data.registration.solution import (
+    SequenceSolution,
+    UnsolvedSequence,
+    adjust_inliers,
+    remove_frames,
+)
 from spn_data.registration.solve import solve
 from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
 
@@ -51,7 +62,7 @@ def with_frame(found: Evidence, row: int, **values: Any) -> Evidence:
 
 
 def judged(found: Evidence, posed: np.ndarray | None = None) -> PoseVerdict:
-    return judge(
+    return check_poses(
         np.ones(len(found.direct), bool) if posed is None else posed, found, CheckOptions()
     )
 
@@ -159,7 +170,7 @@ def test_a_flight_along_the_facade_stands() -> None:
     """Right matches: every frame is within centimetres, all neighbours agree, nothing rivals."""
     made = flight()
     _, solution, found = solved(made, made.matched())
-    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert check_poses(solution.posed, found, CheckOptions()).accepted.all()
     assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
     assert found.agreement.min() > 0.95
     assert found.rival.max() == 0
@@ -176,7 +187,7 @@ def test_a_frame_at_the_wrong_window_is_ambiguous(columns: int) -> None:
     assert away == pytest.approx([columns * PITCH_M, 0, 0], abs=0.15)
     assert found.direct[3] > 0.9 * len(sequence.putative[3])
     assert found.rival[3] == 0
-    verdict = judge(solution.posed, found, CheckOptions())
+    verdict = check_poses(solution.posed, found, CheckOptions())
     assert verdict.accepted.tolist() == [k != 3 for k in range(8)]
     assert verdict.reason[3] == "ambiguous: 6 of 6 neighbours contradict its pose"
 
@@ -189,14 +200,14 @@ def test_a_frame_that_fits_two_windows_is_settled_by_its_neighbours_or_not_at_al
     alone = Flight(made.poses[3:4], made.points, made.pixels[3:4], made.shows[3:4])
     _, solution, found = solved(alone, [both[np.argsort(both[:, 0])]])
     assert found.rival[0] > 0.8 * found.direct[0]
-    verdict = judge(solution.posed, found, CheckOptions())
+    verdict = check_poses(solution.posed, found, CheckOptions())
     assert verdict.reason[0].startswith("ambiguous: ")
     assert verdict.reason[0].endswith("with another, and no neighbour confirms its pose")
     putative = made.matched()
     putative[3] = np.concatenate([right[: len(right) * 3 // 5], wrong[len(right) * 3 // 5 :]])
     _, solution, found = solved(made, putative)
     assert found.rival[3] > 0.5 * found.direct[3]
-    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert check_poses(solution.posed, found, CheckOptions()).accepted.all()
     assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
 
 
@@ -208,7 +219,7 @@ def test_a_frame_without_matches_is_carried_by_its_neighbours() -> None:
     _, solution, found = solved(made, putative)
     assert found.direct[3] == 0
     assert found.inliers[3] > A_COLUMN
-    assert judge(solution.posed, found, CheckOptions()).accepted.all()
+    assert check_poses(solution.posed, found, CheckOptions()).accepted.all()
     assert pose_errors(solution.poses, made.poses)[0].max() < 0.05
 
 
@@ -221,7 +232,7 @@ def test_random_matches_give_no_label() -> None:
         for p in made.pixels
     ]
     _, solution, found = solved(made, putative)
-    verdict = judge(solution.posed, found, CheckOptions())
+    verdict = check_poses(solution.posed, found, CheckOptions())
     assert not verdict.accepted.any()
     assert all(verdict.reason)
 
@@ -275,7 +286,7 @@ def test_points_that_only_one_frame_sees_leave_with_the_others() -> None:
     made = flight()
     putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
     _, solution, _ = solved(made, putative)
-    left = without(solution, np.arange(8) > 2)
+    left = remove_frames(solution, np.arange(8) > 2)
     assert left.posed.tolist() == [k <= 2 for k in range(8)]
     assert left.frame.max() == 2
     counts = np.bincount(left.own[left.own >= 0], minlength=len(left.own_points))
@@ -294,7 +305,7 @@ def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatc
             tuple(reason if k in failing else "" for k in range(8)),
         )
 
-    monkeypatch.setattr("spn_data.registration.register.judge", scripted)
+    monkeypatch.setattr("spn_data.registration.register.check_poses", scripted)
     made = flight()
     found = accepted(made, made.matched())
     assert [found.reason[k] for k in (3, 5, 6)] == ["first", "second", ""]
@@ -319,7 +330,7 @@ def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyp
         np.zeros((len(made.points), 3), np.uint8),
         np.full(len(made.points), 5),
     )
-    return accept(sequence, solution, made.pairs, _Perfect(), points, OPTIONS)  # type: ignore[arg-type]
+    return accept_poses(sequence, solution, made.pairs, _Perfect(), points, OPTIONS)  # type: ignore[arg-type]
 
 
 def test_what_failed_pulls_at_nothing_that_stands() -> None:
@@ -354,7 +365,7 @@ def test_a_frame_of_which_hardly_any_measurement_agrees_loses_its_pose() -> None
     centers = solution.poses.centers.copy()
     centers[3] += [0, 40, 0]
     moved = replace(solution, poses=replace(solution.poses, centers=centers))
-    again = settle(sequence, moved, OPTIONS)
+    again = adjust_inliers(sequence, moved, OPTIONS)
     assert again.posed.tolist() == [k != 3 for k in range(8)]
     assert np.isnan(again.poses.centers[3]).all()
     assert not (again.frame == 3).any()

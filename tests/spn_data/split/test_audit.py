@@ -73,7 +73,7 @@ def regrouped(split: Split, name: str, group: str) -> Split:
 
 
 def assert_fails(finding: AuditFinding, *words: str) -> None:
-    """It failed, and one line of its evidence holds all the words."""
+    """Assert that a check failed with a line of evidence that contains all the words."""
     assert finding.verdict is AuditVerdict.FAIL
     assert any(all(word in line for word in words) for line in finding.evidence), finding.evidence
 
@@ -96,7 +96,7 @@ def test_an_evaluation_frame_among_the_maps_images_is_found(mapping, evaluation)
 
 
 def test_an_evaluation_video_that_was_mapped_is_found_under_any_name(mapping, evaluation):
-    """The content tells, not the file's name."""
+    """Files are compared by content, not by name."""
     sources = {"medium": {"medium/renamed.mp4": "aaaa"}}
     found = audit.check_not_in_map(mapping.names.tolist(), SOURCES, evaluation, sources)
     assert_fails(found, "renamed.mp4", "one.mp4")
@@ -124,7 +124,7 @@ def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
 
 
 def test_a_map_hash_that_changed_is_found():
-    """During a registration, or since."""
+    """The map may change during a registration, or afterwards."""
     same = audit.check_map_unchanged("m1", {"medium": MapHashes("m1", "m1")})
     assert same.verdict is AuditVerdict.PASS
     assert_fails(audit.check_map_unchanged("m2", {"medium": MapHashes("m1", "m2")}), "m1", "m2")
@@ -138,7 +138,7 @@ def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
 
 @pytest.mark.parametrize("tracked", [False, True])
 def test_a_training_frame_within_a_block_is_found(mapping, split, tracked):
-    """Chosen or tracked: it lies in a held-out block, and nearer than the gap to its frames."""
+    """A chosen or tracked frame in a held-out block is reported by both checks."""
     held = mapping.names[
         (split.groups_of(mapping.names) == VALIDATION) & (mapping.tracked == tracked)
     ]

@@ -180,7 +180,7 @@ def test_an_evaluation_sequence_of_which_every_frame_failed_is_no_test(area, eva
 
 
 def test_a_frame_without_a_pose_is_in_no_group(area, evaluation):
-    """Failed frames are left out with their reason, wherever they lie."""
+    """Failed frames are left out with their reason, wherever they are."""
     mapping = failed(area[0], slice(0, 320, 7), "too few matches")
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     lost = mapping.names[~mapping.registered]
@@ -376,7 +376,7 @@ def test_a_split_comes_back_from_its_file(area, evaluation, policy, tmp_path: Pa
 
 
 def test_the_file_says_what_validation_cannot_be_free_of(area, tmp_path: Path):
-    """Joint bundle adjustment stands there in words, and that a test of a mapping flight is optimistic."""
+    """split.json states the joint bundle adjustment and that a test on a mapping flight is optimistic."""
     write_split(tmp_path / "split.json", make_split(area[0], nothing(), {}, SplitOptions()))
     table = read_json(tmp_path / "split.json")
     said = " ".join(table["not_free_of"])

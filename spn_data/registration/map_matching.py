@@ -1,4 +1,4 @@
-"""Which map points a frame shows: its features against those of similar map frames."""
+"""Matching of frames with the map: their features against those of similar map frames."""
 
 from __future__ import annotations
 
@@ -15,36 +15,39 @@ from spn_data.storage.files import atomic_writer
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
 
-_FRAMES_A_BATCH = 4  # neighbours in time look like the same map frames
+_FRAMES_PER_BATCH = 4  # adjacent frames resemble the same map frames
 
 
-def look_up(
+def match_frame_to_map(
     name: str,
     descriptors: np.ndarray,
     map_frames: list[MapFrame],
     options: MatchOptions,
 ) -> tuple[str, np.ndarray]:
-    """Putative matches (M, 2) int64 of feature and map point row, each once. Pure."""
-    found = []
+    """Match a frame's descriptors with those of similar map frames.
+
+    Returns its name and the unique putative matches (M, 2) int64: feature and map point row. A pure function.
+    """
+    parts = []
     for frame in map_frames:
         matches = match_descriptors(descriptors, frame.descriptors, options).astype(np.int64)
-        found.append(np.column_stack([matches[:, 0], frame.point_rows[matches[:, 1]]]))
-    together = np.concatenate(found) if found else np.zeros((0, 2), np.int64)
+        parts.append(np.column_stack([matches[:, 0], frame.point_rows[matches[:, 1]]]))
+    together = np.concatenate(parts) if parts else np.zeros((0, 2), np.int64)
     return name, np.unique(together, axis=0)
 
 
-def _look_up_batch(
+def _match_batch(
     batch: list[tuple[str, np.ndarray, list[str]]],
     map_frames: dict[str, MapFrame],
     options: MatchOptions,
 ) -> list[tuple[str, np.ndarray]]:
     return [
-        look_up(name, descriptors, [map_frames[n] for n in similar], options)
+        match_frame_to_map(name, descriptors, [map_frames[n] for n in similar], options)
         for name, descriptors, similar in batch
     ]
 
 
-def look_up_missing(
+def match_missing_to_map(
     names: tuple[str, ...],
     database: MapDatabase,
     frozen: FrozenMap,
@@ -53,16 +56,20 @@ def look_up_missing(
     dispatch: Dispatch,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Putative matches of every frame by name; those found before lie in `folder`, a file each."""
+    """Return the putative matches of every frame by name.
+
+    Matches from an earlier run are read from `folder`, which holds one file per frame; missing ones are
+    computed.
+    """
     folder.mkdir(exist_ok=True)
     files = {name: folder / f"{name.replace('/', '-')}.npy" for name in names}
     missing = [name for name in names if not files[name].exists()]
     done = len(names) - len(missing)
 
     def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
-        for start in range(0, len(missing), _FRAMES_A_BATCH):
+        for start in range(0, len(missing), _FRAMES_PER_BATCH):
             batch = []
-            for name in missing[start : start + _FRAMES_A_BATCH]:
+            for name in missing[start : start + _FRAMES_PER_BATCH]:
                 descriptors = database.read_features(name).descriptors
                 batch.append((name, descriptors, frozen.similar(descriptors, options.map_frames)))
             needed = sorted({n for _, _, similar in batch for n in similar})
@@ -79,5 +86,5 @@ def look_up_missing(
         done += len(result)
         progress("map matches", done, len(names))
 
-    dispatch(_look_up_batch, batches(), store)
+    dispatch(_match_batch, batches(), store)
     return {name: np.load(files[name], allow_pickle=False) for name in names}
