@@ -1,6 +1,6 @@
-"""Map points followed from labelled frames into the frames between them, and the poses that they give.
+"""Map points tracked from labelled frames into the frames between them, and the poses that follow.
 
-A patch is always taken from a labelled frame, never from the frame before: nothing drifts.
+Patches are always taken from a labelled frame, never from the previous frame, so tracking does not drift.
 """
 
 from __future__ import annotations
@@ -15,18 +15,25 @@ from spn_data.geometry.grouping import rank_within_group
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
 from spn_data.labels.map_points import covered_share
-from spn_data.tracking.tracked_frames import Anchor, Segment, TrackedFrame, TrackingOptions, failed
+from spn_data.tracking.tracked_frames import (
+    Anchor,
+    Segment,
+    TrackedFrame,
+    TrackingOptions,
+    failed_frame,
+)
 
 
 def track_segment(segment: Segment, options: TrackingOptions) -> list[TrackedFrame]:
-    """The frames of a segment in its order; a pure function.
+    """Track the frames of a segment and return them in its order. A pure function.
 
-    Those nearest to a labelled frame come first, so that each begins where its neighbours point to.
+    Frames closest to a labelled frame are processed first, so that each frame starts from the poses of its
+    neighbours.
     """
     height, width = segment.grays[0].shape
     full, camera = segment.camera, segment.camera.scaled(width, height)
-    shrunk = np.array([width / full.width, height / full.height])
-    anchors = [_Prepared.of(a, camera, shrunk, options) for a in segment.anchors]
+    scale = np.array([width / full.width, height / full.height])
+    anchors = [_PreparedAnchor.prepare(a, camera, scale, options) for a in segment.anchors]
     known = {a.time_s: a.poses for a in segment.anchors}
     away = np.abs(segment.time_s[:, None] - np.array(list(known))).min(axis=1)
     results: dict[int, TrackedFrame] = {}
@@ -39,29 +46,38 @@ def track_segment(segment: Segment, options: TrackingOptions) -> list[TrackedFra
         results[k] = replace(
             frame,
             row=int(segment.rows[k]),
-            pixels=frame.pixels / shrunk,
-            error_px=frame.error_px / float(shrunk.mean()),
+            pixels=frame.pixels / scale,
+            error_px=frame.error_px / float(scale.mean()),
         )
     return [results[k] for k in range(len(segment.rows))]
 
 
 def _guesses(known: dict[float, Poses], time_s: float) -> list[Poses]:
-    """Where to begin, the likeliest first: velocity stays, between two neighbours, where a neighbour is."""
+    """Return initial poses, the most likely first.
+
+    These are constant velocity, interpolation between two neighbours, and the poses of the neighbours.
+    """
     before = sorted((t for t in known if t < time_s), reverse=True)
     after = sorted(t for t in known if t > time_s)
     sides = sorted((s for s in (before, after) if s), key=lambda s: abs(s[0] - time_s))
     guesses = []
     near = sides[0]
-    # Two frames far apart tell little of the velocity now.
+    # Two distant frames say little about the current velocity.
     if len(near) > 1 and abs(near[0] - near[1]) <= 2 * abs(time_s - near[0]):
-        guesses.append(between((near[1], known[near[1]]), (near[0], known[near[0]]), time_s))
+        guesses.append(
+            interpolate_pose((near[1], known[near[1]]), (near[0], known[near[0]]), time_s)
+        )
     if before and after:
-        guesses.append(between((before[0], known[before[0]]), (after[0], known[after[0]]), time_s))
+        guesses.append(
+            interpolate_pose((before[0], known[before[0]]), (after[0], known[after[0]]), time_s)
+        )
     return [*guesses, *(known[side[0]] for side in sides)]
 
 
-def between(first: tuple[float, Poses], second: tuple[float, Poses], time_s: float) -> Poses:
-    """Pose (1,) at a time on the constant motion through two others, each with its time."""
+def interpolate_pose(
+    first: tuple[float, Poses], second: tuple[float, Poses], time_s: float
+) -> Poses:
+    """Return the pose (1,) at a time on the constant motion through two others, each with its time."""
     (time_a, a), (time_b, b) = first, second
     share = (time_s - time_a) / (time_b - time_a)
     turn = rotation_vectors(b.rotations @ a.rotations.transpose(0, 2, 1))
@@ -72,41 +88,44 @@ def between(first: tuple[float, Poses], second: tuple[float, Poses], time_s: flo
 
 
 @dataclass(frozen=True, eq=False)
-class _Prepared:
-    """An anchor, reduced to the points that are followed; pixels at the size of its image."""
+class _PreparedAnchor:
+    """Anchor reduced to the points that are tracked; pixels refer to its image."""
 
     time_s: float
     gray: np.ndarray
-    small: np.ndarray  # for the first search
-    start: np.ndarray  # rows of the points of the first search
+    small: np.ndarray  # reduced image for the first search
+    start: np.ndarray  # rows of the points for the first search
     point_ids: np.ndarray
     xyz: np.ndarray
     pixels: np.ndarray
 
     @classmethod
-    def of(
-        cls, anchor: Anchor, camera: Camera, shrunk: np.ndarray, options: TrackingOptions
-    ) -> _Prepared:
-        pixels = anchor.pixels * shrunk
-        rows = spread(pixels, camera.width, camera.height, options.max_points)
+    def prepare(
+        cls, anchor: Anchor, camera: Camera, scale: np.ndarray, options: TrackingOptions
+    ) -> _PreparedAnchor:
+        pixels = anchor.pixels * scale
+        rows = spread_points(pixels, camera.width, camera.height, options.max_points)
         pixels = pixels[rows]
-        start = spread(pixels, camera.width, camera.height, options.start_points)
-        small = _small(anchor.gray, options)
+        start = spread_points(pixels, camera.width, camera.height, options.start_points)
+        small = _downsample(anchor.gray, options)
         ids, xyz = anchor.point_ids[rows], anchor.xyz[rows]
         return cls(anchor.time_s, anchor.gray, small, start, ids, xyz, pixels)
 
 
-def _small(gray: np.ndarray, options: TrackingOptions) -> np.ndarray:
-    """The image of the first search. (cv2.pyrDown would shift it by half a pixel.)"""
+def _downsample(gray: np.ndarray, options: TrackingOptions) -> np.ndarray:
+    """Return the image for the first search (cv2.pyrDown would shift it by half a pixel)."""
     size = (gray.shape[1] >> options.start_halvings, gray.shape[0] >> options.start_halvings)
     return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
 
 
-def spread(pixels: np.ndarray, width: int, height: int, count: int) -> np.ndarray:
-    """Rows, at most `count`, of pixels (K, 2) spread over the image: of each cell, the first ones."""
+def spread_points(pixels: np.ndarray, width: int, height: int, count: int) -> np.ndarray:
+    """Return the rows of at most `count` pixels (K, 2) spread over the image.
+
+    From each cell of a grid, the first pixels are taken.
+    """
     if len(pixels) <= count:
         return np.arange(len(pixels))
-    side = 2 * np.sqrt(width * height / count)  # about four points a cell
+    side = 2 * np.sqrt(width * height / count)  # about four points per cell
     columns = int(np.ceil(width / side))
     x, y = (pixels // side).astype(np.int64).T
     cells = y * columns + x
@@ -114,7 +133,7 @@ def spread(pixels: np.ndarray, width: int, height: int, count: int) -> np.ndarra
     return np.sort(np.argsort(rank_in_cell, kind="stable")[:count])
 
 
-def follow(
+def track_points(
     from_gray: np.ndarray,
     to_gray: np.ndarray,
     pixels: np.ndarray,
@@ -122,17 +141,18 @@ def follow(
     levels: int,
     options: TrackingOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (K, 2) of patches in another image, begun at the expected ones, and which (K,) were found.
+    """Track patches into another image; return their pixels (K, 2) and which (K,) were found.
 
-    Lucas-Kanade there and back (Bouguet 2001): found are those that come back to where they began.
+    The search starts at the expected pixels. Lucas-Kanade forwards and backwards (Bouguet 2001): points that
+    return to their starting point are found.
     """
     height, width = to_gray.shape
-    found = np.all((expected > 0) & (expected < [width, height]), axis=1)  # not where NaN
+    found = np.all((expected > 0) & (expected < [width, height]), axis=1)  # false for NaN
     result = np.full((len(pixels), 2), np.nan)
     rows = np.flatnonzero(found)
     if len(rows) == 0:
         return result, found
-    half = np.float32(0.5)  # OpenCV's pixel centres lie on integers
+    half = np.float32(0.5)  # OpenCV's pixel centres are at integers
     start = pixels[rows].astype(np.float32) - half
     there = expected[rows].astype(np.float32) - half
     search = (
@@ -155,51 +175,54 @@ def follow(
 def _track_frame(
     gray: np.ndarray,
     camera: Camera,
-    anchors: list[_Prepared],
+    anchors: list[_PreparedAnchor],
     guesses: list[Poses],
     options: TrackingOptions,
 ) -> TrackedFrame:
-    """From each labelled frame a rough pose by few points, then all its points; then the checks.
+    """Estimate the pose of a frame and check it.
 
-    Each begins for itself, so that one in a wrong place is contradicted by the other, not led astray.
+    Each labelled frame gives a rough pose from a few points, with which all its points are tracked. Each
+    starts independently, so that one with a wrong pose contradicts the other instead of misleading it.
     """
-    small = _small(gray, options)
+    small = _downsample(gray, options)
     tracks = []
     for anchor in anchors:
         rough = _rough_pose(small, camera, anchor, guesses, options)
         if rough is not None:
-            tracks.append(_tracks(anchor, gray, rough, camera, options))
+            tracks.append(_track_anchor(anchor, gray, rough, camera, options))
             guesses = [rough, *guesses]
     if not tracks:
-        return failed("the points of the labelled frames beside it were not found in it")
-    together = _once(tracks)
-    if len(together.point_ids) < options.min_inliers:
-        return failed(
-            f"only {len(together.point_ids)} points of the labelled frames beside it were found in it"
+        return failed_frame("the points of the adjacent labelled frames were not found in it")
+    merged = _merge(tracks)
+    if len(merged.point_ids) < options.min_inliers:
+        return failed_frame(
+            f"only {len(merged.point_ids)} points of the adjacent labelled frames were found in it"
         )
-    fit = _fit(together, guesses[0], camera)
+    fit = _fit(merged, guesses[0], camera)
     if fit is None:
-        return failed("no pose agrees with its points")
+        return failed_frame("no pose agrees with its points")
     enough = [t for t in tracks if len(t.point_ids) >= options.min_inliers]
     answers = [_fit(t, fit.poses, camera) for t in enough]
-    return _checked(together, fit, [a for a in answers if a is not None], camera, options)
+    return _check_frame(merged, fit, [a for a in answers if a is not None], camera, options)
 
 
 def _rough_pose(
     small: np.ndarray,
     camera: Camera,
-    anchor: _Prepared,
+    anchor: _PreparedAnchor,
     guesses: list[Poses],
     options: TrackingOptions,
 ) -> Poses | None:
-    """From the first guess with which the anchor's points agree with each other."""
+    """Return the pose from the first initial pose with which the anchor's points are consistent."""
     height, width = small.shape
-    shrunk = np.array([width / camera.width, height / camera.height])
+    scale = np.array([width / camera.width, height / camera.height])
     lens = camera.scaled(width, height)
-    xyz, pixels = anchor.xyz[anchor.start], anchor.pixels[anchor.start] * shrunk
+    xyz, pixels = anchor.xyz[anchor.start], anchor.pixels[anchor.start] * scale
     for guess in guesses:
         expected = _project(lens, guess, xyz)
-        there, found = follow(anchor.small, small, pixels, expected, options.start_levels, options)
+        there, found = track_points(
+            anchor.small, small, pixels, expected, options.start_levels, options
+        )
         enough = max(12.0, options.min_inlier_ratio * np.count_nonzero(found))
         if np.count_nonzero(found) < enough:
             continue
@@ -214,7 +237,7 @@ def _project(camera: Camera, poses: Poses, xyz: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tracks:
+class _TrackedPoints:
     """Map points found in a frame: point_ids (K,), xyz (K, 3), pixels (K, 2)."""
 
     point_ids: np.ndarray
@@ -222,35 +245,43 @@ class _Tracks:
     pixels: np.ndarray
 
 
-def _tracks(
-    anchor: _Prepared, gray: np.ndarray, rough: Poses, camera: Camera, options: TrackingOptions
-) -> _Tracks:
+def _track_anchor(
+    anchor: _PreparedAnchor,
+    gray: np.ndarray,
+    rough: Poses,
+    camera: Camera,
+    options: TrackingOptions,
+) -> _TrackedPoints:
     expected = _project(camera, rough, anchor.xyz)
-    there, found = follow(anchor.gray, gray, anchor.pixels, expected, options.levels, options)
-    return _Tracks(anchor.point_ids[found], anchor.xyz[found], there[found])
+    there, found = track_points(anchor.gray, gray, anchor.pixels, expected, options.levels, options)
+    return _TrackedPoints(anchor.point_ids[found], anchor.xyz[found], there[found])
 
 
-def _once(tracks: list[_Tracks]) -> _Tracks:
-    """Each point once: the mean pixel where two anchors led to it."""
+def _merge(tracks: list[_TrackedPoints]) -> _TrackedPoints:
+    """Merge points of several anchors; a point tracked from two anchors gets the mean pixel."""
     ids = np.concatenate([t.point_ids for t in tracks])
     unique, first, back = np.unique(ids, return_index=True, return_inverse=True)
     pixels = np.zeros((len(unique), 2))
     np.add.at(pixels, back, np.concatenate([t.pixels for t in tracks]))
     pixels /= np.bincount(back, minlength=len(unique))[:, None]
-    return _Tracks(unique, np.concatenate([t.xyz for t in tracks])[first], pixels)
+    return _TrackedPoints(unique, np.concatenate([t.xyz for t in tracks])[first], pixels)
 
 
-def _fit(tracks: _Tracks, start: Poses, camera: Camera) -> PoseFit | None:
+def _fit(tracks: _TrackedPoints, start: Poses, camera: Camera) -> PoseFit | None:
     return fit_pose(camera, start, tracks.xyz, tracks.pixels, first_px=2.0, last_px=1.0)
 
 
-def _checked(
-    tracks: _Tracks, fit: PoseFit, answers: list[PoseFit], camera: Camera, options: TrackingOptions
+def _check_frame(
+    tracks: _TrackedPoints,
+    fit: PoseFit,
+    answers: list[PoseFit],
+    camera: Camera,
+    options: TrackingOptions,
 ) -> TrackedFrame:
-    """The frame with its figures; without its label where they speak against it."""
+    """Return the frame with its figures, or a failed one if they speak against its pose."""
     good = fit.inliers(options.max_error_px)
     if np.count_nonzero(good) < options.min_inliers:
-        return failed(f"only {np.count_nonzero(good)} map points agree with its pose")
+        return failed_frame(f"only {np.count_nonzero(good)} map points agree with its pose")
     distance = float(np.median(np.linalg.norm(tracks.xyz[good] - fit.poses.centers, axis=1)))
     error_px = float(np.sqrt((fit.residuals_px[good] ** 2).sum(axis=1).mean()))
     by_position, by_turn = (
@@ -276,12 +307,12 @@ def _checked(
         split=split,
         split_deg=split_deg,
     )
-    objection = _objection(frame, options)
-    return failed(objection) if objection else frame
+    reason = _rejection_reason(frame, options)
+    return failed_frame(reason) if reason else frame
 
 
-def _objection(frame: TrackedFrame, options: TrackingOptions) -> str:
-    """Why a pose is not to be trusted; empty where it is."""
+def _rejection_reason(frame: TrackedFrame, options: TrackingOptions) -> str:
+    """Return why a pose is rejected, or an empty string."""
     if frame.inlier_ratio < options.min_inlier_ratio:
         return f"only {frame.inlier_ratio:.0%} of its points agree with its pose"
     if frame.coverage < options.min_coverage:
@@ -289,5 +320,5 @@ def _objection(frame: TrackedFrame, options: TrackingOptions) -> str:
     if frame.sigma > options.max_sigma or frame.sigma_deg > options.max_sigma_deg:
         return "its map points don't determine its pose"
     if frame.split > options.max_split or frame.split_deg > options.max_split_deg:
-        return "ambiguous: the labelled frames beside it disagree about its pose"
+        return "ambiguous: the adjacent labelled frames disagree about its pose"
     return ""

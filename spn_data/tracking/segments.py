@@ -1,4 +1,4 @@
-"""A video read once, cut into segments of frames with the labelled frames beside them."""
+"""Segments of a video, read once: frames with the labelled frames before and after them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,16 @@ from spn_data.tracking.tracked_frames import Anchor, Segment, TrackingOptions
 
 @dataclass(frozen=True, eq=False)
 class SequenceToLabel:
-    """One sequence: all its frames, those that are labelled with the map points they see, and the map.
+    """One sequence: all its frames, the labelled ones with the map points that they observe, and the map.
 
-    cameras : by key, in pixels of the full-size image.
+    Attributes
+    ----------
+    frames : Frames
+    labelled : Labels
+    seen : LabelObservations
+    cameras : dict of str to Camera
+        By key, in pixels of the full-size image.
+    points : MapPoints
     """
 
     frames: Frames
@@ -31,26 +38,26 @@ class SequenceToLabel:
 
     @property
     def wanted(self) -> np.ndarray:
-        """Rows of the frames to label. Photos have nothing between them."""
+        """Rows of the frames to label. Photos have no frames between them."""
         named = np.isin(self.frames.names, self.labelled.names)
         return np.flatnonzero(~named & (self.frames.video_frame >= 0))
 
     def labelled_rows(self) -> dict[int, int]:
-        """Row among the frames -> row among the labels, of those with a pose."""
+        """Map the rows of labelled frames with a pose to their rows in the labels."""
         row_of = {name: row for row, name in enumerate(self.frames.names.tolist())}
         registered = np.flatnonzero(self.labelled.registered).tolist()
         return {row_of[str(self.labelled.names[k])]: k for k in registered}
 
 
 @dataclass
-class _Open:
-    """Frames that wait for their next labelled frame, all of one camera."""
+class _PendingFrames:
+    """Frames of one camera that wait for the next labelled frame."""
 
     camera: Camera | None = None
     anchors: list[Anchor] = field(default_factory=list)  # the last two
     head: list[tuple[int, np.ndarray]] = field(default_factory=list)  # before the first anchor
     waiting: list[tuple[int, np.ndarray]] = field(default_factory=list)
-    handed_on: bool = False  # the first of those that follow the last anchor
+    start_flushed: bool = False  # the first frames after the last anchor were passed on
 
 
 def read_segments(
@@ -59,33 +66,35 @@ def read_segments(
     options: TrackingOptions,
     reasons: dict[int, str],
 ) -> Iterator[Segment]:
-    """Segments in the order of time. Fills `reasons` for the rows that come in none.
+    """Yield the segments in the order of time; fill `reasons` for the frames that belong to none.
 
-    Raises InputError where a video can't be read.
+    Raises InputError if a video cannot be read.
     """
     frames = sequence.frames
     wanted, labelled = set(sequence.wanted.tolist()), sequence.labelled_rows()
-    key, state = "", _Open()
+    key, state = "", _PendingFrames()
     for row, gray in _images(frames, videos, options):
         if frames.cameras[row] != key:
-            yield from _close(state, sequence, reasons)
+            yield from _flush_rest(state, sequence, reasons)
             key = str(frames.cameras[row])
-            state = _Open(camera=sequence.cameras.get(key))
+            state = _PendingFrames(camera=sequence.cameras.get(key))
         if row in labelled and state.camera is not None:
             anchor = _anchor(sequence, labelled[row], row, gray)
-            yield from _reach(state, anchor, sequence)
+            yield from _flush_between(state, anchor, sequence)
         elif row in wanted and frames.status[row] == FrameStatus.UNREADABLE:
             reasons[row] = str(frames.reason[row])
         elif row in wanted:
             state.waiting.append((row, gray))
-            yield from _limit(state, sequence, reasons, options.max_batch_mb * 1e6 / gray.size)
-    yield from _close(state, sequence, reasons)
+            yield from _limit_memory(
+                state, sequence, reasons, options.max_batch_mb * 1e6 / gray.size
+            )
+    yield from _flush_rest(state, sequence, reasons)
 
 
 def _images(
     frames: Frames, videos: Sequence[Path], options: TrackingOptions
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """(row, grey image) of the frames in the order of time."""
+    """Yield row and grey image of each frame in the order of time."""
     row_of = {
         (str(source), int(index)): row
         for row, (source, index) in enumerate(zip(frames.sources, frames.video_frame, strict=True))
@@ -98,7 +107,7 @@ def _images(
 
 
 def _anchor(sequence: SequenceToLabel, label: int, row: int, gray: np.ndarray) -> Anchor:
-    """With the points of the longest tracks first: they are known best."""
+    """Create an anchor; the points with the longest tracks, which are the most accurate, come first."""
     ids, pixels = sequence.seen.of_frame(label)
     points = sequence.points.rows_of(ids)
     order = np.argsort(-sequence.points.track_lengths[points], kind="stable")
@@ -112,8 +121,10 @@ def _anchor(sequence: SequenceToLabel, label: int, row: int, gray: np.ndarray) -
     )
 
 
-def _reach(state: _Open, anchor: Anchor, sequence: SequenceToLabel) -> Iterator[Segment]:
-    """The next labelled frame is here: what waited for it can go."""
+def _flush_between(
+    state: _PendingFrames, anchor: Anchor, sequence: SequenceToLabel
+) -> Iterator[Segment]:
+    """Yield the frames that waited for this labelled frame."""
     if not state.anchors:
         state.head, state.waiting = state.waiting, []
     else:
@@ -122,28 +133,34 @@ def _reach(state: _Open, anchor: Anchor, sequence: SequenceToLabel) -> Iterator[
         yield from _segment(state, state.waiting, pair, sequence)
         state.head, state.waiting = [], []
     state.anchors = [*state.anchors[-1:], anchor]
-    state.handed_on = False
+    state.start_flushed = False
 
 
-def _limit(
-    state: _Open, sequence: SequenceToLabel, reasons: dict[int, str], most: float
+def _limit_memory(
+    state: _PendingFrames, sequence: SequenceToLabel, reasons: dict[int, str], max_images: float
 ) -> Iterator[Segment]:
-    """In a long gap, its beginning is tracked from behind, and of the rest only its end is kept."""
-    if len(state.waiting) <= most:
+    """Limit the number of waiting images.
+
+    In a long gap, the beginning is tracked from the labelled frames before it; of the rest only the end is
+    kept.
+    """
+    if len(state.waiting) <= max_images:
         return
-    if state.anchors and not state.handed_on:
+    if state.anchors and not state.start_flushed:
         for part in (state.head, state.waiting):
             yield from _segment(state, part, state.anchors, sequence)
-        state.head, state.waiting, state.handed_on = [], [], True
+        state.head, state.waiting, state.start_flushed = [], [], True
     else:
         row, _ = state.waiting.pop(0)
         reasons[row] = "too far from any labelled frame"
 
 
-def _close(state: _Open, sequence: SequenceToLabel, reasons: dict[int, str]) -> Iterator[Segment]:
-    """No labelled frame follows."""
+def _flush_rest(
+    state: _PendingFrames, sequence: SequenceToLabel, reasons: dict[int, str]
+) -> Iterator[Segment]:
+    """Yield the remaining frames, after which no labelled frame follows."""
     for rest in (state.head, state.waiting):
-        if state.anchors and not (rest is state.waiting and state.handed_on):
+        if state.anchors and not (rest is state.waiting and state.start_flushed):
             yield from _segment(state, rest, state.anchors, sequence)
         else:
             why = (
@@ -155,7 +172,7 @@ def _close(state: _Open, sequence: SequenceToLabel, reasons: dict[int, str]) -> 
 
 
 def _segment(
-    state: _Open,
+    state: _PendingFrames,
     images: list[tuple[int, np.ndarray]],
     anchors: list[Anchor],
     sequence: SequenceToLabel,

@@ -1,4 +1,4 @@
-"""What following points into video frames is given, and what becomes of a frame."""
+"""Input and result of tracking points into video frames."""
 
 from __future__ import annotations
 
@@ -12,43 +12,86 @@ from spn_data.geometry.pose import Poses
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingOptions:
-    """How frames are followed, and when a pose becomes a label.
+    """How frames are tracked, and when a pose becomes a label.
 
-    Pixels are those of the image in which points are followed. Lengths are shares of the median distance
-    of the points that the frame sees, so that they hold in a map without a unit as well.
+    Pixels refer to the image in which points are tracked. Lengths are relative to the median distance of the
+    points that the frame observes, so that they also apply to a map without metric scale.
+
+    Attributes
+    ----------
+    max_width_px : int
+        Wider images are reduced to this width.
+    max_points : int
+        Maximum number of points tracked from each labelled frame, spread over the image.
+    start_points : int
+        Number of these that are tracked first, with a large search range, to estimate a rough pose.
+    window_px : int
+        Side of a patch.
+    start_halvings : int
+        Number of times that the image is halved for the first search.
+    start_levels : int
+        Further pyramid levels of the first search.
+    levels : int
+        Pyramid levels of the second search, which starts from a rough pose.
+    round_trip_px : float
+        Maximum distance between a point and its position after tracking forwards and backwards.
+    max_error_px : float
+        Maximum reprojection error of an inlier.
+    min_inliers : int
+    min_inlier_ratio : float
+        Minimum share of the tracked points that are inliers.
+    min_coverage : float
+        Minimum share of the image's cells that contain an inlier.
+    max_sigma, max_sigma_deg : float
+        Maximum standard deviation of position and rotation by these points alone.
+    max_split, max_split_deg : float
+        Maximum difference between the poses from the points of either labelled frame alone.
+    max_jump, max_jump_deg : float
+        Maximum deviation from the constant motion between the frames before and after.
+    max_acceleration, max_turn_deg_s2 : float
+        Acceleration, per s^2, that is allowed in addition to this deviation.
+    max_batch_mb : int
+        Maximum size of the images between two labelled frames; the middle of a longer gap is left out.
     """
 
-    max_width_px: int = 1600  # wider images are reduced to this
-    max_points: int = 400  # followed from each labelled frame, spread over the image
-    start_points: int = 120  # of them, followed first and from far, to find the frame's rough pose
-    window_px: int = 21  # side of a patch
-    start_halvings: int = 2  # of the image for the first search
-    start_levels: int = 2  # further halvings that the first search begins at
-    levels: int = 1  # halvings that the second search begins at: it knows where to look
-    round_trip_px: float = 0.5  # a point followed there and back misses its beginning by no more
-    max_error_px: float = 2.0  # of an inlier
+    max_width_px: int = 1600
+    max_points: int = 400
+    start_points: int = 120
+    window_px: int = 21
+    start_halvings: int = 2
+    start_levels: int = 2
+    levels: int = 1
+    round_trip_px: float = 0.5
+    max_error_px: float = 2.0
     min_inliers: int = 30
-    min_inlier_ratio: float = 0.5  # of the points that were followed
-    min_coverage: float = 0.06  # share of the image's cells that hold an inlier
-    max_sigma: float = 0.005  # standard deviation of the position from these points alone
-    max_sigma_deg: float = 0.25  # of the rotation
-    max_split: float = 0.0125  # between the positions by either labelled frame's points alone
-    max_split_deg: float = 0.5  # between the rotations
-    max_jump: float = 0.01  # off the straight motion from the frame before to the frame after ...
+    min_inlier_ratio: float = 0.5
+    min_coverage: float = 0.06
+    max_sigma: float = 0.005
+    max_sigma_deg: float = 0.25
+    max_split: float = 0.0125
+    max_split_deg: float = 0.5
+    max_jump: float = 0.01
     max_jump_deg: float = 1.0
-    max_acceleration: float = 0.5  # ... and what this adds, per s2,
-    max_turn_deg_s2: float = 100.0  # and this
-    max_batch_mb: int = (
-        256  # of images between two labelled frames; the middle beyond it is left out
-    )
+    max_acceleration: float = 0.5
+    max_turn_deg_s2: float = 100.0
+    max_batch_mb: int = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """A labelled frame and K map points that it sees, those known best first.
+    """Labelled frame and K map points that it observes, the most accurate first.
 
-    gray : (h, w) uint8, maybe reduced; poses : (1,); point_ids : (K,); xyz : (K, 3); pixels : (K, 2) of
-    the full-size image.
+    Attributes
+    ----------
+    time_s : float
+    gray : ndarray, shape (h, w), uint8
+        Possibly reduced image.
+    poses : Poses
+        One pose.
+    point_ids : ndarray, shape (K,)
+    xyz : ndarray, shape (K, 3)
+    pixels : ndarray, shape (K, 2)
+        In the full-size image.
     """
 
     time_s: float
@@ -61,10 +104,18 @@ class Anchor:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """N frames to label between or beside one or two labelled ones, in the order of time.
+    """N frames to label and the one or two labelled frames around them, in the order of time.
 
-    rows : (N,) their rows in the caller's table; time_s : (N,); grays : N images (h, w) uint8, all of one
-    size; camera : of all, anchors included, at full size.
+    Attributes
+    ----------
+    rows : ndarray, shape (N,)
+        Rows in the caller's table.
+    time_s : ndarray, shape (N,)
+    grays : list of ndarray, shape (h, w), uint8
+        N images of equal size.
+    camera : Camera
+        Of all frames including the anchors, at full size.
+    anchors : list of Anchor
     """
 
     rows: np.ndarray
@@ -76,13 +127,31 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """What became of one frame.
+    """Result for one frame.
 
-    reason : why it has no label, empty where it has one. poses : (1,), NaN without a label; point_ids (K,)
-    and full-size pixels (K, 2) of the inliers, coverage and error_px, their spread and root mean square
-    residual (full size). distance : median, of the points; sigma, sigma_deg : of position and rotation, from
-    the residuals alone; split, split_deg : between the answers of two labelled frames, NaN where only one
-    answers. Positions as shares of distance.
+    Attributes
+    ----------
+    row : int
+        Row in the caller's table.
+    reason : str
+        Why it has no label; empty if it has one.
+    poses : Poses
+        One pose; NaN without a label.
+    point_ids : ndarray, shape (K,)
+    pixels : ndarray, shape (K, 2)
+        Inliers, in the full-size image.
+    coverage : float
+        Share of the image that the inliers cover.
+    error_px : float
+        RMS reprojection error of the inliers at full size.
+    inlier_ratio : float
+    distance : float
+        Median distance of the points.
+    sigma, sigma_deg : float
+        Standard deviation of position, relative to `distance`, and rotation, from the residuals alone.
+    split, split_deg : float
+        Difference between the poses from two labelled frames, the position relative to `distance`; NaN if
+        only one gives a pose.
     """
 
     row: int
@@ -100,6 +169,6 @@ class TrackedFrame:
     split_deg: float = np.nan
 
 
-def failed(reason: str, row: int = -1) -> TrackedFrame:
-    """A frame without a label."""
+def failed_frame(reason: str, row: int = -1) -> TrackedFrame:
+    """Return a frame without a label."""
     return TrackedFrame(row, reason, Poses.unknown(1), np.zeros(0, np.int64), np.zeros((0, 2)))

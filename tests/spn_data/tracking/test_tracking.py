@@ -12,7 +12,7 @@ from spn_data.capture.frames import FrameStatus
 from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
 from spn_data.geometry.pose_fit import fit_pose
 from spn_data.tracking.label_video import drop_jumps, track_frames
-from spn_data.tracking.point_tracking import follow, spread, track_segment
+from spn_data.tracking.point_tracking import spread_points, track_points, track_segment
 from spn_data.tracking.segments import read_segments
 from spn_data.tracking.tracked_frames import TrackedFrame, TrackingOptions
 from tests.worlds.tracking_world import CAMERA, LABELLED, TEXTURE, N, World, visible
@@ -83,7 +83,9 @@ def test_frames_off_a_steady_motion_are_dropped_from_the_labels(world: World) ->
     )
     dropped = ~labels.registered
     assert 3 <= dropped.sum() < 20
-    assert set(labels.reason[dropped]) == {"it lies off the motion of the frames before and after"}
+    assert set(labels.reason[dropped]) == {
+        "its pose deviates from the motion of the frames before and after"
+    }
     assert labels.inliers[dropped].max() == 0
     assert not np.isin(seen.frame_idx, np.flatnonzero(dropped)).any()
 
@@ -99,7 +101,7 @@ def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
     x, y = np.meshgrid(np.arange(40.5, 360, 40), np.arange(40.5, 360, 40))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     pixels[0] = (398.0, 200.0)
-    there, found = follow(before, moved, pixels, pixels + np.array([9.0, 8.0]), 3, OPTIONS)
+    there, found = track_points(before, moved, pixels, pixels + np.array([9.0, 8.0]), 3, OPTIONS)
     behind = np.all((pixels > 150) & (pixels < 250), axis=1)
     clear = np.any((pixels < 110) | (pixels > 290), axis=1)
     assert behind.sum() == 9
@@ -166,7 +168,7 @@ def test_a_frame_of_something_else_fails_and_those_around_it_do_not(world: World
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (replace(OPTIONS, min_inliers=10_000), "points of the labelled frames beside it"),
+        (replace(OPTIONS, min_inliers=10_000), "points of the adjacent labelled frames"),
         (replace(OPTIONS, min_coverage=1.01), "cover only"),
         (replace(OPTIONS, max_sigma=1e-9), "don't determine its pose"),
         (replace(OPTIONS, max_split=1e-9), "ambiguous"),
@@ -188,7 +190,7 @@ def test_a_pose_off_the_motion_of_its_neighbours_fails_and_they_stay(world: Worl
     found[12] = replace(found[12], poses=Poses(moved, found[12].poses.quats_wxyz))
     drop_jumps(world.sequence, found, OPTIONS)
     assert [row for row, frame in found.items() if frame.reason] == [12]
-    assert "off the motion" in found[12].reason
+    assert "deviates from the motion" in found[12].reason
 
 
 def test_segments_lie_between_labelled_frames_and_hold_both(world: World) -> None:
@@ -278,7 +280,7 @@ def test_points_are_spread_over_the_image_and_the_first_of_a_cell_kept() -> None
     rng = np.random.default_rng(2)
     crowd = rng.uniform(0, 30, (90, 2))
     others = np.column_stack([np.linspace(150, 470, 10), np.linspace(60, 260, 10)])
-    rows = spread(np.concatenate([crowd, others]), 480, 270, 30)
+    rows = spread_points(np.concatenate([crowd, others]), 480, 270, 30)
     assert len(rows) == 30
     assert set(range(90, 100)) <= set(rows.tolist())
     assert 0 in rows
