@@ -1,0 +1,1 @@
+"""The commands `spn-data` and `spn-model`."""
