@@ -186,7 +186,7 @@ def test_a_data_set_of_another_version_is_refused(dataset, tmp_path):
     other = Path(shutil.copy(dataset, tmp_path / "other.h5"))
     with h5py.File(other, "r+") as file:
         file.attrs["version"] = 99
-    with pytest.raises(FormatError, match="is of format 99"):
+    with pytest.raises(FormatError, match="has format version 99"):
         judged(other, n=network)
 
 
