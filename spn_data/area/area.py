@@ -167,12 +167,7 @@ class Area:
     def record(self, stage: str) -> StageRecord:
         """Return the record of a stage.
 
-        Raises
-        ------
-        StageError
-            If the stage is missing.
-        FormatError
-            If its record is damaged or of a newer version.
+        Raises StageError if the stage is missing, FormatError if its record is damaged or of a newer version.
         """
         path = self.folder(stage) / _RECORD
         if not path.exists():

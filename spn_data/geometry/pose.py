@@ -27,17 +27,7 @@ def rotations_from_quats(quats_wxyz: np.ndarray) -> np.ndarray:
 
 
 def quats_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Convert rotation matrices to unit quaternions.
-
-    Parameters
-    ----------
-    rotations : ndarray, shape (N, 3, 3)
-        Rotation matrices.
-
-    Returns
-    -------
-    ndarray, shape (N, 4)
-        Unit quaternions, scalar first and w >= 0.
+    """Convert rotation matrices (N, 3, 3) to unit quaternions (N, 4), scalar first and w >= 0.
 
     Notes
     -----
@@ -64,17 +54,7 @@ def quats_from_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def canonical_quats(quats_wxyz: np.ndarray) -> np.ndarray:
-    """Normalise quaternions and choose their sign.
-
-    Parameters
-    ----------
-    quats_wxyz : ndarray, shape (N, 4)
-        Quaternions, scalar first, of any non-zero length.
-
-    Returns
-    -------
-    ndarray, shape (N, 4)
-        Unit quaternions of the same rotations with w >= 0 (w = 0: first non-zero component positive).
+    """Normalise quaternions (N, 4), scalar first, to w >= 0 (w = 0: first non-zero component positive).
 
     Raises
     ------
