@@ -1,6 +1,6 @@
-"""Mapping, joining and refining models, as a child process (`python -m spn_data.colmap.mapping`).
+"""Mapping, triangulation and refinement in a child process (`python -m spn_data.colmap.mapping`).
 
-The functions above `main` run in the parent and know no pycolmap objects, those below in the child.
+The functions above `main` run in the parent and use no pycolmap objects; those below run in the child.
 """
 
 from __future__ import annotations
@@ -16,9 +16,21 @@ from spn_data.work import child
 
 
 def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) -> list[Path]:
-    """Folders of the sub-models, most images first; empty where nothing could be mapped.
+    """Run COLMAP's mapper.
 
-    progress is told the number of registered images. Snapshots stay where the child dies.
+    Parameters
+    ----------
+    job : MappingJob
+    log : Path
+        Log file of the child process.
+    progress : callable
+        Called with the number of registered images.
+
+    Returns
+    -------
+    list of Path
+        Folders of the sub-models, most images first; empty if nothing could be mapped. Snapshots remain if
+        the child dies.
     """
     models: list[Path] = []
 
@@ -33,7 +45,18 @@ def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) 
 
 
 def latest_snapshot(snapshots: Path) -> Path | None:
-    """The newest snapshot that is complete; an interrupted write is passed over."""
+    """Return the newest complete snapshot.
+
+    Parameters
+    ----------
+    snapshots : Path
+        Folder of the snapshots; may be missing.
+
+    Returns
+    -------
+    Path or None
+        None if there is none. Snapshots whose writing was interrupted are skipped.
+    """
     from spn_data.colmap.model import count_registered, is_whole
 
     folders = [f for f in snapshots.iterdir() if f.is_dir()] if snapshots.is_dir() else []
@@ -44,9 +67,19 @@ def latest_snapshot(snapshots: Path) -> Path | None:
 
 
 def triangulate(source: Path, target: Path, *, database: Path, log: Path) -> None:
-    """The cameras and poses in `source`, as they are, with the points of all matches in `database`.
+    """Triangulate the points of all matches in a database from the cameras and poses of a model.
 
-    Features may be others than those of `source`; images and cameras are the same.
+    Parameters
+    ----------
+    source : Path
+        Model whose cameras and poses are used unchanged. Its features may differ from those of the database;
+        images and cameras are the same.
+    target : Path
+        Folder to write.
+    database : Path
+        Database file.
+    log : Path
+        Log file of the child process.
     """
     job = {
         "task": "triangulate",
@@ -68,9 +101,28 @@ def refine(
     threads: int,
     log: Path,
 ) -> dict[str, Any]:
-    """Last bundle adjustments over a whole model, with a fuller camera; returns what it did.
+    """Run the final bundle adjustments over a whole model, with more distortion terms.
 
-    images : their folder, for the points' colours; positions : in metres, of those that have one.
+    Parameters
+    ----------
+    source, target : Path
+        Folders to read and write.
+    images : Path
+        Image folder, for the colours of the points.
+    positions : mapping of str to sequence of float
+        Positions in metres of those images that have one.
+    camera_model : str
+        COLMAP's camera model.
+    refine_principal_point : bool
+    threads : int
+    log : Path
+        Log file of the child process.
+
+    Returns
+    -------
+    dict
+        "error_before_px" and "error_px" (mean reprojection error), "dropped" (measurements), and "bend_m"
+        (median displacement by the correction of doming, 0 if there was none).
     """
     result: dict[str, Any] = {}
     job = {
@@ -88,6 +140,7 @@ def refine(
 
 
 def main() -> None:
+    """Run the task of the child process."""
     job = child.read_job()
     task = job.pop("task")
     if task == "map":
@@ -97,7 +150,7 @@ def main() -> None:
     elif task == "refine":
         _refine(**job)
     else:
-        raise ValueError(f"no task {task!r}")
+        raise ValueError(f"unknown task {task!r}")
 
 
 def _map(job: MappingJob) -> None:
@@ -112,7 +165,7 @@ def _map(job: MappingJob) -> None:
         models = pycolmap.global_mapping(job.database, job.images, job.output, options)
     else:
         models = map_incrementally(job)
-    # The mapper's own names depend on whether it went on from a model.
+    # The mapper's own names depend on whether it continued from a model.
     folders = []
     for rank, i in enumerate(sorted(models, key=lambda i: (-models[i].num_reg_images(), i))):
         folder = Path(job.output) / f"model-{rank}"

@@ -1,4 +1,4 @@
-"""COLMAP model files and the values they hold."""
+"""COLMAP models: reading, writing, and the values that they contain."""
 
 from __future__ import annotations
 
@@ -26,10 +26,22 @@ from spn_data.labels.map_points import MapPoints
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A reconstruction in COLMAP's own gauge (arbitrary origin, rotation and unit).
+    """Reconstruction in its own gauge (arbitrary origin, rotation and scale).
 
-    names : the registered images, sorted; poses : of these; camera_ids : (N,); cameras : by id;
-    points : (P, 3); point_errors_px : (P,); track_lengths : (P,).
+    Attributes
+    ----------
+    names : tuple of str
+        Registered images, sorted.
+    poses : Poses
+        N poses of these images.
+    camera_ids : ndarray, shape (N,)
+        COLMAP's camera id of each image.
+    cameras : dict of int to Camera
+        By COLMAP's camera id.
+    points : ndarray, shape (P, 3)
+    point_errors_px : ndarray, shape (P,)
+        Mean reprojection errors.
+    track_lengths : ndarray, shape (P,)
     """
 
     names: tuple[str, ...]
@@ -43,10 +55,18 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class MapObservations:
-    """Every measurement of a point in an image, M in all.
+    """M measurements of points in images.
 
-    image_idx : (M,) position in Scene.names; point_idx : (M,) position in Scene.points;
-    pixels : (M, 2) measured; residuals_px : (M, 2) projected minus measured.
+    Attributes
+    ----------
+    image_idx : ndarray, shape (M,)
+        Row in ``Scene.names``.
+    point_idx : ndarray, shape (M,)
+        Row in ``Scene.points``.
+    pixels : ndarray, shape (M, 2)
+        Measured.
+    residuals_px : ndarray, shape (M, 2)
+        Projected minus measured.
     """
 
     image_idx: np.ndarray
@@ -222,7 +242,21 @@ def _observations(
 
 
 def write_transformed(source: Path, target: Path, world_from_model: Similarity) -> None:
-    """The same model in another frame, in COLMAP's binary format."""
+    """Write a model transformed to another frame, in COLMAP's binary format.
+
+    Parameters
+    ----------
+    source, target : Path
+        Folders to read and write.
+    world_from_model : Similarity
+
+    Raises
+    ------
+    FormatError
+        If `source` is not a complete model.
+    StageError
+        If the disk is full.
+    """
     native = load_native(source)
     native.transform(
         pycolmap.Sim3d(
@@ -235,7 +269,10 @@ def write_transformed(source: Path, target: Path, world_from_model: Similarity) 
 
 
 def write_native(native: pycolmap.Reconstruction, target: Path) -> None:
-    """Write a model and read it back: COLMAP does not notice a disk that is full. Raises StageError then."""
+    """Write a model and read it back, because COLMAP does not report write errors on a full disk.
+
+    Raises StageError if it was not written completely.
+    """
     target.mkdir(parents=True, exist_ok=True)
     native.write(str(target))
     try:
@@ -244,10 +281,11 @@ def write_native(native: pycolmap.Reconstruction, target: Path) -> None:
     except FormatError:
         whole = False
     if not whole:
-        raise StageError(f"{target}: cannot be written whole; is the disk full?")
+        raise StageError(f"{target}: could not be written completely; is the disk full?")
 
 
 def from_native_camera(camera: pycolmap.Camera) -> Camera:
+    """Convert COLMAP's camera. Raises FormatError if its camera model is not supported."""
     try:
         return Camera(camera.model_name, camera.width, camera.height, np.array(camera.params))
     except ValueError as error:
@@ -258,7 +296,7 @@ _DISTORTION = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "PINHOLE": 0, "SIMP
 
 
 def upgrade_camera(camera: Any, model: str) -> None:
-    """Change COLMAP's camera in place to a fuller model with the same projection, if it is fuller."""
+    """Change COLMAP's camera in place to a model with more distortion terms and the same projection."""
     old = from_native_camera(camera)
     if _DISTORTION[model] <= _DISTORTION[old.model]:
         return
@@ -270,4 +308,5 @@ def upgrade_camera(camera: Any, model: str) -> None:
 
 
 def registered_images(native: pycolmap.Reconstruction) -> list[Any]:
+    """Return the images with a pose, as objects of pycolmap."""
     return [native.images[i] for i in native.reg_image_ids()]

@@ -1,4 +1,4 @@
-"""What became of each frame in a reconstruction, and which passages are missing and why."""
+"""Result of a reconstruction for each frame, and the reasons for missing frames."""
 
 from __future__ import annotations
 
@@ -13,21 +13,35 @@ from spn_data.reconstruction.correspondences import FramesToMap
 
 @dataclass(frozen=True)
 class FrameRegistration:
-    """What became of one frame."""
+    """Result for one frame.
+
+    Attributes
+    ----------
+    name : str
+    registered : bool
+    reason : str
+        Why it is missing; empty if it is registered.
+    keypoints : int
+    verified_pairs : int
+    observations : int
+        Number of observed points of the model.
+    error_px : float
+        Mean reprojection error; NaN if it is not registered.
+    """
 
     name: str
     registered: bool
-    reason: str  # empty where it is registered
+    reason: str
     keypoints: int
     verified_pairs: int
-    observations: int  # of points of the model
-    error_px: float  # mean; NaN where it is not registered
+    observations: int
+    error_px: float
 
 
 def diagnose(
     database: MapDatabase, frames: FramesToMap, scene: Scene, seen: MapObservations
 ) -> tuple[FrameRegistration, ...]:
-    """What became of each frame, and for the missing ones why."""
+    """Return the result for each frame, and for missing frames the reason."""
     position = {name: k for k, name in enumerate(scene.names)}
     partners: dict[str, dict[str, int]] = {name: {} for name in frames.names}
     for (a, b), inliers in database.verified_pairs().items():
@@ -53,7 +67,7 @@ def diagnose(
 
 def _why_missing(keypoints: int, partners: dict[str, int], registered: dict[str, int]) -> str:
     if keypoints < 100:
-        return f"only {keypoints} features: too blurred, dark or bare"
+        return f"only {keypoints} features: blurred, dark or without texture"
     if not partners:
         return f"{keypoints} features, but no verified match with any frame"
     inside = {name: inliers for name, inliers in partners.items() if name in registered}
@@ -73,7 +87,20 @@ def _why_missing(keypoints: int, partners: dict[str, int], registered: dict[str,
 def missing_passages(
     registrations: tuple[FrameRegistration, ...], sequences: np.ndarray, time_s: np.ndarray
 ) -> tuple[str, ...]:
-    """A sentence for each run of missing frames in a sequence: when, how many, and the commonest reason."""
+    """Describe each run of missing frames in a sequence: when, how many, and the most frequent reason.
+
+    Parameters
+    ----------
+    registrations : tuple of FrameRegistration
+        Of N frames.
+    sequences : ndarray, shape (N,), str
+    time_s : ndarray, shape (N,)
+
+    Returns
+    -------
+    tuple of str
+        One sentence per run.
+    """
     sentences = []
     for sequence in dict.fromkeys(sequences.tolist()):
         rows = np.flatnonzero(sequences == sequence)

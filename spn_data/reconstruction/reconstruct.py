@@ -1,4 +1,4 @@
-"""From frames to one model: features, pairs, matches, mapping, a second chance, and a diagnosis."""
+"""Reconstruction of one model from frames: features, pairs, matches, mapping, second chances, diagnosis."""
 
 from __future__ import annotations
 
@@ -12,24 +12,13 @@ from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.job import MappingJob
 from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
-from spn_data.colmap.model import (
-    MapObservations,
-    Scene,
-    count_registered,
-    read_map,
-    read_scene,
-)
+from spn_data.colmap.model import MapObservations, Scene, count_registered, read_map, read_scene
 from spn_data.errors import StageError
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
 from spn_data.reconstruction.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
-from spn_data.reconstruction.contradiction import (
-    Contradiction,
-    FocalChange,
-    contradictions,
-    focal_changes,
-)
+from spn_data.reconstruction.contradiction import contradictions, focal_changes
 from spn_data.reconstruction.correspondences import (
     FramesToMap,
     appearance_of,
@@ -37,6 +26,14 @@ from spn_data.reconstruction.correspondences import (
     match_missing,
 )
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
+from spn_data.reconstruction.notes import (
+    attempt_note,
+    bend_note,
+    contradiction_note,
+    drift_note,
+    failure_message,
+    misplaced_note,
+)
 from spn_data.storage.files import write_atomically
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch
@@ -47,24 +44,24 @@ _DRIFTED = 1.5  # ratio of focal lengths; a video cropped for stabilisation has 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """What every step of a reconstruction works on."""
+    """Input shared by all steps of a reconstruction."""
 
     frames: FramesToMap
     work: Path
     options: ReconstructOptions
-    dispatch: Dispatch  # who computes features and matches
+    dispatch: Dispatch  # computes features and matches
     progress: Progress
     stopwatch: Stopwatch
 
     def named(self, name: str) -> _Run:
-        """Steps under a name of their own, so that a second round is not taken for the first."""
+        """Return a run whose steps carry a name, so that a second round is not mistaken for the first."""
         told = self.progress
         return replace(self, progress=lambda step, *counts: told(f"{step} ({name})", *counts))
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """What an attempt gave."""
+    """Result of one attempt."""
 
     sound: bool  # whether nothing contradicts it
     registered: int
@@ -79,13 +76,31 @@ class _Candidate:
 
 @dataclass(frozen=True, eq=False)
 class ReconstructResult:
-    """Where the model lies and how it came about."""
+    """Model and how it was made.
+
+    Attributes
+    ----------
+    model : Path
+        Folder of the refined model.
+    database : Path
+        Database file of the attempt that was kept.
+    registrations : tuple of FrameRegistration
+        One per frame.
+    submodels : tuple of int
+        Number of images in each sub-model of the attempt that was kept.
+    attempts : tuple of str
+        Sentences: what was tried, with which result.
+    pairs_tried, pairs_verified : int
+        Number of matched and verified pairs.
+    scene, observations, points
+        The refined model.
+    """
 
     model: Path
     database: Path
     registrations: tuple[FrameRegistration, ...]
-    submodels: tuple[int, ...]  # images in each, of the attempt that was kept
-    attempts: tuple[str, ...]  # sentences: what was tried and what it gave
+    submodels: tuple[int, ...]
+    attempts: tuple[str, ...]
     pairs_tried: int
     pairs_verified: int
     scene: Scene
@@ -93,7 +108,7 @@ class ReconstructResult:
     points: MapPoints
 
 
-# Measured on drone video and photos of 0.5 to 2 megapixels, two cores, 4,096 features an image.
+# Measured on drone video and photos of 0.5 to 2 megapixels, with two cores and 4,096 features per image.
 FEATURES_CPU_S_PER_MEGAPIXEL = 0.27
 PAIRS_PER_FRAME = 11
 MATCHING_CPU_S_PER_PAIR = 0.025
@@ -104,10 +119,22 @@ DATABASE_BYTES_PER_FRAME = 800_000
 def estimate_model_cost(
     frames: int, megapixels: float, options: ReconstructOptions
 ) -> tuple[float, int]:
-    """(seconds, bytes on disk) that a model of so many frames is expected to take, within a factor of two.
+    """Estimate time and disk space of a reconstruction, within a factor of two.
 
-    megapixels : of one frame, as far as features are looked for. Mapping grows faster than the number of
-    frames above some hundreds.
+    Parameters
+    ----------
+    frames : int
+        Number of frames.
+    megapixels : float
+        Size of a frame as used for feature extraction.
+    options : ReconstructOptions
+
+    Returns
+    -------
+    seconds : float
+        Mapping grows faster than the number of frames above some hundreds.
+    size : int
+        Bytes on disk.
     """
     features = frames * megapixels * FEATURES_CPU_S_PER_MEGAPIXEL
     share = (options.features.max_features / FeatureOptions.max_features) ** 2
@@ -123,16 +150,34 @@ def reconstruct(
     progress: Progress,
     stopwatch: Stopwatch,
 ) -> ReconstructResult:
-    """Make one model of the frames, in `work`, going on from whatever an interrupted run left there.
+    """Reconstruct one model from frames.
 
-    Raises StageError where fewer than three images, or less than `usable_share` of them, register.
+    Parameters
+    ----------
+    frames : FramesToMap
+    work : Path
+        Working folder. Results of an interrupted run there are reused.
+    options : ReconstructOptions
+    progress : Progress
+    stopwatch : Stopwatch
+
+    Returns
+    -------
+    ReconstructResult
+
+    Raises
+    ------
+    StageError
+        If fewer than three images, or less than the share `options.usable_share` of them, are registered.
     """
     story: list[str] = []
     with dispatch_to(options.cluster, options.threads) as dispatch:
         run = _Run(frames, work, options, dispatch, progress, stopwatch)
         best = _best_attempt(run, story)
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
-        raise StageError(_no_model(work, frames, 0 if best is None else best.registered, story))
+        raise StageError(
+            failure_message(work, len(frames.names), 0 if best is None else best.registered, story)
+        )
     refined = _refine(run, best.model, story)
     scene, observations, points = read_map(refined)
     with MapDatabase.open(work / best.database) as database:
@@ -154,7 +199,7 @@ def reconstruct(
 
 
 def _best_attempt(run: _Run, story: list[str]) -> _Candidate | None:
-    """The first attempt that is good enough, or else the best of all."""
+    """Return the first attempt that is good enough, otherwise the best of all."""
     options = run.options
     best: _Candidate | None = None
     for attempt in attempts(options):
@@ -169,7 +214,7 @@ def _best_attempt(run: _Run, story: list[str]) -> _Candidate | None:
 
 
 def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
-    """What an attempt gives, with the chances of the frames that it leaves out; the story goes on."""
+    """Run an attempt and the second chances of its missing frames; append what happened to the story."""
     frames, work, stopwatch = run.frames, run.work, run.stopwatch
     n = len(frames.names)
     with MapDatabase.open(work / attempt.database) as database:
@@ -185,7 +230,7 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
         _match(run, database, pairs)
     models = _map(run, attempt)
     submodels = tuple(count_registered(model) for model in models)
-    story.append(_tell(attempt, submodels, n))
+    story.append(attempt_note(attempt, submodels, n))
     if not models:
         return None
     model, kept = _settled(run, attempt, models[0], story), attempt.database
@@ -208,9 +253,9 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
         wrong = contradictions(database, scene)
     drifted = focal_changes(scene, frames, _DRIFTED)
     if wrong:
-        story.append(_tell_contradictions(wrong))
+        story.append(contradiction_note(wrong))
     if drifted:
-        story.append(_tell_drift(drifted))
+        story.append(drift_note(drifted))
     return _Candidate(not (wrong or drifted), registered, model, kept, submodels)
 
 
@@ -234,7 +279,7 @@ def _match(run: _Run, database: MapDatabase, pairs: list[tuple[int, int]]) -> No
 def _map(
     run: _Run, attempt: Attempt, chance: Chance | None = None, start_from: Path | None = None
 ) -> list[Path]:
-    """Sub-models, most images first; an interrupted run goes on from its last snapshot."""
+    """Return the sub-models, most images first. An interrupted run continues from its last snapshot."""
     folder = run.work / "-".join(["mapping", attempt.name, *([chance.name] if chance else [])])
     done = folder / "models.json"
     if done.exists():
@@ -245,7 +290,7 @@ def _map(
     n = len(run.frames.names)
     with run.stopwatch.step("mapping"):
         database = run.work / (chance or attempt).database
-        # What these left out has its chance with all features.
+        # Frames that are missing then get a second chance with all features.
         if attempt.thinned and chance is None:
             thinned = folder / "thinned.db"
             with MapDatabase.open(database) as whole:
@@ -275,10 +320,10 @@ def _map(
 
 
 def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path:
-    """The model with the points of all matches and without misplaced frames.
+    """Return the model with the points of all matches and without misplaced frames.
 
-    Made once: the chances that follow add matches to the database, and an interrupted run that made it anew
-    would go on from another model.
+    It is computed only once: later chances add matches to the database, and an interrupted run that
+    recomputed it would continue from a different model.
     """
     done = run.work / f"mapping-{attempt.name}" / "settled.json"
     if not done.exists():
@@ -295,7 +340,7 @@ def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path
 
 
 def _with_all_points(run: _Run, attempt: Attempt, model: Path) -> Path:
-    """The model from the features that match most, with the points of all."""
+    """Triangulate the points of all features in the model from the features with most matches."""
     target = run.work / f"mapping-{attempt.name}" / "all-points"
     with run.stopwatch.step("mapping"):
         triangulate(
@@ -307,7 +352,7 @@ def _with_all_points(run: _Run, attempt: Attempt, model: Path) -> Path:
 def _grow(
     run: _Run, attempt: Attempt, chance: Chance, pairs: list[tuple[int, int]], model: Path
 ) -> Path:
-    """The model, grown by frames that a chance connects: sub-models join it that way too."""
+    """Extend the model by the frames that a chance connects; sub-models join it in the same way."""
     names = run.frames.names
     missing = set(names) - set(read_scene(model).names)
     if not (run.work / chance.database).exists():
@@ -328,10 +373,7 @@ def _without_misplaced(run: _Run, database: str, model: Path, story: list[str]) 
         wrong = drop_misplaced(model, target, matches)
     if not wrong:
         return model
-    story.append(
-        f"{len(wrong)} of them taken out again, that match others and show next to nothing of the model from "
-        f"where they lay ({', '.join(wrong[:3])}{', ...' if len(wrong) > 3 else ''})"
-    )
+    story.append(misplaced_note(wrong))
     return target
 
 
@@ -352,40 +394,5 @@ def _refine(run: _Run, model: Path, story: list[str]) -> Path:
         )
     run.progress("refinement", 1, 1)
     if done["bend_m"] > 0:
-        story.append(
-            f"it was bent by {done['bend_m']:.1f} m, in the median: the flight's positions took that out "
-            "before the last adjustment"
-        )
+        story.append(bend_note(done["bend_m"]))
     return target
-
-
-def _tell(attempt: Attempt, submodels: tuple[int, ...], n: int) -> str:
-    how = f"{attempt.name} attempt{f' ({attempt.why})' if attempt.why else ''}"
-    if not submodels:
-        return f"{how}: no model"
-    rest = f"; sub-models of {', '.join(map(str, submodels[1:]))}" if len(submodels) > 1 else ""
-    return f"{how}: {submodels[0]} of {n} frames in the largest model{rest}"
-
-
-def _tell_contradictions(wrong: list[Contradiction]) -> str:
-    worst = wrong[0]
-    others = f", and {len(wrong) - 1} more such pairs" if len(wrong) > 1 else ""
-    return (
-        f"parts of it lie wrongly to each other: {worst.images[0]} and {worst.images[1]} share "
-        f"{worst.matches} matches, of which its poses explain {worst.share:.0%}{others}"
-    )
-
-
-def _tell_drift(drifted: list[FocalChange]) -> str:
-    lenses = ", ".join(
-        f"of {one.camera} from {one.said_px:.0f} to {one.found_px:.0f} px" for one in drifted
-    )
-    return f"its focal lengths drifted: {lenses}"
-
-
-def _no_model(work: Path, frames: FramesToMap, registered: int, story: list[str]) -> str:
-    return (
-        f"no usable model: {registered} of {len(frames.names)} frames fit together "
-        f"({'; '.join(story)}). Frames must overlap by at least two thirds, be sharp, and show "
-        f"textured, rigid things from changing positions; COLMAP's log is {work / 'mapping.log'}"
-    )

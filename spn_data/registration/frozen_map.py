@@ -1,4 +1,4 @@
-"""The map as registration sees it: points, and descriptors of each frame that saw them. Read only."""
+"""Read-only access to the map for registration: points, and descriptors of the map frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descrip
 class MapFrame:
     """Features of a map frame that are points of the map.
 
-    descriptors : (K, 128) uint8 RootSIFT; point_rows : (K,) rows in MapPoints.
+    Attributes
+    ----------
+    descriptors : ndarray, shape (K, 128), uint8
+        RootSIFT.
+    point_rows : ndarray, shape (K,)
+        Rows in MapPoints.
     """
 
     descriptors: np.ndarray
@@ -29,7 +34,7 @@ class MapFrame:
 
 
 class FrozenMap:
-    """A model and its database, opened for reading."""
+    """Model and its database, opened for reading."""
 
     def __init__(self, folder: Path, features: MapFeatures):
         self.scene: Scene
@@ -46,22 +51,25 @@ class FrozenMap:
     @classmethod
     @contextmanager
     def open(cls, folder: Path, database: Path) -> Iterator[Self]:
+        """Open the model in `folder` and its database; raises FormatError if one of them is damaged."""
         with MapFeatures.open(database) as opened:
             yield cls(folder, opened)
 
     def similar(self, descriptors: np.ndarray, count: int) -> list[str]:
-        """Names of the map frames that look most like an image with these descriptors, best first."""
-        likeness = self._appearance @ vlad_descriptor(descriptors, self.vocabulary)
-        order = np.argsort(-likeness, kind="stable")[:count]
+        """Return the names of the map frames most similar to an image with these descriptors, best first."""
+        similarity = self._appearance @ vlad_descriptor(descriptors, self.vocabulary)
+        order = np.argsort(-similarity, kind="stable")[:count]
         return [self.scene.names[k] for k in order]
 
     def frame(self, name: str) -> MapFrame:
+        """Return a map frame. Raises FormatError if model and database contain different features."""
         descriptors = self._features.descriptors(name)
         point_ids = self._feature_points[name]
         if len(point_ids) != len(descriptors):
-            raise FormatError(f"{name}: the model and its database hold different features of it")
+            raise FormatError(f"{name}: its features in the model and in the database differ")
         is_point = np.flatnonzero(point_ids >= 0)
         return MapFrame(descriptors[is_point], self.points.rows_of(point_ids[is_point]))
 
     def frames(self, names: Sequence[str]) -> dict[str, MapFrame]:
+        """Return map frames by name."""
         return {name: self.frame(name) for name in names}

@@ -231,13 +231,13 @@ def test_no_surprise_is_told_of_a_focal_length_that_was_given_rightly(finished_a
         (
             "contradictions",
             Contradiction(("flight1/000001.jpg", "flight1/000002.jpg"), 500, 0.02),
-            "parts of it lie wrongly to each other: flight1/000001.jpg and flight1/000002.jpg share 500 "
-            "matches, of which its poses explain 2%",
+            "parts of the model are inconsistent: flight1/000001.jpg and flight1/000002.jpg share 500 "
+            "matches, but its poses explain only 2% of them",
         ),
         (
             "focal_changes",
             FocalChange("flight1", 220.0, 767.8),
-            "its focal lengths drifted: of flight1 from 220 to 768 px",
+            "the focal lengths drifted: flight1 from 220 to 768 px",
         ),
     ],
 )
@@ -294,7 +294,7 @@ def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
     assert result.exit_code == 0, result.output
     assert misplaced == [[], []]
     area = Area(tmp_path / "area")
-    assert any(_MISPLACED in n and "taken out again" in n for n in area.record(MODEL).notes)
+    assert any(_MISPLACED in n and "removed again" in n for n in area.record(MODEL).notes)
     assert _MISPLACED in read_scene(area.folder(MODEL)).names
 
 
