@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -60,7 +61,7 @@ class Dataset:
 
     Parameters
     ----------
-    path : Path
+    path : str or path-like
         File to open.
 
     Attributes
@@ -81,8 +82,8 @@ class Dataset:
         when the affected part is read.
     """
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: str | PathLike[str]):
+        self.path = path = Path(path)
         if not path.is_file():
             raise InputError("does not exist" if not path.exists() else "is not a file", path=path)
         try:
@@ -121,6 +122,17 @@ class Dataset:
             return DatasetGroup(self.path, name, _child(self._file, name, h5py.Group), self.info)
 
         return _guarded(self.path, f"group {name}", read)
+
+    def __getitem__(self, name: str) -> DatasetGroup:
+        if name not in self.groups:
+            raise KeyError(f"{name!r} is not a group; the data set has: {', '.join(self.groups)}")
+        return self.groups[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.groups)
+
+    def __len__(self) -> int:
+        return len(self.groups)
 
     def of_role(self, role: Role) -> list[DatasetGroup]:
         """Return the groups with a role, sorted by name."""

@@ -105,6 +105,44 @@ def cover_area(
     return found
 
 
+def compute_coverage(
+    labelled: LabelledArea,
+    name: str,
+    options: CoverageOptions | None = None,
+    progress: Progress = lambda *_: None,
+) -> Coverage:
+    """Compute the coverage of one evaluation sequence without writing anything.
+
+    Parameters
+    ----------
+    labelled : LabelledArea
+        The labels of an area.
+    name : str
+        Name of the evaluation sequence.
+    options : CoverageOptions, optional
+        Limits of the strata; by default those in metres. A map without metres has no strata unless they
+        are given.
+    progress : callable, optional
+        Called with the step, the amount done and the total.
+
+    Returns
+    -------
+    Coverage
+
+    Raises
+    ------
+    InputError
+        If the area has no such sequence.
+    """
+    if name not in labelled.evaluation:
+        known = ", ".join(labelled.evaluation) or "none"
+        raise InputError(f"there is no evaluation sequence {name!r}; the area has: {known}")
+    is_metric = labelled.units == "m"
+    limits = options or (CoverageOptions() if is_metric else None)
+    queries = _queries_of(labelled.evaluation[name], labelled)
+    return assess_coverage(queries, _mapping(labelled, has_up=is_metric), limits, progress)
+
+
 def check_new(path: Path, *, overwrite: bool) -> None:
     """Raises InputError where a file can't be made, or would be replaced without being asked to."""
     if path.suffix.lower() != ".csv" or path.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 import cv2
@@ -57,8 +58,8 @@ class Localizer:
 
     Parameters
     ----------
-    folder : Path
-        Bundle.
+    folder : str or path-like
+        Folder of the bundle.
     int8 : bool
         Use the 8-bit graph instead of the float32 graph.
     threads : int
@@ -81,7 +82,8 @@ class Localizer:
         If the bundle is damaged.
     """
 
-    def __init__(self, folder: Path, *, int8: bool = False, threads: int = 1):
+    def __init__(self, folder: str | PathLike[str], *, int8: bool = False, threads: int = 1):
+        folder = Path(folder)
         self.bundle: Bundle = read_bundle(folder)
         self.camera = self.bundle.camera
         precision = INT8 if int8 else FLOAT32
