@@ -278,7 +278,7 @@ def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
-def test_unseen_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
+def test_held_out_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
     """Each is what a camera at its pose sees; none is among those that batches are drawn from."""
     options = SceneStageOptions(views_share=1.0, views=8)
     examples = SceneExamples(data, options, CENTER, SPREAD, shrink, UNKNOWN_COUNT)

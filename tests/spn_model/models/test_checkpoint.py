@@ -29,7 +29,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def saved(field: Path, tmp_path: Path) -> tuple[Path, TinyModel, View]:
-    """A checkpoint of a member with weights, statistics and a counter that are not those of a new one."""
+    """A checkpoint of a pose model with weights, statistics and a counter that are not those of a new one."""
     model = TinyModel.make({"width": 5, "dropout": 0.25}, seed=3)
     with Dataset(field) as dataset:
         model.fit(TrainingSet(dataset.groups["train"]))
@@ -63,7 +63,7 @@ def rewritten(path: Path, **changes: object) -> Path:
 
 
 def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
-    """The member that is loaded estimates bit for bit what the saved one does, and knows its camera."""
+    """The loaded model estimates bit for bit what the saved one does, and knows its camera."""
     path, model, view = saved
     found = load(path)
     assert isinstance(found, Checkpoint)
@@ -183,5 +183,5 @@ def test_the_view_is_that_of_the_data_set(saved, field, tmp_path):
     for name, wrong in (("units", "ft"), ("size", [0, 3]), ("size", [3]), ("up_is_known", 1)):
         with pytest.raises((ValueError, TypeError)):
             View.from_json({**value, name: wrong})
-    with pytest.raises(ValueError, match="is no place"):
+    with pytest.raises(ValueError, match="is not a valid location"):
         View.from_json({**value, "origin": {**value["origin"], "lat_deg": 95}})

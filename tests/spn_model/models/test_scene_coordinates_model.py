@@ -1,4 +1,4 @@
-"""The scene-coordinate member: what it is shown is true, it learns it, and says when it sees nothing."""
+"""The scene-coordinate model: what it is shown is true, it learns it, and says when it sees nothing."""
 
 from __future__ import annotations
 
@@ -263,8 +263,8 @@ def test_the_page_tells_all_options_and_their_defaults():
         assert told[name].removesuffix(".0") == expected, name
 
 
-def test_options_of_decoding_make_the_member():
-    """What `options` gives makes the member anew; an unknown one is refused."""
+def test_options_of_decoding_make_the_model():
+    """What `options` returns builds the same model; an unknown option is refused."""
     model = SceneCoordinatesModel.make({"cells": 300, "shrink": 1})
     assert SceneCoordinatesModel.make(model.options).network.shrink == 1
     assert SceneCoordinatesModel.make(model.options).decoding == model.decoding

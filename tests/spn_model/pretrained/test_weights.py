@@ -544,7 +544,7 @@ def test_without_a_network_the_line_says_what_to_do(cache):
     weights = replace(by_name("googlenet"), url=f"http://127.0.0.1:{port}/small.pth")
     with pytest.raises(InputError, match="download failed") as error:
         fetch(weights, quiet)
-    wanted = f"fetch it elsewhere and put it at {cache / weights.file}, or give its path"
+    wanted = f"download it elsewhere and put it at {cache / weights.file}, or give its path"
     assert wanted in one_line(error)
 
 
