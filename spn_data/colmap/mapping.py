@@ -210,14 +210,14 @@ def _refine(
     from spn_data.colmap import pycolmap
     from spn_data.colmap.adjust import adjust
     from spn_data.colmap.clean import drop_without_depth
+    from spn_data.colmap.doming import correct_doming
     from spn_data.colmap.model import upgrade_camera, write_native
-    from spn_data.colmap.unbend import unbend
 
     model = pycolmap.Reconstruction(source)
     for camera in model.cameras.values():
         upgrade_camera(camera, camera_model)
     before = model.compute_mean_reprojection_error()
-    bend_m = unbend(model, positions)
+    bend_m = correct_doming(model, positions)
     dropped = adjust(model, refine_principal_point=refine_principal_point, threads=threads)
     dropped += drop_without_depth(model)
     model.update_point_3d_errors()

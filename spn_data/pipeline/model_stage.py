@@ -145,9 +145,9 @@ _FOCAL_SURPRISE = 1.1  # ratio to a focal length that was known
 def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
     """A word where a focal length came out far from what it was said to be."""
     return [
-        f"camera {change.camera}: the focal length came out at {change.found_px:.0f} px, "
-        f"{change.found_px / change.said_px - 1:+.0%} from the {change.said_px:.0f} px that were given. A "
-        "flight at one height that looks one way hardly determines it, and heights are off by as much; or "
+        f"camera {change.camera}: the focal length came out at {change.estimated_px:.0f} px, "
+        f"{change.estimated_px / change.known_px - 1:+.0%} from the {change.known_px:.0f} px that were given. "
+        "A flight at one height that looks one way hardly determines it, and heights are off by as much; or "
         "the video is cropped. --camera settles it"
         for change in focal_changes(scene, frames, _FOCAL_SURPRISE)
     ]

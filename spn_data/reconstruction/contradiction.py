@@ -80,18 +80,18 @@ class FocalChange:
     ----------
     camera : str
         Key of the camera.
-    said_px, found_px : float
+    known_px, estimated_px : float
         Known and estimated focal length.
     """
 
     camera: str
-    said_px: float
-    found_px: float
+    known_px: float
+    estimated_px: float
 
     @property
     def ratio(self) -> float:
         """Longer focal length divided by the shorter one."""
-        return max(self.found_px / self.said_px, self.said_px / self.found_px)
+        return max(self.estimated_px / self.known_px, self.known_px / self.estimated_px)
 
 
 def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[FocalChange]:

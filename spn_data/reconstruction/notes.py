@@ -46,7 +46,7 @@ def contradiction_note(wrong: list[Contradiction]) -> str:
 def drift_note(drifted: list[FocalChange]) -> str:
     """Return the focal lengths that changed too much."""
     lenses = ", ".join(
-        f"{one.camera} from {one.said_px:.0f} to {one.found_px:.0f} px" for one in drifted
+        f"{one.camera} from {one.known_px:.0f} to {one.estimated_px:.0f} px" for one in drifted
     )
     return f"the focal lengths drifted: {lenses}"
 

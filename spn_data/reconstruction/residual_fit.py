@@ -22,6 +22,7 @@ from spn_data.geometry.least_squares import (
     projection_jacobians,
     rows_to_sparse,
 )
+from spn_data.geometry.pose import to_camera
 
 FRAME_EFFECTS = 3  # zoom, shear and stretch of one frame
 _PER_FRAME = POSE + FRAME_EFFECTS
@@ -160,8 +161,8 @@ def linearize(
         return None
     frame, point = place[seen.image_idx[rows]], position[seen.point_idx[rows]]
     poses = scene.poses[frames]
-    offsets = scene.points[seen.point_idx[rows]] - poses.centers[frame]
-    points_cam = np.einsum("mij,mj->mi", poses.rotations[frame], offsets)
+    rotations = poses.rotations[frame]
+    points_cam = to_camera(scene.points[seen.point_idx[rows]], poses.centers[frame], rotations)
     by_point, lens = projection_jacobians(camera, points_cam)
     # Unlike elsewhere, translations are along the camera's axes.
     pose = np.concatenate([by_point, np.cross(points_cam[:, None], by_point)], axis=2)
@@ -173,7 +174,7 @@ def linearize(
     residuals = seen.residuals_px[rows]
     weights = huber_weights(residuals)
     per_frame = np.concatenate([pose, own], axis=2)
-    by_place = by_point @ poses.rotations[frame]
+    by_place = by_point @ rotations
     inverse_root = point_whitening(
         np.sqrt(weights)[:, None, None] * by_place, point, len(order), ridge=_POINT_RIDGE
     )

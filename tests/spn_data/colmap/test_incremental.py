@@ -102,7 +102,9 @@ def test_up_to_a_thousand_images_colmap_adjusts_by_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path, truth = database
-    monkeypatch.setattr(incremental, "adjust_long_tracks", lambda *_, **__: pytest.fail("not its own"))
+    monkeypatch.setattr(
+        incremental, "adjust_long_tracks", lambda *_, **__: pytest.fail("not its own")
+    )
     models = incremental.map_incrementally(job(path, tmp_path))
     assert told[-1] == {"registered": _IMAGES}
     assert position_error(models[0], truth) < 0.002

@@ -99,4 +99,4 @@ def test_a_known_focal_length_that_comes_out_far_off_speaks_against_a_model(
     assert len(changes) == told
     for change in changes:
         assert change.ratio == pytest.approx(max(factor, 1 / factor))
-        assert change.found_px / change.said_px == pytest.approx(factor)
+        assert change.estimated_px / change.known_px == pytest.approx(factor)

@@ -222,7 +222,8 @@ def test_wild_and_unknown_residuals_do_not_change_the_finding(tmp: Path) -> None
     assert found.zoom_rms == pytest.approx(filmed.diagnose().zoom_rms, rel=0.1)
     residuals[:] = 0
     assert (
-        replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose().describe() == ""
+        replace(filmed, seen=replace(filmed.seen, residuals_px=residuals)).diagnose().describe()
+        == ""
     )
     residuals[:] = np.nan
     nothing = replace(filmed.seen, residuals_px=residuals)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spn_data.colmap import pycolmap
-from spn_data.colmap import unbend as module
-from spn_data.colmap.unbend import unbend
+from spn_data.colmap import doming, pycolmap
+from spn_data.colmap.doming import correct_doming
 from tests.worlds.survey_world import error_m, survey
 
 _LINES = 12  # 480 images
@@ -16,7 +15,7 @@ _LINES = 12  # 480 images
 @pytest.fixture(autouse=True)
 def _enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand images would take a minute."""
-    monkeypatch.setattr(module, "_MIN_POSITIONS", 400)
+    monkeypatch.setattr(doming, "_MIN_POSITIONS", 400)
 
 
 def fixes(centers: np.ndarray, sigma_m: float = 0.8) -> dict[str, list[float]]:
@@ -43,7 +42,7 @@ def test_a_bend_is_taken_out_of_cameras_and_points_alike() -> None:
     """To decimetres, though positions are off by metres; what fitted still does, as parts move rigidly."""
     model, centers = survey(15.0, lines=_LINES)
     before_m, before_px = error_m(model, centers), reprojection_px(model)
-    bend_m = unbend(model, fixes(centers))
+    bend_m = correct_doming(model, fixes(centers))
     assert before_m > 3
     assert bend_m == pytest.approx(before_m, rel=0.3)
     assert error_m(model, centers) < 0.6
@@ -55,7 +54,7 @@ def test_positions_that_are_wrong_do_not_bend_it() -> None:
     positions = fixes(centers)
     for name in list(positions)[::20]:
         positions[name] = [5000.0, -3000.0, 800.0]
-    assert unbend(model, positions) > 3
+    assert correct_doming(model, positions) > 3
     assert error_m(model, centers) < 0.6
 
 
@@ -72,10 +71,10 @@ def test_a_model_is_left_as_it_is_where(
     sag_m: float, lines: int, given: int, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if lines == 1:
-        monkeypatch.setattr(module, "_MIN_POSITIONS", 30)
+        monkeypatch.setattr(doming, "_MIN_POSITIONS", 30)
     model, centers = survey(sag_m, lines=lines)
     before = geometry(model)
     positions = dict(list(fixes(centers).items())[:given])
-    assert unbend(model, positions) == 0, why
+    assert correct_doming(model, positions) == 0, why
     for one, other in zip(before, geometry(model), strict=True):
         assert np.array_equal(one, other)

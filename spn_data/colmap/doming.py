@@ -29,7 +29,7 @@ _ROUNDS = 5  # of outlier rejection
 
 
 @dataclass(frozen=True, eq=False)
-class Bend:
+class Deformation:
     """Smooth displacement of a surface and of the points above and below it.
 
     Attributes
@@ -50,7 +50,7 @@ class Bend:
     terms: np.ndarray
 
     @classmethod
-    def fit(cls, centers: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Bend:
+    def fit(cls, centers: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Deformation:
         """Fit the displacement from centres (N, 3) to targets (N, 3) by least squares.
 
         The surface is fitted to the targets. Weights (N,) are zero or one.
@@ -93,7 +93,9 @@ class Bend:
         return moved @ self.axes + self.origin, self.axes.T @ turned @ self.axes
 
 
-def unbend(native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[float]]) -> float:
+def correct_doming(
+    native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[float]]
+) -> float:
     """Remove the bend of a model in place if it is larger than the noise of its positions.
 
     Parameters
@@ -117,7 +119,7 @@ def unbend(native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[flo
         for _ in range(_ROUNDS):
             model_from_world = Similarity.fit(measured, centers, used)
             targets = model_from_world.apply(measured)
-            bend = Bend.fit(centers, targets, used)
+            bend = Deformation.fit(centers, targets, used)
             straight, _ = bend.apply(centers)
             residuals = np.linalg.norm(targets - straight, axis=1)
             used = (residuals < _OUTLIER * np.median(residuals)).astype(np.float64)
@@ -132,7 +134,7 @@ def unbend(native: pycolmap.Reconstruction, positions: Mapping[str, Sequence[flo
     return moved / model_from_world.scale
 
 
-def _move(native: pycolmap.Reconstruction, bend: Bend) -> None:
+def _move(native: pycolmap.Reconstruction, bend: Deformation) -> None:
     ids = list(native.points3D)
     moved, _ = bend.apply(np.array([native.points3D[i].xyz for i in ids]).reshape(-1, 3))
     for i, xyz in zip(ids, moved, strict=True):
