@@ -1,7 +1,8 @@
-"""All labels of an area in the map's frame: mapping frames, tracked frames, evaluation sequences."""
+"""All labels of an area in the world frame: mapping frames, tracked frames, evaluation sequences."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,12 +39,23 @@ from spn_data.storage.json_files import read_json
 
 @dataclass(frozen=True, eq=False)
 class LabelledArea:
-    """Every frame with what became of it.
+    """Labels of all frames of an area, with the map and the map points that each frame observes.
 
-    units : "m" (East-North-Up about `origin`) or "model" (COLMAP's gauge; origin is None).
-    mapping : chosen frames of the mapping flights; tracked : their other frames; evaluation : by sequence,
-    chosen and tracked frames. Each with the map points that the frames see. cameras : by key, in pixels of
-    the full-size images.
+    Attributes
+    ----------
+    units : str
+        "m" (East-North-Up about `origin`) or "model" (COLMAP's gauge).
+    origin : GeoOrigin or None
+        None if the area is not georegistered.
+    points : MapPoints
+    cameras : dict of str to Camera
+        Camera of each key, in pixels of the full-size images.
+    mapping, mapping_seen : Labels, LabelObservations
+        Chosen frames of the mapping flights.
+    tracked, tracked_seen : Labels, LabelObservations
+        Tracked frames of the mapping flights.
+    evaluation, evaluation_seen : dict of str to Labels, dict of str to LabelObservations
+        Chosen and tracked frames of each evaluation sequence, by its name.
     """
 
     units: str
@@ -58,7 +70,7 @@ class LabelledArea:
     evaluation_seen: dict[str, LabelObservations]
 
     def parts(self) -> list[tuple[Labels, LabelObservations]]:
-        """Mapping, its tracked frames, and each evaluation sequence."""
+        """Return mapping frames, their tracked frames, and each evaluation sequence, in this order."""
         return [
             (self.mapping, self.mapping_seen),
             (self.tracked, self.tracked_seen),
@@ -67,21 +79,35 @@ class LabelledArea:
 
 
 def map_folder(area: Area) -> Path:
-    """Where the map's frame is: 3-geo, or 2-model where telemetry did not determine a place."""
+    """Return the folder of the map: 3-geo, or 2-model if the area is not georegistered."""
     return area.folder(GEO if area.has(GEO) else MODEL)
 
 
 def read_labelled_area(
     area: Area, *, mapping_covariance: bool = True, tracked: bool = True
 ) -> LabelledArea:
-    """All labels, in metres where the area is georegistered.
+    """Read all labels of an area, in metres if it is georegistered.
 
-    mapping_covariance : false leaves the covariances of mapping frames unknown (NaN), which is quicker.
-    tracked : false leaves out the frames between, and does not mind whether their stages are stale.
+    Parameters
+    ----------
+    area : Area
+    mapping_covariance : bool
+        If false, covariances of mapping frames may be left unknown (NaN), which is faster.
+    tracked : bool
+        If false, tracked frames are left out and their stages may be stale.
 
-    Raises StageError for a stage that is missing or stale, FormatError or InputError for a damaged file.
+    Returns
+    -------
+    LabelledArea
+
+    Raises
+    ------
+    StageError
+        If a stage is missing or stale.
+    FormatError, InputError
+        If a file is damaged.
     """
-    area.upstream_of(GEO)  # frames and model stand and fit each other
+    area.upstream_of(GEO)  # raises if frames or model are missing or stale
     for stage in area.stages():
         if stage.partition("/")[0] in (GEO, EVALUATION, *([TRACKED] if tracked else [])):
             area.check_fresh(stage)
@@ -96,22 +122,24 @@ def read_labelled_area(
     }
     geo = read_geo(area)
     world_from_model = Similarity.identity() if geo is None else geo.world_from_model
-    between = area.sequences(TRACKED) if tracked else ()
+    tracked_names = area.sequences(TRACKED) if tracked else ()
     evaluation, evaluation_seen = {}, {}
     for name in area.sequences(EVALUATION):
         stage = f"{EVALUATION}/{name}"
         parts = [_read_stage(area, stage, world_from_model)]
-        if name in between:
+        if name in tracked_names:
             parts.append(_read_stage(area, f"{TRACKED}/{name}", world_from_model))
-        evaluation[name], evaluation_seen[name] = together(parts)
+        evaluation[name], evaluation_seen[name] = merge_labels(parts)
         cameras[name] = _read_camera(area.folder(stage) / CAMERA)
-    of_mapping = [
+    tracked_parts = [
         _read_stage(area, f"{TRACKED}/{name}", world_from_model)
-        for name in between
+        for name in tracked_names
         if name not in evaluation
     ]
-    nothing = (mapping.select(np.zeros(0, np.int64)), mapping_seen.select(np.zeros(0, np.int64)))
-    tracked_labels, tracked_seen = together(of_mapping) if of_mapping else nothing
+    if not tracked_parts:
+        no_rows = np.zeros(0, np.int64)
+        tracked_parts = [(mapping.select(no_rows), mapping_seen.select(no_rows))]
+    tracked_labels, tracked_seen = merge_labels(tracked_parts)
     return LabelledArea(
         units="m" if area.has(GEO) else "model",
         origin=None if geo is None else geo.origin,
@@ -127,24 +155,24 @@ def read_labelled_area(
 
 
 def chosen_frames(area: Area) -> Frames:
-    """The mapping flights' frames that went into reconstruction."""
+    """Return the frames of the mapping flights that were selected for reconstruction."""
     frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     return frames.select(frames.chosen)
 
 
 def read_geo(area: Area) -> GeoFit | None:
-    """How the area was put into the world; None where it is not georegistered."""
+    """Read the georegistration of an area; None if it has none."""
     return GeoFit.from_json(read_json(area.folder(GEO) / GEO_FIT)) if area.has(GEO) else None
 
 
 def read_world_from_model(area: Area) -> Similarity:
-    """From COLMAP's gauge to the frame that labels are in: the identity where there is no 3-geo."""
+    """Read the similarity from COLMAP's gauge to the frame of the labels: the identity without 3-geo."""
     geo = read_geo(area)
     return Similarity.identity() if geo is None else geo.world_from_model
 
 
 def _camera_samples(chosen: Frames, scene: Scene) -> dict[str, str]:
-    """A registered image of each camera key."""
+    """Return one registered image of each camera key."""
     registered = set(scene.names)
     pairs = zip(chosen.cameras.tolist(), chosen.names.tolist(), strict=True)
     return {key: name for key, name in pairs if name in registered}
@@ -159,7 +187,7 @@ def _mapping_labels(
     *,
     covariance: bool,
 ) -> tuple[Labels, LabelObservations]:
-    """Return the labels that the model stage wrote; compute those of an area that was made before it did."""
+    """Read the labels written by the model stage; compute them for areas of older versions."""
     folder = area.folder(MODEL)
     if (folder / POSES).exists():
         labels = read_labels(folder / POSES).transformed(read_world_from_model(area))
@@ -172,18 +200,19 @@ def _mapping_labels(
 def _read_stage(
     area: Area, stage: str, world_from_model: Similarity
 ) -> tuple[Labels, LabelObservations]:
-    """Labels of one stage, moved to where the map is now: it may have been georegistered anew since."""
+    """Read the labels of one stage in the present world frame: the georegistration may have changed since."""
     folder = area.folder(stage)
     labels = read_labels(folder / POSES)
-    there = read_json(folder / REGISTRATION)["world_from_model"]
-    written = Similarity.from_json(there)
+    written = Similarity.from_json(read_json(folder / REGISTRATION)["world_from_model"])
     if written.to_json() != world_from_model.to_json():
         labels = labels.transformed(world_from_model @ written.inverse())
     return labels, read_label_observations(folder / OBSERVATIONS)
 
 
-def together(parts: list[tuple[Labels, LabelObservations]]) -> tuple[Labels, LabelObservations]:
-    """One after the other, sorted by sequence and time."""
+def merge_labels(
+    parts: Sequence[tuple[Labels, LabelObservations]],
+) -> tuple[Labels, LabelObservations]:
+    """Concatenate labels with their observations and sort the frames by sequence and time."""
     labels = Labels.concatenate([part for part, _ in parts])
     first = np.cumsum([0, *(len(part) for part, _ in parts)])
     seen = LabelObservations(
@@ -199,4 +228,4 @@ def _read_camera(path: Path) -> Camera:
     try:
         return camera_from_json(read_json(path))
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: is no camera ({error})") from error
+        raise FormatError(f"{path}: is not a camera file ({error})") from error

@@ -1,4 +1,4 @@
-"""The folder cambridge/ of a split: a data set that programs for Cambridge Landmarks read as it is."""
+"""The folder cambridge/ of a split: a data set that programs for Cambridge Landmarks can read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spn_data.dataset.cambridge import NVM, TEST_LIST, TRAIN_LIST, VALIDATION_LI
 from spn_data.dataset.nvm import build_nvm_model, write_nvm
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import PinholeRenderer, undistorted_camera
-from spn_data.inputs.dataset_contents import GivenFrames
+from spn_data.inputs.dataset_contents import GroupedFrames
 from spn_data.labels.map_points import MapPoints
 from spn_data.split.audit import MIN_TRAINING_VIEWS
 from spn_data.split.groups import TRAIN, VALIDATION
@@ -20,21 +20,27 @@ from spn_data.storage.files import write_atomically
 _LISTS = {TRAIN: TRAIN_LIST, VALIDATION: VALIDATION_LIST}
 
 
-def list_of(group: str) -> str:
-    """The file that lists a group; all evaluation sequences, or the held-out test block, are in one."""
+def list_file(group: str) -> str:
+    """Return the list file of a group; evaluation sequences or the held-out test block share one."""
     return _LISTS.get(group, TEST_LIST)
 
 
 def image_name(frame: str) -> str:
-    """The image of a frame, as the lists name it."""
+    """Return the name of a frame's image in the lists."""
     return frame.removesuffix(".jpg") + ".png"
 
 
 class CambridgeFolder:
-    """Images are added one by one, the lists and the model at the end.
+    """Writer of the folder: images are added one by one, lists and model at the end.
 
-    Images are undistorted, of full size, their principal point in the middle, as the format has no
-    parameters for either. cameras : by key, of the full-size images.
+    Images are written in full size, undistorted and with a centred principal point, because the format has
+    no parameters for either.
+
+    Parameters
+    ----------
+    folder : Path
+    cameras : dict of str to Camera
+        Camera of each key, of the full-size images.
     """
 
     def __init__(self, folder: Path, cameras: dict[str, Camera]):
@@ -43,20 +49,28 @@ class CambridgeFolder:
         self._renderers: dict[str, PinholeRenderer] = {}
 
     def add_image(self, frame: str, key: str, image: np.ndarray) -> None:
-        """Write a frame's image (H, W, 3) BGR, unless an interrupted run has written it already."""
+        """Write a frame's image (H, W, 3) BGR, unless an interrupted run already wrote it."""
         path = self._folder / image_name(frame)
         if path.exists():
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         ok, data = cv2.imencode(".png", self._renderer(key).render(image))
         if not ok:
-            raise ValueError(f"{frame} can't be encoded as PNG")
+            raise ValueError(f"{frame} cannot be encoded as PNG")
         write_atomically(path, data.tobytes())
 
-    def finish(self, frames: GivenFrames, rows: np.ndarray, points: MapPoints) -> None:
-        """The lists, each sorted by sequence and time, and the model. rows : of frames with an image."""
+    def finish(self, frames: GroupedFrames, rows: np.ndarray, points: MapPoints) -> None:
+        """Write the lists, each sorted by sequence and time, and the model.
+
+        Parameters
+        ----------
+        frames : GroupedFrames
+        rows : ndarray, shape (K,), int
+            Rows of the frames whose images were added.
+        points : MapPoints
+        """
         names = [image_name(name) for name in frames.labels.names.tolist()]
-        files = np.array([list_of(name) for name in frames.group.tolist()])
+        files = np.array([list_file(name) for name in frames.group.tolist()])
         for file in (*_LISTS.values(), TEST_LIST):
             mine = rows[files[rows] == file]
             write_cambridge(
@@ -65,11 +79,11 @@ class CambridgeFolder:
         self._write_model(frames, rows, [names[k] for k in rows], points)
 
     def _write_model(
-        self, frames: GivenFrames, rows: np.ndarray, names: list[str], points: MapPoints
+        self, frames: GroupedFrames, rows: np.ndarray, names: list[str], points: MapPoints
     ) -> None:
-        """All images, for their focal lengths; of points only what training frames measured.
+        """Write all images, for their focal lengths, but only measurements of training frames.
 
-        A held-out frame's measurements would tell where it is.
+        The measurements of a held-out frame would reveal its pose.
         """
         images, ids, offsets, focal_px = [], [], [], []
         for image, row in enumerate(rows.tolist()):

@@ -1,4 +1,4 @@
-"""What dataset.h5 is given of an area: frames in a group, their points, their rendered images."""
+"""Contents of dataset.h5: frames with their group, map points and rendered images."""
 
 from __future__ import annotations
 
@@ -25,13 +25,23 @@ from spn_data.split.groups import LEFT_OUT, TRAIN, Split
 
 
 @dataclass(frozen=True, eq=False)
-class GivenFrames:
-    """N frames that are in a group, sorted by sequence and time.
+class GroupedFrames:
+    """N frames that belong to a group of the split, sorted by sequence and time.
 
-    group : (N,) str; strata : (N,) str, by the chosen training frames; empty for training frames and where
-    there are no metres. for_training : ids of the points that training frames are given.
-    split : of all frames. seen : of the parts of the area that the frames are from, which may be large and
-    are not copied; part, row : (N,) where each frame is in them.
+    Attributes
+    ----------
+    labels : Labels
+    group : ndarray, shape (N,), str
+    strata : ndarray, shape (N,), str
+        Coverage by the chosen training frames; empty for training frames and if the map is not in metres.
+    for_training : ndarray, int
+        Ids of the map points that training frames may use.
+    split : Split
+        Split of all frames of the area.
+    seen : tuple of LabelObservations
+        Observations of the parts of the area that the frames are from. They may be large and are not copied.
+    part, row : ndarray, shape (N,), int
+        Part of each frame, and its row in that part.
     """
 
     labels: Labels
@@ -44,15 +54,30 @@ class GivenFrames:
     row: np.ndarray
 
     def points_of(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """(ids (K,), pixels (K, 2)) that frame k is given; in training those that training frames made."""
+        """Return ids (K,) and pixels (K, 2) of the map points in frame k.
+
+        A training frame has only points that were reconstructed by training frames.
+        """
         ids, pixels = self.seen[self.part[k]].of_frame(int(self.row[k]))
         if self.group[k] == TRAIN:
-            given = np.isin(ids, self.for_training)
-            ids, pixels = ids[given], pixels[given]
+            allowed = np.isin(ids, self.for_training)
+            ids, pixels = ids[allowed], pixels[allowed]
         return ids, pixels
 
 
-def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
+def group_frames(labelled: LabelledArea, split: Split) -> GroupedFrames:
+    """Collect the frames of an area that are in a group of the split.
+
+    Parameters
+    ----------
+    labelled : LabelledArea
+    split : Split
+
+    Returns
+    -------
+    GroupedFrames
+        Without frames that the split leaves out.
+    """
     parts = labelled.parts()
     kept = [np.flatnonzero(split.groups_of(labels.names) != LEFT_OUT) for labels, _ in parts]
     labels = Labels.concatenate([p.select(rows) for (p, _), rows in zip(parts, kept, strict=True)])
@@ -64,7 +89,7 @@ def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
         others = group != TRAIN
         training = labels.poses[(group == TRAIN) & ~labels.tracked]
         strata[others] = coverage_strata(labels.poses[others], training)
-    return GivenFrames(
+    return GroupedFrames(
         labels,
         group,
         strata,
@@ -79,36 +104,56 @@ def given_frames(labelled: LabelledArea, split: Split) -> GivenFrames:
 def target_cameras(
     labelled: LabelledArea, labels: Labels, *, native: bool, width_px: int | None
 ) -> dict[str, Camera]:
-    """The pinhole that the images of each lens are rendered into, by camera key.
+    """Return the pinhole camera that images of each lens are rendered with.
 
-    One for all, fixed by the mapping cameras alone, so that an evaluation sequence changes nothing in what
-    is trained on; or each lens's own.
+    Parameters
+    ----------
+    labelled : LabelledArea
+    labels : Labels
+        Frames to render.
+    native : bool
+        Whether each lens keeps its own field of view. Otherwise, all share one camera, which depends on the
+        mapping cameras only, so that an evaluation sequence does not change the training images.
+    width_px : int or None
+        Image width; None: that of each lens if `native`, else the default of `RenderingOptions`.
+
+    Returns
+    -------
+    dict of str to Camera
+        Target camera by camera key.
     """
     keys = sorted(set(labels.cameras.tolist()))
     if native:
         own = {key: undistorted_camera(labelled.cameras[key]) for key in keys}
-        return {key: _of_width(camera, width_px) for key, camera in own.items()}
+        return {key: _resized(camera, width_px) for key, camera in own.items()}
     mapping = labelled.mapping
     mapped = sorted(set(mapping.cameras[mapping.registered].tolist()))
     rendering = RenderingOptions(width_px=width_px or RenderingOptions.width_px)
-    one = canonical_camera([labelled.cameras[key] for key in mapped], rendering)
-    return dict.fromkeys(keys, one)
+    shared = canonical_camera([labelled.cameras[key] for key in mapped], rendering)
+    return dict.fromkeys(keys, shared)
 
 
-def _of_width(camera: Camera, width_px: int | None) -> Camera:
+def _resized(camera: Camera, width_px: int | None) -> Camera:
     if width_px is None:
         return camera
     return camera.scaled(width_px, max(1, round(width_px * camera.height / camera.width)))
 
 
 class RenderedFrames:
-    """Frames as dataset.h5 takes them, one by one.
+    """Renderer of the frames of dataset.h5, one by one.
 
-    targets : the pinhole of each lens, by camera key; masks : folder of `<sequence>.png`, which may be empty.
+    Parameters
+    ----------
+    labelled : LabelledArea
+    frames : GroupedFrames
+    targets : dict of str to Camera
+        Target pinhole camera of each camera key.
+    masks : Path
+        Folder of `<sequence>.png`, which may be empty.
     """
 
     def __init__(
-        self, labelled: LabelledArea, frames: GivenFrames, targets: dict[str, Camera], masks: Path
+        self, labelled: LabelledArea, frames: GroupedFrames, targets: dict[str, Camera], masks: Path
     ):
         self._cameras, self._points = labelled.cameras, labelled.points
         self._frames = frames
@@ -118,7 +163,7 @@ class RenderedFrames:
         self._valid: dict[tuple[str, str], np.ndarray | None] = {}
 
     def frame(self, row: int, image: np.ndarray) -> DatasetFrame:
-        """A frame, from its full-size image (H, W, 3) BGR."""
+        """Return the frame in a row, rendered from its full-size image (H, W, 3) BGR."""
         labels, key = self._frames.labels, str(self._frames.labels.cameras[row])
         renderer = self._renderer(key)
         ids, pixels = self._frames.points_of(row)
@@ -146,7 +191,7 @@ class RenderedFrames:
         return self._renderers[key]
 
     def _valid_pixels(self, sequence: str, key: str) -> np.ndarray | None:
-        """(H, W) bool: inside the lens's image, and not masked out; None where all pixels are."""
+        """Return (H, W) bool, true inside the source image and its mask; None if all pixels are valid."""
         if (sequence, key) not in self._valid:
             renderer, path = self._renderer(key), self._masks / f"{sequence}.png"
             valid = None if renderer.all_valid else renderer.valid

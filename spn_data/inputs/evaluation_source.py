@@ -1,4 +1,4 @@
-"""What a sequence is registered from: its frames as images, telemetry, the lens to start from."""
+"""Source of an evaluation sequence: sampled frames, telemetry, and the initial camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
-from spn_data.inputs.flight_telemetry import telemetry_of
+from spn_data.inputs.flight_telemetry import source_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.source_fingerprints import fingerprints
@@ -28,9 +28,18 @@ from spn_data.work.timing import Progress
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
-    """frames : all candidates; track : telemetry, if any; start : lens to begin with, and whether its focal
-    length is known; notes : one sentence each.
+class SampledSequence:
+    """Frames sampled from a video or folder of photos.
+
+    Attributes
+    ----------
+    frames : Frames
+        All candidate frames; the sampled ones have status "chosen".
+    track : Telemetry or None
+    start : tuple of (Camera, bool)
+        Initial camera, and whether its focal length is known.
+    notes : list of str
+        One sentence each.
     """
 
     frames: Frames
@@ -40,42 +49,61 @@ class Taken:
 
 
 def find_source(area: Area, video: Path, name: str | None) -> Source:
-    """The one sequence of `video`, under its new name."""
+    """Find the one sequence in `video`, which becomes an evaluation sequence.
+
+    Parameters
+    ----------
+    area : Area
+    video : Path
+        A video, or a folder with the parts of one video or the photos of one flight.
+    name : str or None
+        Name of the sequence; None: the name of the source.
+
+    Returns
+    -------
+    Source
+
+    Raises
+    ------
+    InputError
+        If there are several sequences, the name is invalid or used by a mapping sequence or a group of the
+        split, or a file is part of the map.
+    """
     found = discover(video).sources
     if len(found) != 1:
         names = ", ".join(source.sequence for source in found[:6])
         raise InputError(
-            f"holds {len(found)} sequences ({names}); register them one at a time", path=video
+            f"contains {len(found)} sequences ({names}); register them one at a time", path=video
         )
     (source,) = found
     if name is not None and safe_name(name) != name:
         raise InputError(
-            f"{name!r} cannot name a folder; use letters, digits, dot, dash and underscore"
+            f"{name!r} is not a valid sequence name; use letters, digits, dot, dash and underscore"
         )
     source = replace(source, sequence=name or source.sequence)
     if source.sequence in GROUPS:
         raise InputError(
-            f"a sequence may not be called {source.sequence!r}: that is a group of the split; "
-            "give another one as --name"
+            f"a sequence may not be called {source.sequence!r}, which is a group of the split; "
+            "choose another --name"
         )
     record = area.record(FRAMES)
     mapped = {file.split("/", 1)[0] for file in record.inputs}
     if source.sequence.lower() in {sequence.lower() for sequence in mapped}:
         raise InputError(
-            f"{source.sequence} is the name of a mapping sequence; give another one as --name"
+            f"{source.sequence} is the name of a mapping sequence; choose another --name"
         )
-    prints = set(record.inputs.values())
-    for part, print_ in zip(
+    mapped_files = set(record.inputs.values())
+    for part, fingerprint in zip(
         source.parts, fingerprints((replace(source, telemetry=()),), {}).values(), strict=True
     ):
-        if print_ in prints:
+        if fingerprint in mapped_files:
             raise InputError(
-                "is part of the map: labels of it would be no independent test", path=part
+                "is part of the map, so its labels would not be an independent test", path=part
             )
     return source
 
 
-def take_frames(
+def sample_frames(
     folder: Path,
     source: Source,
     given: Camera | None,
@@ -84,8 +112,33 @@ def take_frames(
     rate_hz: float,
     fov_deg: float | None,
     any_telemetry: bool,
-) -> Taken:
-    """All candidate frames, those taken written as images; telemetry; the lens to start from."""
+) -> SampledSequence:
+    """Sample frames of a sequence and write them as images, with its telemetry and frame table.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the stage in progress.
+    source : Source
+    given : Camera or None
+        Calibrated camera, if known.
+    progress : Progress
+    rate_hz : float
+        Frames per second to sample from a video; all photos are used.
+    fov_deg : float or None
+        Horizontal field of view, if known.
+    any_telemetry : bool
+        Whether to accept telemetry whose duration does not match the video.
+
+    Returns
+    -------
+    SampledSequence
+
+    Raises
+    ------
+    InputError
+        If the frames have several cameras or focal lengths, or no image can be read.
+    """
     (folder / ".analysis").mkdir(exist_ok=True)
     expected = estimate_cost([source]).candidates
     candidates = analyse(
@@ -94,13 +147,15 @@ def take_frames(
         progress=lambda done: progress("analysis", done, max(done, expected)),
     )
     measured = candidates.measured
-    taken = _taken(measured.time_s, measured.readable, source, rate_hz)
-    status = np.where(taken, FrameStatus.CHOSEN.value, FrameStatus.SKIPPED.value)
+    sampled = _sampled(measured.time_s, measured.readable, source, rate_hz)
+    status = np.where(sampled, FrameStatus.CHOSEN.value, FrameStatus.SKIPPED.value)
     status[~measured.readable] = FrameStatus.UNREADABLE.value
-    reason = np.where(taken, "chosen: at the rate asked for", "skipped: between two that are taken")
+    reason = np.where(
+        sampled, "chosen: at the requested rate", "skipped: between two sampled frames"
+    )
     reason = np.where(measured.readable, reason, measured.problem)
     choice = FrameChoice(status, reason, np.full(len(status), np.nan))
-    track = telemetry_of(source, candidates, any_telemetry=any_telemetry)
+    track = source_telemetry(source, candidates, any_telemetry=any_telemetry)
     zoom = None if track is None else track.at(measured.time_s).zoom
     frames = build_frames(candidates, choice, focal=zoom)
     if track is not None:
@@ -109,12 +164,12 @@ def take_frames(
     keys = np.unique(frames.cameras[frames.chosen]).tolist()
     if len(keys) != 1:
         raise InputError(
-            f"is taken with {len(keys)} lenses or focal lengths: register each part by itself",
+            f"was taken with {len(keys)} lenses or focal lengths; register each part separately",
             path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
     starts = start_cameras(frames, candidates.photos, fov, {} if given is None else {"*": given})
-    # One lens, whatever the source calls it: its key is the sequence's name.
+    # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)
     extract_chosen(
@@ -124,7 +179,7 @@ def take_frames(
         progress=lambda done: progress("frames", done, int(frames.chosen.sum())),
     )
     start = starts[keys[0]]
-    return Taken(
+    return SampledSequence(
         frames,
         track,
         (camera_from_json(start), bool(start["focal_is_known"])),
@@ -132,13 +187,15 @@ def take_frames(
     )
 
 
-def _taken(time_s: np.ndarray, readable: np.ndarray, source: Source, rate_hz: float) -> np.ndarray:
-    """(N,) bool: all photos; of a video the first readable frame of each interval, whatever it shows."""
+def _sampled(
+    time_s: np.ndarray, readable: np.ndarray, source: Source, rate_hz: float
+) -> np.ndarray:
+    """Return (N,) bool: all readable photos, or the first readable frame of each interval of a video."""
     if source.kind is SourceKind.PHOTOS:
         return readable.copy()
     interval = np.floor(time_s * rate_hz + 1e-6).astype(np.int64)
     rows = np.flatnonzero(readable)
     _, first = np.unique(interval[rows], return_index=True)
-    taken = np.zeros(len(time_s), bool)
-    taken[rows[first]] = True
-    return taken
+    sampled = np.zeros(len(time_s), bool)
+    sampled[rows[first]] = True
+    return sampled

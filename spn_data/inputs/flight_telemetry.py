@@ -1,4 +1,4 @@
-"""Which telemetry belongs to a source, on the source's own clock."""
+"""Telemetry of a source, on the clock of the source."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
 
-# A subtitle file this much shorter or longer than its video is another flight's.
+# If the durations of a subtitle file and its video differ by more, they are of different flights.
 _LENGTH_TOLERANCE_S = 5.0
 _LENGTH_TOLERANCE = 0.1
 
 
 def check_telemetry(source: Source) -> None:
-    """Raises InputError where a file beside a video is not of its length: before hours go into the video."""
+    """Raise InputError if a subtitle file does not match its video in duration.
+
+    This is checked before hours are spent on the video.
+    """
     if source.kind is SourceKind.PHOTOS:
         return
     for part in source.parts:
@@ -31,22 +34,39 @@ def check_telemetry(source: Source) -> None:
                     _check_length(read_telemetry(path), duration_s, path.name)
 
 
-def telemetry_of(
+def source_telemetry(
     source: Source, candidates: Candidates, *, any_telemetry: bool = False
 ) -> Telemetry | None:
-    """Telemetry of a source: the file beside it, the subtitles inside it, or the photos' own; None without.
+    """Read the telemetry of a source.
 
-    Raises InputError where a file beside it can't be read, or is as long as no part of it.
+    Parameters
+    ----------
+    source : Source
+    candidates : Candidates
+        Measured frames of the source.
+    any_telemetry : bool
+        Whether to accept a subtitle file whose duration does not match the video.
+
+    Returns
+    -------
+    Telemetry or None
+        From the file next to each video part, else from its subtitle track; for photos from their metadata
+        or a log. None if there is none.
+
+    Raises
+    ------
+    InputError
+        If a telemetry file cannot be read, or its duration does not match the video.
     """
     if source.kind is SourceKind.PHOTOS:
-        return _of_photos(source, candidates)
+        return _photo_telemetry(source, candidates)
     parts = []
     for index, (part, start_s) in enumerate(
         zip(source.parts, candidates.part_start_s, strict=True)
     ):
         files = [t for t in source.telemetry if t.stem.lower() == part.stem.lower()]
         if len(files) > 1:
-            # The subtitle file is on the video's clock; a log is not.
+            # Prefer the subtitle file: it is on the clock of the video, a log is not.
             files.sort(key=lambda t: t.suffix.lower() != ".srt")
         info = probe(part)
         track = None
@@ -68,23 +88,25 @@ def _check_length(track: Telemetry, video_s: float, name: str) -> None:
     covered_s = float(track.time_s[-1] - track.time_s[0])
     if abs(covered_s - video_s) > max(_LENGTH_TOLERANCE_S, _LENGTH_TOLERANCE * video_s):
         raise InputError(
-            f"its telemetry lasts {covered_s:.0f} s, the video beside it {video_s:.0f} s: of another "
-            "flight? Remove it, or give --any-telemetry to use it all the same",
+            f"its telemetry lasts {covered_s:.0f} s, but the video lasts {video_s:.0f} s: it may belong to "
+            "another flight; remove it, or use --any-telemetry to accept it",
             path=name,
         )
 
 
 def _on_video_clock(track: Telemetry, info: VideoInfo) -> Telemetry:
-    """A log's records at the video's times, by the video's creation time where both know the hour."""
+    """Return a log on the clock of the video, by its creation time if both have absolute times."""
     if info.created_utc is None or not np.isfinite(track.utc_s).any():
-        note = "its clock is not the video's: it is taken to begin with the video's first frame"
+        note = (
+            "no common clock with the video; the log is assumed to start at the first video frame"
+        )
         return replace(track, notes=(*track.notes, note))
-    note = "its clock is tied to the video by the video's creation time"
+    note = "synchronised with the video by the creation time of the video"
     moved = replace(track, time_s=track.utc_s - info.created_utc.timestamp())
     return replace(moved.select(np.isfinite(moved.time_s)), notes=(*track.notes, note))
 
 
-def _of_photos(source: Source, candidates: Candidates) -> Telemetry | None:
+def _photo_telemetry(source: Source, candidates: Candidates) -> Telemetry | None:
     own = candidates.photo_telemetry
     if own is not None and own.has_fix.any():
         return own
@@ -99,12 +121,12 @@ def _of_photos(source: Source, candidates: Candidates) -> Telemetry | None:
 
 
 def unread_tracks(source: Source) -> list[str]:
-    """A sentence where a video without readable telemetry carries some of a kind that is not read."""
+    """Return a note if a video without readable telemetry has data tracks that are not supported."""
     if source.kind is SourceKind.PHOTOS:
         return []
     names = sorted({name for part in source.parts for name in probe(part).data_streams})
     return [
-        f"{source.sequence}: its data tracks ({', '.join(names)}) are not read: GoPro's GPMF and DJI's own "
-        "need to be converted to GPX or CSV first"
+        f"{source.sequence}: its data tracks ({', '.join(names)}) are not supported; "
+        "convert GoPro GPMF or DJI metadata to GPX or CSV"
         for _ in names[:1]
     ]

@@ -15,18 +15,38 @@ from spn_data.errors import InputError
 from spn_data.inputs.source_videos import find_videos
 from spn_data.labels.labels import Labels
 
-STORED = "frames"  # folder of the images of an evaluation sequence, inside its stage
+STORED = "frames"  # subfolder of the stage of an evaluation sequence, with its images
 
 
 def frame_images(
     area: Area, labels: Labels, *, video_folder: Path | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """(row, (H, W, 3) uint8 BGR) of every frame, once each, by sequence; one image in memory at a time.
+    """Iterate over the full-size images of frames, with one image in memory at a time.
 
-    Raises InputError for a file that can't be read, StageError where a video is not found.
+    Parameters
+    ----------
+    area : Area
+    labels : Labels
+        The frames.
+    video_folder : Path or None
+        Where to look first for the videos of tracked frames.
+
+    Yields
+    ------
+    row : int
+        Row of `labels`; each row once, sequence by sequence.
+    image : ndarray, shape (H, W, 3), uint8
+        BGR image.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    StageError
+        If a video is not found.
     """
     sequences = np.unique(labels.sequences).tolist()
-    videos = {  # all of them first: a missing one is told before any work
+    videos = {  # find all of them first, so that a missing one is reported before any work
         sequence: find_videos(area, sequence, video_folder)
         for sequence in sequences
         if labels.tracked[labels.sequences == sequence].any()
@@ -41,7 +61,7 @@ def frame_images(
 
 
 def image_path(area: Area, name: str, sequence: str) -> Path:
-    """File of a frame that was chosen."""
+    """Return the image file of a chosen frame."""
     if area.has(f"{EVALUATION}/{sequence}"):
         return area.folder(f"{EVALUATION}/{sequence}") / STORED / name
     return area.folder(FRAMES) / name
@@ -51,7 +71,7 @@ def _stored(area: Area, name: str, sequence: str) -> np.ndarray:
     path = image_path(area, name, sequence)
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InputError("is missing, or no image that can be decoded", path=path)
+        raise InputError("is missing or cannot be decoded as an image", path=path)
     return image
 
 
@@ -68,4 +88,4 @@ def _decoded(
             if frame.image is not None:
                 yield wanted.pop(frame.index), frame.image
         if wanted:
-            raise InputError(f"frame {min(wanted)} is not in it any more", path=part)
+            raise InputError(f"no longer contains frame {min(wanted)}", path=part)

@@ -1,4 +1,4 @@
-"""Labels of an evaluation flight against its own GNSS, which they were made without."""
+"""Comparison of the labels of an evaluation flight with its own GNSS fixes, which they do not use."""
 
 from __future__ import annotations
 
@@ -14,18 +14,32 @@ from spn_data.labels.labels import Labels
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FIXES = 5
-_CONTRADICTION = 3.0  # standard deviations of what GNSS and the map's place account for
+_CONTRADICTION = 3.0  # standard deviations of the offset, from GNSS and georegistration
 
 
 @dataclass(frozen=True, kw_only=True)
 class GnssCheck:
-    """Fix minus label, metres; an offset that all frames share is mostly GNSS's own, and the map's.
+    """Difference between fixes and labels, in metres.
 
-    fixes : frames with a label and a fix; time_offset_s : added to telemetry's times, 0 where the flight
-    cannot tell. offset_e_m, offset_n_m, offset_u_m : medians (None: no comparable height).
-    scatter_h_m, scatter_v_m : within which half of the frames lie about them; max_h_m : the largest.
-    sigma_h_m, sigma_v_m : of the offset, by the map's uncertainty and that of such fixes.
-    contradicts : whether the offset is more than three times that.
+    An offset common to all frames is mostly due to GNSS and georegistration.
+
+    Attributes
+    ----------
+    fixes : int
+        Number of frames with a label and a fix.
+    time_offset_s : float
+        Added to the times of the telemetry; 0 if the flight does not determine it.
+    offset_e_m, offset_n_m, offset_u_m : float
+        Median of fix minus label; `offset_u_m` is None if there is no comparable height.
+    scatter_h_m, scatter_v_m : float
+        Median distance of the frames from these medians; `scatter_v_m` may be None.
+    max_h_m : float
+        Largest horizontal distance.
+    sigma_h_m, sigma_v_m : float
+        Standard deviation of the offset, from the uncertainties of the map and of such fixes; `sigma_v_m`
+        may be None.
+    contradicts : bool
+        Whether the offset exceeds three times that.
     """
 
     fixes: int
@@ -42,31 +56,46 @@ class GnssCheck:
 
     @property
     def offset_h_m(self) -> float:
+        """Horizontal offset."""
         return float(np.hypot(self.offset_e_m, self.offset_n_m))
 
-    def tell(self) -> str:
+    def describe(self) -> str:
+        """Return a note for the user, with a warning if fixes and labels contradict each other."""
         vertical = (
             "; no height to compare"
             if self.offset_u_m is None
-            else f", {self.offset_u_m:+.2f} m vertically (half within {self.scatter_v_m:.2f} m)"
+            else f", vertically {self.offset_u_m:+.2f} m (half within {self.scatter_v_m:.2f} m)"
         )
         text = (
-            f"its own GNSS, not used, lies {self.offset_h_m:.2f} m beside the labels in the middle (half of "
-            f"{self.fixes} frames within {self.scatter_h_m:.2f} m of that)" + vertical
+            f"its own GNSS fixes (not used) differ from the labels by {self.offset_h_m:.2f} m horizontally "
+            f"(median; half of {self.fixes} frames within {self.scatter_h_m:.2f} m of it)"
+            + vertical
         )
         if self.contradicts:
             text += (
-                f". That is more than the map's place and GNSS account for ({self.sigma_h_m:.2f} m"
+                ". This exceeds the uncertainty of georegistration and GNSS "
+                f"({self.sigma_h_m:.2f} m horizontally"
                 + ("" if self.sigma_v_m is None else f", {self.sigma_v_m:.2f} m vertically")
-                + "; 1 sigma): the map, its lens or this one is wrong, or the heights count from elsewhere"
+                + "; 1 sigma): the map, a lens or the height reference is wrong"
             )
         return text
 
 
 def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | None:
-    """Compare registered frames with telemetry; None with fewer than five fixes among them.
+    """Compare registered frames with the fixes of their telemetry.
 
-    geo : how the map was put into the world.
+    Parameters
+    ----------
+    labels : Labels
+        Frames of one sequence, in the world frame.
+    track : Telemetry
+    geo : GeoFit
+        Georegistration of the map.
+
+    Returns
+    -------
+    GnssCheck or None
+        None if fewer than five registered frames have a fix.
     """
     origin = geo.origin
     registered = labels.select(labels.registered)
@@ -88,12 +117,12 @@ def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | Non
     horizontal = np.hypot(away[:, 0], away[:, 1])
     has_height = np.isfinite(height[known])
     vertical = difference[has_height, 2]
-    tells_height = len(vertical) >= _MIN_FIXES
-    offset_u = float(np.median(vertical)) if tells_height else None
-    of_kind = default_sigma_m(track.kind)
+    compares_height = len(vertical) >= _MIN_FIXES
+    offset_u = float(np.median(vertical)) if compares_height else None
+    fix_sigma = default_sigma_m(track.kind)
     # Fixes of one flight share their error: many are hardly better than one.
-    sigma_h = float(np.hypot(geo.uncertainty.horizontal_m, np.hypot(*of_kind[:2])))
-    sigma_v = float(np.hypot(geo.uncertainty.vertical_m, of_kind[2])) if tells_height else None
+    sigma_h = float(np.hypot(geo.uncertainty.horizontal_m, np.hypot(*fix_sigma[:2])))
+    sigma_v = float(np.hypot(geo.uncertainty.vertical_m, fix_sigma[2])) if compares_height else None
     too_far = float(np.hypot(*middle[:2])) > _CONTRADICTION * sigma_h
     if offset_u is not None and sigma_v is not None:
         too_far |= abs(offset_u) > _CONTRADICTION * sigma_v
@@ -115,7 +144,7 @@ def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | Non
 
 
 def _height(rows: Telemetry, origin: GeoOrigin) -> np.ndarray:
-    """(N,) heights that count from what the origin's does; NaN where none does."""
+    """Return (N,) heights with the height reference of the origin; NaN if there are none."""
     if origin.height_reference is HeightReference.TAKEOFF:
         return rows.rel_alt_m + origin.alt_m
     if origin.height_reference == rows.abs_reference:

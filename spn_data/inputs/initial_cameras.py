@@ -1,4 +1,4 @@
-"""Start intrinsics of the cameras of a source."""
+"""Initial intrinsics of the cameras of a source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spn_data.capture.photos import PhotoHeaders
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length, camera_to_json
 
-# Of the longer side: a 71-degree lens, as most drones carry; taken as unknown and estimated.
+# Focal length over the longer image side: 71 degrees, as most drones have. It is estimated in any case.
 _GUESSED_FOCAL_SHARE = 0.7
 
 
@@ -22,10 +22,30 @@ def start_cameras(
     fov_deg: Mapping[str, float],
     given: Mapping[str, Camera],
 ) -> dict[str, dict[str, Any]]:
-    """Each camera of one source, by key: the user's, by the photo's own metadata, or a guess.
+    """Return the initial intrinsics of each camera of one source: given, from photo metadata, or a guess.
 
-    What the user gives holds for the source's first camera: another zoom is another lens.
-    Raises InputError where a given camera is of another image shape.
+    What the user gives applies only to the first camera of the source, because another zoom is another lens.
+
+    Parameters
+    ----------
+    frames : Frames
+        Frames of the source.
+    photos : PhotoHeaders or None
+        Metadata of its photos.
+    fov_deg : mapping of str to float
+        Horizontal field of view by sequence; "*" for all.
+    given : mapping of str to Camera
+        Calibrated cameras by sequence; "*" for all.
+
+    Returns
+    -------
+    dict of str to dict
+        Camera as JSON by camera key, with "focal_is_known" and "source".
+
+    Raises
+    ------
+    InputError
+        If a given camera has another image shape than the frames.
     """
     cameras = {}
     sequence = str(frames.sequences[0])

@@ -1,4 +1,4 @@
-"""What the report shows of trained networks: metrics.json and figures of each run, read as hostile files."""
+"""Trained networks for the report: metrics.json and figures of each run, read as untrusted files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import finite_or_none
 
-_VERSION = 1  # of metrics.json
+_VERSION = 1  # format of metrics.json
 _MAX_BYTES = 20_000_000
 _MAX_FIGURE_BYTES = 3_000_000
-_MAX_FIGURES_BYTES = 12_000_000  # of all runs together
+_MAX_FIGURES_BYTES = 12_000_000  # in all runs
 _MAX_RUNS, _MAX_FIGURES = 50, 60
 _MAX_TEXT = 200
 _KINDS = ("trajectories", "histograms", "distance", "calibration")
@@ -27,7 +27,19 @@ _SVG = re.compile(rb'<svg [^<>]*?viewBox="0 0 (\d{1,5}) \d{1,5}"')
 
 
 def read_runs(area: Area) -> tuple[tuple[RunFacts, ...], tuple[str, ...]]:
-    """Runs with metrics.json, compared ones first, then by name; and why others cannot be shown."""
+    """Read the evaluated runs of an area.
+
+    Parameters
+    ----------
+    area : Area
+
+    Returns
+    -------
+    runs : tuple of RunFacts
+        Runs with metrics.json: comparisons of several networks first, then by name.
+    broken : tuple of str
+        Why other runs cannot be shown.
+    """
     folder = area.root / RUNS
     names = [n for n in area.sequences(RUNS) if (folder / n / METRICS).is_file()]
     names.sort(key=lambda name: (name != COMPARED, name))
@@ -56,7 +68,7 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
             raise ValueError(f"larger than {_MAX_BYTES // 1_000_000} MB")
         table = json.loads(path.read_text(encoding="utf-8"))
         if table["version"] != _VERSION:
-            raise ValueError(f"of format {table['version']!r}, this program reads {_VERSION}")
+            raise ValueError(f"format version {table['version']!r}, this program reads {_VERSION}")
         facts = table["facts"]
         figures, left_out = _figures(folder / FIGURES, budget)
         dataset = _text(facts["dataset"])
@@ -86,8 +98,8 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
                 (
                     _text(row["network"]),
                     _text(row["sequence"]),
-                    _known(row["position_m"]),
-                    _known(row["rotation_deg"]),
+                    _required(row["position_m"]),
+                    _required(row["rotation_deg"]),
                 )
                 for row in table["paper"]["table_1"][:100]
             ),
@@ -105,9 +117,9 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
 
 
 def _checkpoint(runs: Path, name: str) -> str:
-    """Fingerprint of a run's network as it is now; empty without one."""
+    """Return the fingerprint of the present network of a run; empty if there is none."""
     if safe_name(name) != name:
-        raise ValueError("a name that no run has")
+        raise ValueError("a network name that is not a run name")
     path = runs / name / CHECKPOINT
     return content_fingerprint(path) if path.is_file() else ""
 
@@ -131,12 +143,12 @@ def _errors(value: Mapping[str, Any]) -> MethodErrors:
     kinds = ("median", "mean", "p95")
     calibration = value["calibration"]
     return MethodErrors(
-        frames=int(_known(value["frames"])),
-        located=int(_known(value["located"])),
+        frames=int(_required(value["frames"])),
+        located=int(_required(value["located"])),
         position=tuple(_number(value["position"][kind]) for kind in kinds),
         rotation_deg=tuple(_number(value["rotation_deg"][kind]) for kind in kinds),
         within=tuple(
-            (_known(part["limit"]), _known(part["limit_deg"]), _known(part["share"]))
+            (_required(part["limit"]), _required(part["limit_deg"]), _required(part["share"]))
             for part in value["within"][:10]
         ),
         signed=tuple(
@@ -147,15 +159,15 @@ def _errors(value: Mapping[str, Any]) -> MethodErrors:
 
 
 def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:
-    """The figures of a folder, and how many are left out: too large, or nothing of ours."""
+    """Return the figures of a folder, and how many are left out: too large, or not of this program."""
     if not folder.is_dir() or folder.is_symlink():
         return (), 0
     found: list[Figure] = []
     left_out = 0
-    for path in sorted(folder.glob("*.svg"), key=_place):
-        is_ours = path.is_file() and not path.is_symlink()
-        size = path.stat().st_size if is_ours else 0
-        if not is_ours or size > min(_MAX_FIGURE_BYTES, budget) or len(found) >= _MAX_FIGURES:
+    for path in sorted(folder.glob("*.svg"), key=_reading_order):
+        is_regular = path.is_file() and not path.is_symlink()
+        size = path.stat().st_size if is_regular else 0
+        if not is_regular or size > min(_MAX_FIGURE_BYTES, budget) or len(found) >= _MAX_FIGURES:
             left_out += 1
             continue
         content = path.read_bytes()
@@ -170,34 +182,34 @@ def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:
     return tuple(found), left_out
 
 
-def _place(path: Path) -> tuple[bool, str, int, str]:
-    """The course of a training first, then group by group, in the order of reading."""
+def _reading_order(path: Path) -> tuple[bool, str, int, str]:
+    """Return a sort key: the training curve first, then the figures of each group."""
     group, _, what = path.stem.rpartition("-")
     return path.stem != "training", group, _KINDS.index(what) if what in _KINDS else 9, path.stem
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} where text belongs")
+        raise TypeError(f"{type(value).__name__} instead of text")
     return value[:_MAX_TEXT]
 
 
 def _number(value: Any) -> float | None:
-    """None for what is unknown."""
+    """Return a number, or None if it is unknown."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{type(value).__name__} where a number belongs")
+        raise TypeError(f"{type(value).__name__} instead of a number")
     return finite_or_none(value)
 
 
-def _known(value: Any) -> float:
-    found = _number(value)
-    if found is None:
-        raise ValueError("an unknown number where one is needed")
-    return found
+def _required(value: Any) -> float:
+    number = _number(value)
+    if number is None:
+        raise ValueError("a required number is missing")
+    return number
 
 
 def _count(value: Any) -> int | None:
-    found = _number(value)
-    return None if found is None else int(found)
+    number = _number(value)
+    return None if number is None else int(number)

@@ -1,4 +1,4 @@
-"""Fingerprints of the files that a stage is made from."""
+"""Fingerprints of the input files of a stage."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spn_data.storage.fingerprints import content_fingerprint
 
 
 def fingerprints(sources: tuple[Source, ...], masks: Mapping[str, Path]) -> dict[str, str]:
-    """Content fingerprint of every file of the sources, by sequence and name, and of their masks."""
+    """Return the content fingerprint of each source file, by sequence and name, and of each mask."""
     files = {
         f"{source.sequence}/{path.name}": content_fingerprint(path)
         for source in sources

@@ -1,4 +1,4 @@
-"""Where the video files of a sequence lie, long after it was registered or mapped."""
+"""Search for the video files of a sequence that was mapped or registered earlier."""
 
 from __future__ import annotations
 
@@ -12,10 +12,25 @@ from spn_data.storage.fingerprints import content_fingerprint
 
 
 def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[Path, ...]:
-    """The files of a sequence's video in the order of time, recognised by their content.
+    """Find the video files of a sequence, recognised by their content.
 
-    given : where to look besides the places that the area remembers. Raises StageError where the sequence
-    is not made of video, or its files are not found as they were.
+    Parameters
+    ----------
+    area : Area
+    sequence : str
+        A mapping or evaluation sequence.
+    given : Path or None
+        Where to look first; then in the sources recorded in the area.
+
+    Returns
+    -------
+    tuple of Path
+        Files in temporal order.
+
+    Raises
+    ------
+    StageError
+        If the sequence is not a video, or a file with the same content is not found.
     """
     stage = f"{EVALUATION}/{sequence}"
     record = area.record(stage if area.has(stage) else FRAMES)
@@ -25,9 +40,9 @@ def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[P
         if name.startswith(f"{sequence}/") and Path(name).suffix.lower() in VIDEO_SUFFIXES
     }
     if not wanted:
-        raise StageError(f"{area.root}: {sequence} is not made of video: it has no other frames")
-    remembered = area.facts.evaluation.get(sequence) if area.has(stage) else None
-    places = [remembered] if remembered is not None else list(area.facts.sources)
+        raise StageError(f"{area.root}: {sequence} is not a video, so it has no other frames")
+    recorded = area.facts.evaluation.get(sequence) if area.has(stage) else None
+    places = [recorded] if recorded is not None else list(area.facts.sources)
     folders = [*([given] if given is not None else []), *(area.root / place for place in places)]
     found: dict[str, Path] = {}
     for folder in folders:
@@ -36,16 +51,16 @@ def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[P
                 found.setdefault(part.name, part)
     missing = [name for name in wanted if name not in found]
     if missing:
-        looked = ", ".join(str(folder) for folder in folders) or "nowhere"
+        searched = ", ".join(str(folder) for folder in folders) or "no folder"
         raise StageError(
-            f"{missing[0]} of {sequence} is not found as it was (looked in {looked}); "
-            "give the place where it lies now as --video"
+            f"{missing[0]} of {sequence} was not found with its former content (searched {searched}); "
+            "give its folder with --video"
         )
     return tuple(found[name] for name in wanted)
 
 
 def _videos_in(folder: Path) -> list[Path]:
-    """None where there is no such folder any more, or nothing in it."""
+    """Return the videos in a folder; none if it no longer exists or has no video."""
     try:
         return [part for source in discover(folder).sources for part in source.parts]
     except InputError:

@@ -25,7 +25,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.nvm import read_nvm
 from spn_data.errors import FormatError, SpnError
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
-from spn_data.inputs.cambridge_contents import image_name, list_of
+from spn_data.inputs.cambridge_contents import image_name, list_file
 from spn_data.labels.labels import Labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.split.audit import (
@@ -171,7 +171,7 @@ def _check_cambridge(
     wanted: dict[str, PoseList] = {}
     for group, each in sorted(stored.items()):
         kept = each.select(np.flatnonzero(~tracked[group] | with_tracked))
-        file = list_of(group)
+        file = list_file(group)
         wanted[file] = kept if file not in wanted else wanted[file].appended(kept)
     model = read_nvm(folder / NVM)
     measured = [model.names[k] for k in np.unique(model.image_idx)]

@@ -25,7 +25,7 @@ from spn_data.exports.nerfstudio import IMAGE_FOLDER as NERFSTUDIO_IMAGES
 from spn_data.exports.nerfstudio import write_nerfstudio
 from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
-from spn_data.inputs.area_labels import LabelledArea, map_folder, read_labelled_area, together
+from spn_data.inputs.area_labels import LabelledArea, map_folder, merge_labels, read_labelled_area
 from spn_data.inputs.frame_images import image_path
 from spn_data.storage.files import replace_folder
 from spn_data.storage.json_files import VERSION, write_json
@@ -175,7 +175,7 @@ def chosen_frames(
             mask &= of_map | np.isin(labels.sequences, list(sequences))
         rows = np.flatnonzero(mask)
         kept.append((labels.select(rows), seen.select(rows)))
-    labels, seen = together(kept)
+    labels, seen = merge_labels(kept)
     if len(labels) == 0:
         raise StageError("no frame of " + (", ".join(sequences) or "the area") + " has a pose")
     return ExportedFrames(

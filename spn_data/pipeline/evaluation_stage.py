@@ -27,7 +27,7 @@ from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.inputs.area_labels import read_geo, read_world_from_model
-from spn_data.inputs.evaluation_source import find_source, take_frames
+from spn_data.inputs.evaluation_source import find_source, sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
@@ -102,7 +102,7 @@ def _register(
     before = {stage: map_hash(area.folder(stage)) for stage in (MODEL, GEO) if area.has(stage)}
     with stopwatch.step("frames"):
         check_telemetry(source)
-        taken = take_frames(
+        taken = sample_frames(
             work.path,
             source,
             given,
@@ -163,7 +163,7 @@ def _register(
     if labels.registered.any():
         notes += lens_remarks(solution.camera, _mapping_lenses(area))
     if gnss is not None:
-        notes.append(gnss.tell())
+        notes.append(gnss.describe())
     return work.finish(
         counts=_counts(labels, solution.camera, gnss),
         seconds=stopwatch.seconds,

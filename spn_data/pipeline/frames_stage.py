@@ -29,7 +29,7 @@ from spn_data.capture.video import probe
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.geometry.geodesy import metres_from_first_fix
-from spn_data.inputs.flight_telemetry import check_telemetry, telemetry_of, unread_tracks
+from spn_data.inputs.flight_telemetry import check_telemetry, source_telemetry, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.storage.fingerprints import content_fingerprint
@@ -190,7 +190,7 @@ def choose_frames(
     for source in found.sources:
         with stopwatch.step("analysis"):
             measured = _analyse(source, work.path / ".analysis", found.cost, progress)
-        track = telemetry_of(source, measured, any_telemetry=options.any_telemetry)
+        track = source_telemetry(source, measured, any_telemetry=options.any_telemetry)
         check_usable(measured.measured, options.selection, source.parts[0].name)
         tell(source.sequence, None if track is None else summarize(track))
         notes += measured.notes

@@ -19,9 +19,9 @@ from spn_data.geometry.camera import Camera
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.cambridge_contents import CambridgeFolder
 from spn_data.inputs.dataset_contents import (
-    GivenFrames,
+    GroupedFrames,
     RenderedFrames,
-    given_frames,
+    group_frames,
     target_cameras,
 )
 from spn_data.inputs.frame_images import frame_images
@@ -95,7 +95,7 @@ def _split(
             metric=labelled.units == "m",
         )
         write_split(work.path / SPLIT_FILE, split)
-        frames = given_frames(labelled, split)
+        frames = group_frames(labelled, split)
     with stopwatch.step("images"):
         targets = target_cameras(
             labelled, frames.labels, native=options.native, width_px=options.width_px
@@ -129,7 +129,7 @@ def _split(
 def _write_files(
     folder: Path,
     labelled: LabelledArea,
-    frames: GivenFrames,
+    frames: GroupedFrames,
     rendered: RenderedFrames,
     images: Iterator[tuple[int, np.ndarray]],
     info: DatasetInfo,

@@ -103,7 +103,7 @@ def test_telemetry_of_another_length_is_refused_before_the_video_is_measured(
     srt = copy_of_flight / "flight1.SRT"
     srt.write_text("\n\n".join(srt.read_text().split("\n\n")[:5]) + "\n\n")
     message = refused(copy_of_flight, "--area", tmp_path / "area")
-    assert "flight1.SRT: its telemetry lasts 2 s, the video beside it 9 s" in message
+    assert "flight1.SRT: its telemetry lasts 2 s, but the video lasts 9 s" in message
     assert not (tmp_path / "area").exists()
 
 

@@ -84,17 +84,17 @@ def test_a_shared_offset_is_told_apart_from_scatter() -> None:
     assert 0.01 < found.scatter_h_m < 0.2
     assert found.fixes == N
     assert not found.contradicts
-    assert "1.0" in found.tell()
-    assert "-0.5" in found.tell()
+    assert "1.0" in found.describe()
+    assert "-0.5" in found.describe()
 
 
 def test_an_offset_beyond_what_gnss_can_err_is_a_contradiction() -> None:
-    """Thirty metres beside, or thirty above."""
+    """Thirty metres horizontally or vertically."""
     geo = geo_fit(3)
     for offset in ((30.0, 0.0, 0.0), (0.0, 0.0, 30.0)):
         found = check(labelled(), track(geo, offset), geo)
         assert found.contradicts
-        assert "more than the map's place and GNSS account for" in found.tell()
+        assert "exceeds the uncertainty of georegistration and GNSS" in found.describe()
 
 
 def test_a_clock_that_is_behind_is_no_scatter() -> None:
@@ -112,7 +112,7 @@ def test_heights_that_count_from_elsewhere_are_not_compared() -> None:
     assert found.offset_u_m is None
     assert found.scatter_v_m is None
     assert not found.contradicts
-    assert "no height to compare" in found.tell()
+    assert "no height to compare" in found.describe()
 
 
 def test_too_few_labels_or_fixes_are_no_check() -> None:
