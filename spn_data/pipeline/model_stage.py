@@ -146,7 +146,7 @@ def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
     """A word where a focal length came out far from what it was said to be."""
     return [
         f"camera {change.camera}: the focal length came out at {change.estimated_px:.0f} px, "
-        f"{change.estimated_px / change.known_px - 1:+.0%} from the {change.known_px:.0f} px that were given. "
+        f"{change.estimated_px / change.known_px - 1:+.0%} from the known {change.known_px:.0f} px. "
         "A flight at one height that looks one way hardly determines it, and heights are off by as much; or "
         "the video is cropped. --camera settles it"
         for change in focal_changes(scene, frames, _FOCAL_SURPRISE)
