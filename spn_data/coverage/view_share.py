@@ -108,27 +108,23 @@ def view_shares(
     `max_turn_deg` and a distance within `max_range_factor` of the pose's own.
     """
     options = options or ViewShareOptions()
-    rotations = poses.rotations
     borders = {id(camera): _border(camera) for camera in cameras}
     shares = np.zeros(len(poses))
     for k, camera in enumerate(cameras):
-        shares[k] = _share(
-            poses.centers[k], rotations[k], camera, borders[id(camera)], seen, options
-        )
+        shares[k] = _share(poses[k : k + 1], camera, borders[id(camera)], seen, options)
         if progress is not None and (k % 100 == 99 or k == len(cameras) - 1):
             progress("view", k + 1, len(cameras))
     return shares
 
 
 def _share(
-    center: np.ndarray,
-    rotation: np.ndarray,
+    pose: Poses,
     camera: Camera,
     border: tuple[np.ndarray, np.ndarray],
     seen: SeenMap,
     options: ViewShareOptions,
 ) -> float:
-    points, x, y, ranges = _in_view(center, rotation, camera, border, seen)
+    points, x, y, ranges = _in_view(pose, camera, border, seen)
     count = options.columns * options.rows
     column = (x * (options.columns / camera.width)).astype(np.int64)
     row = (y * (options.rows / camera.height)).astype(np.int64)
@@ -140,7 +136,9 @@ def _share(
     is_first = rank_within_group(cells, count) < _FIRST
     for wanted in (is_first, ~is_first):
         part = np.flatnonzero(wanted & ~covered[cells])
-        covered[cells[part][_matchable(center, points[part], ranges[part], seen, options)]] = True
+        covered[
+            cells[part][_matchable(pose.centers[0], points[part], ranges[part], seen, options)]
+        ] = True
     return float(covered.mean())
 
 
@@ -158,17 +156,16 @@ def _border(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _in_view(
-    center: np.ndarray,
-    rotation: np.ndarray,
+    pose: Poses,
     camera: Camera,
     border: tuple[np.ndarray, np.ndarray],
     seen: SeenMap,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the points (K,) in the image, their pixels x and y (K,), and their distances (K,)."""
-    near = _inside((seen.block_center - center) @ rotation.T, border, seen.block_radius)
+    near = _inside(pose.to_camera(seen.block_center), border, seen.block_radius)
     points = (near[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
     points = points[points < len(seen.xyz)]
-    rays = (seen.xyz[points] - center) @ rotation.T
+    rays = pose.to_camera(seen.xyz[points])
     inside = _inside(rays, border, np.zeros(1))
     points, rays = points[inside], rays[inside]
     pixels = camera.project(rays)

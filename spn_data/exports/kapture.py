@@ -46,8 +46,8 @@ def write_kapture(folder: Path, frames: ExportedFrames) -> None:
                 f"{key}, camera, {camera.model}, {camera.width}, {camera.height}, {params}"
             )
             mine = rows[labels.cameras[rows] == key]
-            quats_xyzw, translations = labels.poses[mine].to_cam_from_world()
-            numbers = np.concatenate([np.roll(quats_xyzw, 1, axis=1), translations], axis=1)
+            _, translations = labels.poses[mine].to_cam_from_world()
+            numbers = np.concatenate([labels.poses[mine].quats_wxyz, translations], axis=1)
             for k, stamp in enumerate(timestamps_us(labels.time_s[mine])):
                 pose = ", ".join(repr(float(value)) for value in numbers[k])
                 trajectories.append(f"{stamp}, {sensor}, {pose}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
-from spn_data.geometry.pose import Poses, conjugate_quats
+from spn_data.geometry.pose import Poses, conjugate_quats, scalar_last
 from spn_data.storage.files import write_atomically
 
 
@@ -48,7 +48,7 @@ def tum_text(sequence: str, time_s: np.ndarray, poses: Poses, world: str) -> str
         "# timestamp (s since the sequence's first frame) tx ty tz qx qy qz qw",
     ]
     # Conjugates rotate camera axes to world axes.
-    quats_xyzw = np.roll(conjugate_quats(poses.quats_wxyz), -1, axis=1)
+    quats_xyzw = scalar_last(conjugate_quats(poses.quats_wxyz))
     for stamp, center, quat in zip(timestamps_us(time_s), poses.centers, quats_xyzw, strict=True):
         numbers = " ".join(f"{value:.9f}" for value in (*center, *quat))
         lines.append(f"{stamp / 1e6:.6f} {numbers}")

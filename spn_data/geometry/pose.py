@@ -76,6 +76,11 @@ def conjugate_quats(quats_wxyz: np.ndarray) -> np.ndarray:
     return np.asarray(quats_wxyz, dtype=np.float64) * [1, -1, -1, -1]
 
 
+def scalar_last(quats_wxyz: np.ndarray) -> np.ndarray:
+    """Reorder quaternions (N, 4) from w, x, y, z to x, y, z, w."""
+    return np.roll(quats_wxyz, -1, axis=-1)
+
+
 def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
     """Convert rotation matrices (N, 3, 3) to rotation vectors (N, 3) in radians, of length at most pi."""
     quats = quats_from_rotations(rotations)
@@ -158,6 +163,27 @@ def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
     return np.stack([np.rad2deg(heading) % 360.0, np.rad2deg(pitch), np.rad2deg(roll)], axis=-1)
 
 
+def to_camera(points: np.ndarray, centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Transform world points (M, 3) into camera frames.
+
+    Parameters
+    ----------
+    points : ndarray, shape (M, 3)
+        In the world frame.
+    centers, rotations : ndarray, shapes (3,) and (3, 3), or (M, 3) and (M, 3, 3)
+        Camera centres and cam_from_world rotations: one pose for all points, or one for each point.
+
+    Returns
+    -------
+    ndarray, shape (M, 3)
+        In camera axes: x right, y down, z forward; in the world's unit.
+    """
+    offsets = points - centers
+    if rotations.ndim == 2:
+        return np.asarray(offsets @ rotations.T)
+    return np.einsum("mij,mj->mi", rotations, offsets)
+
+
 @dataclass(frozen=True, eq=False)
 class Poses:
     """Camera poses of N frames, in the Cambridge convention.
@@ -217,28 +243,15 @@ class Poses:
     def to_cam_from_world(self) -> tuple[np.ndarray, np.ndarray]:
         """Return COLMAP's scalar-last quaternions (N, 4) and translations (N, 3)."""
         translations = -np.einsum("nij,nj->ni", self.rotations, self.centers)
-        return np.roll(self.quats_wxyz, -1, axis=-1), translations
+        return scalar_last(self.quats_wxyz), translations
 
     def to_camera(self, points: np.ndarray, index: int | np.ndarray = 0) -> np.ndarray:
-        """Transform world points (M, 3) into camera frames.
+        """Transform world points (M, 3) into camera frames: of one pose, or of one pose (M,) per point."""
+        return to_camera(points, self.centers[index], rotations_from_quats(self.quats_wxyz[index]))
 
-        Parameters
-        ----------
-        points : ndarray, shape (M, 3)
-            In the world frame.
-        index : int or ndarray, shape (M,), optional
-            The pose to use for all points, or one for each point.
-
-        Returns
-        -------
-        ndarray, shape (M, 3)
-            In camera axes: x right, y down, z forward; in the world's unit.
-        """
-        rotations = rotations_from_quats(self.quats_wxyz[index])
-        offsets = points - self.centers[index]
-        if rotations.ndim == 2:
-            return np.asarray(offsets @ rotations.T)
-        return np.einsum("mij,mj->mi", rotations, offsets)
+    def depths(self, points: np.ndarray, index: int = 0) -> np.ndarray:
+        """Return the depths (M,) of world points (M, 3) along the optical axis of one pose."""
+        return np.asarray((points - self.centers[index]) @ self.rotations[index][2])
 
     @property
     def rotations(self) -> np.ndarray:

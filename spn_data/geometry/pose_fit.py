@@ -8,7 +8,7 @@ import numpy as np
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import cauchy_weights, pose_jacobians, projection_jacobians
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
 
 _MAX_STEPS = 20
 _CONVERGED_PX = 1e-3  # mean change of the projections
@@ -74,7 +74,7 @@ def fit_pose(
     center, rotation = start.centers[0], start.rotations[0]
     scale = max(first_px, last_px)
     for _ in range(_MAX_STEPS):
-        in_camera = (xyz - center) @ rotation.T
+        in_camera = to_camera(xyz, center, rotation)
         ahead = in_camera[:, 2] > 0
         if np.count_nonzero(ahead) < 4:
             return None
@@ -98,5 +98,5 @@ def fit_pose(
     else:
         return None
     poses = Poses.from_rotations(center[None], rotation[None])
-    residuals = camera.project((xyz - center) @ rotation.T) - pixels
+    residuals = camera.project(to_camera(xyz, center, rotation)) - pixels
     return PoseFit(poses, np.nan_to_num(residuals, nan=_BEHIND_PX), inverse)

@@ -20,7 +20,7 @@ from spn_data.geometry.least_squares import (
     projection_jacobians,
     rows_to_sparse,
 )
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
 
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost
@@ -125,8 +125,7 @@ def linearize(
         state.own_points[observations.own] if len(state.own_points) else 0.0,
         observations.map_xyz,
     )
-    offset = places - state.poses.centers[observations.frame]
-    in_camera = np.einsum("mij,mj->mi", rotations, offset)
+    in_camera = to_camera(places, state.poses.centers[observations.frame], rotations)
     behind = in_camera[:, 2] <= 1e-6 * np.linalg.norm(in_camera, axis=1)
     safe = np.where(behind[:, None], np.array([0.0, 0.0, 1.0]), in_camera)
     residuals = state.camera.project(safe) - observations.pixels

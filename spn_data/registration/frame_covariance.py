@@ -128,8 +128,7 @@ def _frame_covariance(
     np.add.at(together, where, by_points)
     by_lens = None
     if lens.camera_id is not None:
-        in_camera = (frame.xyz - pose.centers[0]) @ pose.rotations[0].T
-        full = projection_jacobians(camera, in_camera)[1]
+        full = projection_jacobians(camera, pose.to_camera(frame.xyz))[1]
         by_lens = inverse @ np.einsum("mia,mil->al", weighted, full)
         assert by_lens.shape == (POSE, LENS)
     elif lens.covariance is not None and len(lens.covariance):

@@ -206,6 +206,5 @@ def reprojection_errors(
     pose: Poses, camera: Camera, points: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
     """Return reprojection errors (M,) in pixels; infinite behind the camera."""
-    in_camera = (points - pose.centers[0]) @ pose.rotations[0].T
-    error_px = np.linalg.norm(camera.project(in_camera) - pixels, axis=1)
+    error_px = np.linalg.norm(camera.project(pose.to_camera(points)) - pixels, axis=1)
     return np.where(np.isfinite(error_px), error_px, np.inf)

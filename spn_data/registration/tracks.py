@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses
+from spn_data.geometry.pose import Poses, to_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def triangulate(
     spread = np.zeros(count)
     away = np.arccos(np.clip((directions * mean[track]).sum(axis=1), -1, 1))
     np.maximum.at(spread, track, np.rad2deg(away))
-    in_camera = np.einsum("mij,mj->mi", rotations, points[track] - centers)
+    in_camera = to_camera(points[track], centers, rotations)
     error = np.linalg.norm(camera.project(in_camera) - pixels, axis=1)
     worst = np.zeros(count)
     np.maximum.at(worst, track, np.where(np.isfinite(error), error, np.inf))

@@ -20,6 +20,7 @@ from spn_data.geometry.least_squares import (
     projection_jacobians,
     rows_to_sparse,
 )
+from spn_data.geometry.pose import to_camera
 
 GAUGE = 7  # dimension of the gauge: a similarity changes no residual
 
@@ -133,8 +134,8 @@ def linearize_bundle(
     frame = seen.image_idx[rows]
     points, point = np.unique(seen.point_idx[rows], return_inverse=True)
     rotations = scene.poses.rotations[frame]
-    offsets = scene.points[points[point]] - scene.poses.centers[frame]
-    points_cam = np.einsum("mij,mj->mi", rotations, offsets)
+    xyz, centers = scene.points[points[point]], scene.poses.centers[frame]
+    points_cam = to_camera(xyz, centers, rotations)
     ids = scene.camera_ids[frame]
     width = max(len(columns) for columns in unknowns.lens_columns.values())
     by_cam = np.empty((len(rows), 2, 3))
@@ -154,6 +155,7 @@ def linearize_bundle(
     whitened = by_point @ np.swapaxes(whitening, 1, 2)[point]
     by_points = rows_to_sparse(whitened, 3 * point[:, None] + np.arange(3), 3 * len(points))
     residuals = seen.residuals_px[rows].ravel()
+    offsets = xyz - centers
     distance = np.linalg.norm(offsets, axis=1, keepdims=True)
     return LinearizedBundle(
         points,

@@ -145,7 +145,7 @@ def surface(
     width, height = size
     columns, rows = width // options.step_px, height // options.step_px
     inverse = np.full(rows * columns, np.nan)
-    depth = (points.xyz - pose.centers[0]) @ pose.rotations[0][2]
+    depth = pose.depths(points.xyz)
     ahead = depth > 0
     corners, values = points.pixels[ahead].astype(np.float64), 1 / depth[ahead]
     try:

@@ -79,7 +79,7 @@ def visible_points(
     xyz, seen = np.zeros((len(rows), count, 3)), np.zeros((len(rows), count), bool)
     for k, row in enumerate(rows):
         points = data.points(int(row)).xyz
-        in_camera = (points - poses.centers[k]) @ poses.rotations[k].T
+        in_camera = poses.to_camera(points, k)
         with np.errstate(divide="ignore", invalid="ignore"):
             homogeneous = in_camera @ data.intrinsics[row].T
             pixels = homogeneous[:, :2] / homogeneous[:, 2:]

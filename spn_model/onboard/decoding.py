@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
 
 # Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
 # few pixels still converges.
@@ -135,7 +135,7 @@ def decode(
     center, rotation = _first_pose(xyz, at, matrix, options)
     focal_px = np.sqrt(matrix[0, 0] * matrix[1, 1])
     for width in options.robust * np.array(_ROBUST_SCALES):
-        in_camera = (xyz - center) @ rotation.T
+        in_camera = to_camera(xyz, center, rotation)
         ahead = in_camera[:, 2] > 0
         x = in_camera[ahead]
         if len(x) < options.min_inliers:

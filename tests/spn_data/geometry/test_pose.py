@@ -124,6 +124,23 @@ def test_poses_agree_with_pycolmap_s_projection_center():
     assert back_translations == pytest.approx(translations, abs=1e-12)
 
 
+def test_points_in_camera_axes_agree_with_pycolmap():
+    """With one pose for all points, with one pose per point, and for depths alone."""
+    rng = np.random.default_rng(5)
+    poses = Poses(rng.standard_normal((4, 3)), _random_quats(4, 6))
+    points, index = rng.standard_normal((9, 3)), rng.integers(0, 4, 9)
+    quats_xyzw, translations = poses.to_cam_from_world()
+    rigid = [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(q), t)
+        for q, t in zip(quats_xyzw, translations, strict=True)
+    ]
+    expected = np.array([[r * point for point in points] for r in rigid])
+    for k in range(4):
+        assert poses.to_camera(points, k) == pytest.approx(expected[k], abs=1e-12)
+        assert poses.depths(points, k) == pytest.approx(expected[k, :, 2], abs=1e-12)
+    assert poses.to_camera(points, index) == pytest.approx(expected[index, range(9)], abs=1e-12)
+
+
 def test_poses_can_be_picked_and_walked():
     """Poses have a length and support masks, slices and iteration."""
     poses = Poses(np.arange(12.0).reshape(4, 3), _random_quats(4))
