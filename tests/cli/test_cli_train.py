@@ -213,6 +213,6 @@ def test_options_are_documented_with_their_defaults():
 def test_columns_of_the_log_are_documented():
     """docs/training.md names every column of log.csv and no other."""
     page = Path(__file__).resolve().parents[2] / "docs" / "training.md"
-    part = page.read_text().split("Columns of `log.csv`")[1].split("Judged are")[0]
+    part = page.read_text().split("Columns of `log.csv`")[1].split("## Recipes")[0]
     cells = "".join(re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE))
     assert sorted(re.findall(r"`(\w+)`", cells)) == sorted(COLUMNS)
