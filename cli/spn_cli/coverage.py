@@ -90,7 +90,7 @@ def coverage(
     from spn_data.coverage.nearest_frame import Stratum
     from spn_data.coverage.refly import ReflyOptions
     from spn_data.geometry.camera_file import read_camera
-    from spn_data.pipeline.area_coverage import CoverageStageOptions, check_new, cover_area
+    from spn_data.pipeline.area_coverage import CoverageStageOptions, check_output_file, cover_area
     from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):
@@ -106,7 +106,7 @@ def coverage(
         fov_deg=fov_deg,
     )
     if fly_again is not None:
-        check_new(fly_again, overwrite=overwrite)
+        check_output_file(fly_again, overwrite=overwrite)
     area = options.open_area(area_folder)
     with area.locked():
         with console.progress() as progress:

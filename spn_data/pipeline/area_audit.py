@@ -1,4 +1,4 @@
-"""The evidence for an audit, gathered from the area; audit.json."""
+"""Audit of a split, with evidence from the area; audit.json."""
 
 from __future__ import annotations
 
@@ -57,7 +57,21 @@ from spn_data.storage.json_files import VERSION, read_json, write_json
 
 
 def audit(area: Area) -> tuple[AuditFinding, ...]:
-    """Check the area's split as it lies on the disk. Raises StageError where there is none."""
+    """Check the split of an area as stored on disk.
+
+    Parameters
+    ----------
+    area : Area
+
+    Returns
+    -------
+    tuple of AuditFinding
+
+    Raises
+    ------
+    StageError
+        If there is no split, or a stage is stale.
+    """
     area.record(SPLIT)
     return (
         check_up_to_date(area.stale_because(SPLIT)),
@@ -66,7 +80,7 @@ def audit(area: Area) -> tuple[AuditFinding, ...]:
 
 
 def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[AuditFinding, ...]:
-    """Check a split in a folder against the area's labels."""
+    """Check a split in a folder against the labels of the area."""
     split = read_split(folder / SPLIT_FILE)
     parts = {"mapping": labelled.mapping, "tracked": labelled.tracked, **labelled.evaluation}
     covered = check_completeness(parts, split)
@@ -78,9 +92,7 @@ def audit_folder(area: Area, labelled: LabelledArea, folder: Path) -> tuple[Audi
         covered,
         check_test_independence(split),
     ]
-    if (
-        covered.verdict is AuditVerdict.FAIL
-    ):  # groups of frames that it does not know cannot be judged
+    if covered.verdict is AuditVerdict.FAIL:  # frames without a group cannot be checked further
         return tuple(findings)
     flights = Labels.concatenate([labelled.mapping, labelled.tracked])
     flights = flights.select(flights.registered)
@@ -104,7 +116,7 @@ def _check_not_in_map(area: Area, labelled: LabelledArea) -> AuditFinding:
 
 
 def _check_duplicates(labelled: LabelledArea) -> list[AuditFinding]:
-    """Only where lengths are metres and there is something to compare."""
+    """Compare mapping and evaluation frames, if the map is in metres and there are both."""
     if labelled.units != "m" or not labelled.evaluation:
         return []
     mapping = Labels.concatenate([labelled.mapping, labelled.tracked])
@@ -112,7 +124,7 @@ def _check_duplicates(labelled: LabelledArea) -> list[AuditFinding]:
 
 
 def _sources(area: Area, stage: str) -> dict[str, str]:
-    """Content fingerprint of each file that a stage was made from; a mask may serve several."""
+    """Return the content fingerprint of each source file of a stage; masks may be shared by several."""
     inputs = area.record(stage).inputs
     return {name: value for name, value in inputs.items() if not name.endswith("/mask")}
 
@@ -129,10 +141,10 @@ def _check_files(
             }
             tracked = {name: group.tracked for name, group in dataset.groups.items()}
             marks = {name: g.points_for_training for name, g in dataset.groups.items()}
-            given = _point_ids(dataset)
+            point_ids = _point_ids(dataset)
         findings = [
             check_dataset(lists, parts, split),
-            check_training_points(given, labelled.mapping, labelled.mapping_seen, split),
+            check_training_points(point_ids, labelled.mapping, labelled.mapping_seen, split),
             check_training_marks(marks),
         ]
         if (folder / CAMBRIDGE).is_dir():
@@ -147,7 +159,7 @@ def _check_files(
 
 
 def _point_ids(dataset: Dataset) -> np.ndarray:
-    """Ids of all points that the training group gives."""
+    """Return the ids of all map points in the training group."""
     if TRAIN not in dataset.groups:
         return np.zeros(0, np.int64)
     group = dataset.groups[TRAIN]
@@ -158,10 +170,10 @@ def _point_ids(dataset: Dataset) -> np.ndarray:
 def _check_cambridge(
     folder: Path, stored: dict[str, PoseList], tracked: dict[str, np.ndarray], split: Split
 ) -> list[AuditFinding]:
-    """Lists hold every chosen frame of the data set; tracked ones are in all lists or in none."""
+    """Check that the lists contain all chosen frames of the data set, and all tracked frames or none."""
     files = sorted(path.name for path in folder.glob("dataset_*.txt"))
     lists = {file: read_cambridge(folder / file) for file in files}
-    found = {file: PoseList(each.names, each.poses) for file, each in lists.items()}
+    listed = {file: PoseList(each.names, each.poses) for file, each in lists.items()}
     known = {name for each in lists.values() for name in each.names}
     with_tracked = any(
         image_name(name) in known
@@ -175,31 +187,33 @@ def _check_cambridge(
         wanted[file] = kept if file not in wanted else wanted[file].appended(kept)
     model = read_nvm(folder / NVM)
     measured = [model.names[k] for k in np.unique(model.image_idx)]
-    return [check_cambridge(found, wanted), check_nvm_measurements(measured, split)]
+    return [check_cambridge(listed, wanted), check_nvm_measurements(measured, split)]
 
 
 def _check_map_unchanged(area: Area) -> AuditFinding:
-    """Each sequence's stage noted the map's hash before and after it was registered."""
-    at: dict[str, MapHashes] = {}
+    """Compare the map with its hashes recorded before and after each sequence was registered."""
+    hashes: dict[str, MapHashes] = {}
     for group in (EVALUATION, TRACKED):
         for name in area.sequences(group):
             path = area.folder(f"{group}/{name}") / REGISTRATION
-            noted = read_json(path)
+            recorded = read_json(path)
             try:
-                at[f"{group}/{name}"] = MapHashes(str(noted["map_before"]), str(noted["map_after"]))
+                hashes[f"{group}/{name}"] = MapHashes(
+                    str(recorded["map_before"]), str(recorded["map_after"])
+                )
             except KeyError as error:
                 raise FormatError(f"{path}: does not state {error}") from error
-    return check_map_unchanged(map_hash(area.folder(MODEL)), at)
+    return check_map_unchanged(map_hash(area.folder(MODEL)), hashes)
 
 
 def write_audit(path: Path, findings: tuple[AuditFinding, ...]) -> None:
-    """audit.json: findings in the order in which they were checked."""
+    """Write audit.json, with the findings in the order of the checks."""
     table = [{**asdict(f), "verdict": f.verdict.value} for f in findings]
     write_json(path, {"version": VERSION, "findings": table})
 
 
 def read_audit(path: Path) -> tuple[AuditFinding, ...]:
-    """Raises FormatError where it is not what `write_audit` writes."""
+    """Read audit.json; raise FormatError if it is not what `write_audit` writes."""
     table = read_json(path)
     try:
         return tuple(
@@ -212,4 +226,4 @@ def read_audit(path: Path) -> tuple[AuditFinding, ...]:
             for f in table["findings"]
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: is no audit of this program ({error!r})") from error
+        raise FormatError(f"{path}: is not an audit written by this program ({error!r})") from error

@@ -1,4 +1,4 @@
-"""Coverage of an area's evaluation sequences, or of planned waypoints, and where to fly again."""
+"""Coverage of evaluation sequences or planned waypoints, and a plan for another mapping flight."""
 
 from __future__ import annotations
 
@@ -34,28 +34,52 @@ from spn_data.pipeline.geo_stage import recorded_options
 from spn_data.storage.json_files import VERSION, finite, read_json, write_json
 from spn_data.work.timing import Progress
 
-WAYPOINTS = "waypoints"  # name of the plan, as of a sequence
+WAYPOINTS = "waypoints"  # name of the plan, in place of the name of a sequence
 _FILE = "coverage.json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageStageOptions:
-    """Of what, and by which measure."""
+    """Options of the coverage stage.
 
-    # None: the default strata, or none where the map has no metres.
+    Attributes
+    ----------
+    coverage : CoverageOptions or None
+        Limits of the strata. None: the defaults, or no strata if the map is not in metres.
+    refly : ReflyOptions
+        Options of the plan for another flight.
+    camera : Camera or None
+        Camera of waypoints that name none; None: the one with most mapping frames.
+    fov_deg : float or None
+        Instead of `camera`: horizontal field of view, with the image size of that camera.
+    """
+
     coverage: CoverageOptions | None = None
     refly: ReflyOptions = field(default_factory=ReflyOptions)
-    camera: Camera | None = None  # of waypoints that name none; None: the one that mapped most
-    fov_deg: float | None = None  # or that one's image with this horizontal field of view
+    camera: Camera | None = None
+    fov_deg: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class AreaCoverage:
-    """What was found. folder : where it was written.
+    """Result of the coverage stage.
 
-    units : "m" or "model". options : None where there are no strata. by_name : of each sequence, or of the
-    plan. fly_again : over all of them together; None where the map has no metres or no up. stops : cells
-    of its CSV by column. notes : sentences for the user.
+    Attributes
+    ----------
+    folder : Path
+        Where it was written.
+    units : str
+        "m" or "model".
+    options : CoverageOptions or None
+        None if there are no strata.
+    by_name : dict of str to Coverage
+        Coverage of each sequence, or of the plan.
+    fly_again : ReflightPlan or None
+        One plan for all of them; None if scale or up direction of the map are unknown.
+    stops : dict of str to list of str
+        Cells of the CSV of the plan, by column.
+    notes : tuple of str
+        Sentences for the user.
     """
 
     folder: Path
@@ -74,13 +98,31 @@ def cover_area(
     *,
     waypoints: Path | None = None,
 ) -> AreaCoverage:
-    """Coverage of every evaluation sequence, or of the waypoints in a file instead; written to the area.
+    """Assess the coverage of all evaluation sequences, or of waypoints, and write it to the area.
 
-    What an earlier run wrote there is replaced. Raises StageError where there is nothing to cover, or
-    where waypoints meet a map that has no East, North and Up.
+    The result of an earlier run is replaced.
+
+    Parameters
+    ----------
+    area : Area
+    options : CoverageStageOptions
+    progress : Progress
+    waypoints : Path or None
+        CSV file of planned waypoints, to assess instead of the evaluation sequences.
+
+    Returns
+    -------
+    AreaCoverage
+
+    Raises
+    ------
+    StageError
+        If no evaluation sequence is registered, or waypoints are given but the map is not georegistered.
+    InputError
+        If the waypoints are invalid or name an unknown camera.
     """
     labelled = read_labelled_area(area)
-    place = _place(area, labelled)
+    frame = _waypoint_frame(area, labelled)
     if waypoints is None:
         folder = area.folder(COVERAGE)
         queries = {
@@ -88,21 +130,20 @@ def cover_area(
         }
         if not queries:
             raise StageError(
-                f"{area.root}: no evaluation sequence is registered; "
-                "spn-data register VIDEO --name NAME adds one, --waypoints FILE.csv takes a plan instead"
+                f"{area.root}: no evaluation sequence is registered; add one with spn-data register VIDEO "
+                "--name NAME, or assess a plan with --waypoints FILE.csv"
             )
     else:
         folder = area.folder(PLANNED_COVERAGE)
-        if place is None:
+        if frame is None:
             raise StageError(
-                f"{area.root}: the map has no East, North and Up, which waypoints are stated in; "
-                "it needs telemetry: spn-data georegister"
+                f"{area.root}: --waypoints needs a georegistered map; run spn-data georegister first"
             )
-        plan = read_waypoints(waypoints, place)
-        queries = {WAYPOINTS: _planned(plan, labelled, options, waypoints)}
-    found = _measured(labelled, queries, place, options, folder, progress)
-    _write(area, found, options, str(waypoints.name) if waypoints else "")
-    return found
+        plan = read_waypoints(waypoints, frame)
+        queries = {WAYPOINTS: _waypoint_queries(plan, labelled, options, waypoints)}
+    result = _assess(labelled, queries, frame, options, folder, progress)
+    _write(area, result, options, str(waypoints.name) if waypoints else "")
+    return result
 
 
 def compute_coverage(
@@ -140,34 +181,34 @@ def compute_coverage(
     is_metric = labelled.units == "m"
     limits = options or (CoverageOptions() if is_metric else None)
     queries = _queries_of(labelled.evaluation[name], labelled)
-    return assess_coverage(queries, _mapping(labelled, has_up=is_metric), limits, progress)
+    return assess_coverage(queries, _mapping_frames(labelled, has_up=is_metric), limits, progress)
 
 
-def check_new(path: Path, *, overwrite: bool) -> None:
-    """Raises InputError where a file can't be made, or would be replaced without being asked to."""
+def check_output_file(path: Path, *, overwrite: bool) -> None:
+    """Raise InputError if a CSV file cannot be created, or exists and `overwrite` is false."""
     if path.suffix.lower() != ".csv" or path.is_dir():
-        raise InputError("is not the name of a CSV file: it ends in .csv", path=path)
+        raise InputError("is not the name of a CSV file; it must end in .csv", path=path)
     if any((parent / "stage.json").exists() for parent in path.resolve().parents):
-        raise InputError("lies in a stage of an area; name a file elsewhere", path=path)
+        raise InputError("is inside a stage of an area; choose another folder", path=path)
     if path.exists() and not overwrite:
-        raise InputError("exists already; --overwrite replaces it", path=path)
+        raise InputError("already exists; use --overwrite to replace it", path=path)
     if not path.parent.is_dir():
         raise InputError("its folder does not exist", path=path)
 
 
 def read_coverage(area: Area, folder: str = COVERAGE) -> dict[str, Any] | None:
-    """What coverage.json holds (docs/coverage.md); None where coverage was not asked for yet."""
+    """Read coverage.json (docs/coverage.md); None if coverage was not assessed yet."""
     path = area.folder(folder) / _FILE
     if not path.exists():
         return None
     value: dict[str, Any] = read_json(path)
     if not value.keys() >= {"sequences", "made_of", "fly_again", "units", "options"}:
-        raise FormatError(f"{path}: is no coverage of this program")
+        raise FormatError(f"{path}: is not a coverage file written by this program")
     return value
 
 
 def stale_because(area: Area, coverage: Mapping[str, Any]) -> str | None:
-    """Why what `read_coverage` gave no longer fits the area, or None."""
+    """Return why the result of `read_coverage` is out of date, or None."""
     before = dict(coverage["made_of"])
     now = _fingerprints(area, of_plan=bool(coverage.get("waypoints")))
     for stage in sorted({*before, *now}):
@@ -180,25 +221,25 @@ def stale_because(area: Area, coverage: Mapping[str, Any]) -> str | None:
     return None
 
 
-def _measured(
+def _assess(
     labelled: LabelledArea,
     queries: Mapping[str, Queries],
-    place: WaypointFrame | None,
+    frame: WaypointFrame | None,
     options: CoverageStageOptions,
     folder: Path,
     progress: Progress,
 ) -> AreaCoverage:
     is_metric = labelled.units == "m"
     chosen = options.coverage or (CoverageOptions() if is_metric else None)
-    mapping = _mapping(labelled, has_up=is_metric)
+    mapping = _mapping_frames(labelled, has_up=is_metric)
     by_name = {
         name: assess_coverage(each, mapping, chosen, progress) for name, each in queries.items()
     }
     fly_again, stops = None, {}
-    if place is not None and chosen is not None:
-        poses, strata = _together(by_name)
+    if frame is not None and chosen is not None:
+        poses, strata = _known_poses(by_name)
         fly_again = plan_reflight(poses, strata, chosen, options.refly)
-        stops = waypoint_columns(fly_again.poses.centers, fly_again.angles_deg, place)
+        stops = waypoint_columns(fly_again.poses.centers, fly_again.angles_deg, frame)
         numbers = {"stop": [str(k + 1) for k in range(len(fly_again))]}
         stops = {**numbers, **stops, "serves": [str(n) for n in fly_again.serves]}
     notes = tuple(
@@ -206,21 +247,21 @@ def _measured(
     )
     if not is_metric:
         notes = (
-            "The map is in units of the model: lengths are no metres, no axis points up"
-            + ("." if options.coverage else ", and there are no strata."),
+            "The map is not georegistered: lengths are in units of the model and up is unknown"
+            + ("." if options.coverage else "; there are no strata."),
             *notes,
         )
     return AreaCoverage(folder, labelled.units, chosen, by_name, fly_again, stops, notes)
 
 
-def _mapping(labelled: LabelledArea, *, has_up: bool) -> MappingFrames:
-    """The chosen frames of the mapping flights that have a pose, and what they saw.
+def _mapping_frames(labelled: LabelledArea, *, has_up: bool) -> MappingFrames:
+    """Return the registered chosen frames of the mapping flights, and the map points they see.
 
-    Their tracked frames are left out: whether poses were computed for those changes nothing in the flight.
+    Tracked frames are left out: computing poses for them does not change what was flown.
     """
     labels, seen = labelled.mapping, labelled.mapping_seen
     known = np.flatnonzero(labels.registered)
-    centers = labels.poses.centers  # NaN where there is no pose: such a sighting does not count
+    centers = labels.poses.centers  # NaN without a pose: such an observation does not count
     rows = labelled.points.rows_of(seen.point_ids)
     return MappingFrames(
         labels.names[known],
@@ -239,37 +280,37 @@ def _queries_of(labels: Labels, labelled: LabelledArea) -> Queries:
     )
 
 
-def _planned(
+def _waypoint_queries(
     plan: Waypoints, labelled: LabelledArea, options: CoverageStageOptions, path: Path
 ) -> Queries:
-    """The plan's poses. Raises InputError, with the line, for a camera that the area does not hold."""
-    usual = _usual_camera(labelled)
+    """Return the poses of a plan; raise InputError, with the line, for an unknown camera."""
+    default = _main_camera(labelled)
     if options.camera is not None:
-        usual = options.camera
+        default = options.camera
     elif options.fov_deg is not None:
-        usual = Camera.from_horizontal_fov(usual.width, usual.height, options.fov_deg)
+        default = Camera.from_horizontal_fov(default.width, default.height, options.fov_deg)
     cameras = []
     for line, key in zip(plan.lines.tolist(), plan.cameras.tolist(), strict=True):
         if key and key not in labelled.cameras:
             raise InputError(
-                f"the area holds no camera {key!r}; it holds {', '.join(sorted(labelled.cameras))}",
+                f"the area has no camera {key!r}; cameras are {', '.join(sorted(labelled.cameras))}",
                 path=path,
                 line=line,
             )
-        cameras.append(labelled.cameras[key] if key else usual)
+        cameras.append(labelled.cameras[key] if key else default)
     names = np.array([f"line {line}" for line in plan.lines.tolist()], dtype=np.str_)
     return Queries(names, plan.poses, cameras, np.full(len(plan), "", dtype="<U1"))
 
 
-def _usual_camera(labelled: LabelledArea) -> Camera:
-    """The one that took most mapping frames."""
+def _main_camera(labelled: LabelledArea) -> Camera:
+    """Return the camera with most mapping frames."""
     labels = labelled.mapping
     keys, counts = np.unique(labels.cameras[labels.registered], return_counts=True)
     return labelled.cameras[str(keys[counts.argmax()])]
 
 
-def _place(area: Area, labelled: LabelledArea) -> WaypointFrame | None:
-    """What is known of the area's place and heights."""
+def _waypoint_frame(area: Area, labelled: LabelledArea) -> WaypointFrame | None:
+    """Return the coordinate frame of waypoints; None if the area is not georegistered."""
     origin = labelled.origin
     if origin is None:
         return None
@@ -282,8 +323,8 @@ def _place(area: Area, labelled: LabelledArea) -> WaypointFrame | None:
     return WaypointFrame(origin)
 
 
-def _together(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:
-    """Poses and strata of all queries that have a pose."""
+def _known_poses(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:
+    """Return poses and strata of all queries that have a pose."""
     every = [(each, each.queries.known) for each in by_name.values()]
     return (
         Poses.concatenate(each.queries.poses[known] for each, known in every),
@@ -292,7 +333,7 @@ def _together(by_name: Mapping[str, Coverage]) -> tuple[Poses, np.ndarray]:
 
 
 def _fingerprints(area: Area, *, of_plan: bool) -> dict[str, str]:
-    """Of the stages that coverage is made from, by name; a plan's needs no evaluation sequence."""
+    """Return fingerprints of the stages that coverage depends on; a plan needs no evaluation sequence."""
     kept = [stage for stage in area.stages() if stage in (MODEL, GEO)]
     if not of_plan:
         names = area.sequences(EVALUATION)
@@ -302,7 +343,7 @@ def _fingerprints(area: Area, *, of_plan: bool) -> dict[str, str]:
 
 
 def _write(area: Area, found: AreaCoverage, options: CoverageStageOptions, waypoints: str) -> None:
-    """The folder appears whole, in place of that of an earlier run."""
+    """Write the folder atomically, replacing that of an earlier run."""
     name = found.folder.name
     path = area.partial(name)
     shutil.rmtree(path, ignore_errors=True)
@@ -325,7 +366,7 @@ def _write(area: Area, found: AreaCoverage, options: CoverageStageOptions, waypo
 
 
 def _stops(columns: Mapping[str, list[str]]) -> list[dict[str, float]]:
-    """A stop each, numbers and counts apart."""
+    """Return one row per stop, with counts as integers."""
     convert = {name: int if name in ("stop", "serves") else float for name in columns}
     rows = zip(*columns.values(), strict=True)
     return [

@@ -1,4 +1,4 @@
-"""Exports: the area's labels in other programs' formats, in a folder of their own."""
+"""Export of an area's labels in other programs' formats."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RECORD = "export.json"
 
 
 class Format(StrEnum):
-    """What labels can be exported as; ALL makes a folder of each that the area allows."""
+    """Export formats; ALL writes one folder for each format that the area allows."""
 
     TUM = "tum"
     NERFSTUDIO = "nerfstudio"
@@ -47,7 +47,7 @@ class Format(StrEnum):
     ALL = "all"
 
 
-# Formats that list images, with the folder where those are looked up.
+# Formats that list images, with the subfolder in which they are expected.
 _IMAGES = {
     Format.NERFSTUDIO: NERFSTUDIO_IMAGES,
     Format.KAPTURE: KAPTURE_IMAGES,
@@ -55,17 +55,22 @@ _IMAGES = {
     Format.COLMAP: COLMAP_IMAGES,
 }
 _NEED_ORIGIN = (Format.GEOJSON, Format.KML)
-_WITH_MAP = (Format.COLMAP_TEXT, Format.COLMAP)  # holds the map whole, whatever is chosen
+_WITH_MAP = (Format.COLMAP_TEXT, Format.COLMAP)  # contain the whole map, whatever is selected
 _WITH_TRACKED = (Format.TUM, Format.GEOJSON, Format.KML)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelExportOptions:
-    """What is exported.
+    """Options of an export.
 
-    sequences : names of those wanted, none for all (COLMAP's models hold all mapping frames).
-    all_frames : tracked frames too, in formats that list no images.
-    images : copy the images that a format lists.
+    Attributes
+    ----------
+    sequences : tuple of str
+        Sequences to export; empty for all. COLMAP models always contain all mapping frames.
+    all_frames : bool
+        Whether to include tracked frames, in formats that do not list images.
+    images : bool
+        Whether to copy the images that a format lists.
     """
 
     sequences: tuple[str, ...] = ()
@@ -75,7 +80,19 @@ class LabelExportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportedLabels:
-    """What an export holds: frames by sequence, formats written, and formats left out, with the reason."""
+    """Result of an export.
+
+    Attributes
+    ----------
+    units : str
+        "m" or "model".
+    frames : dict of str to int
+        Number of frames by sequence.
+    formats : tuple of str
+        Formats that were written.
+    left_out : dict of str to str
+        Formats that were left out, with the reason.
+    """
 
     units: str
     frames: dict[str, int]
@@ -91,10 +108,26 @@ def export(
     *,
     overwrite: bool = False,
 ) -> ExportedLabels:
-    """Write the registered frames to the folder `target`, which appears whole.
+    """Write the registered frames to a folder, atomically.
 
-    Raises StageError where the target holds something, where no frame has a pose, where a sequence is
-    unknown, and where a format needs a place in the world that the area does not have.
+    Parameters
+    ----------
+    area : Area
+    format_name : Format
+    target : Path
+    options : LabelExportOptions
+    overwrite : bool
+        Whether an earlier export in `target` may be replaced.
+
+    Returns
+    -------
+    ExportedLabels
+
+    Raises
+    ------
+    StageError
+        If `target` contains something else, no frame has a pose, a sequence is unknown, or the format needs
+        a georegistered map but the area has none.
     """
     target = Path(os.path.abspath(target))
     check_target(area, target, overwrite=overwrite)
@@ -102,12 +135,12 @@ def export(
     wanted = [f for f in Format if f != Format.ALL] if format_name == Format.ALL else [format_name]
     left_out: dict[str, str] = {}
     if format_name == Format.ALL and labelled.origin is None:
-        left_out = {f.value: "needs a place in the world" for f in _NEED_ORIGIN}
+        left_out = {f.value: "needs a georegistered map" for f in _NEED_ORIGIN}
         wanted = [f for f in wanted if f not in _NEED_ORIGIN]
     if options.all_frames and format_name != Format.ALL and format_name not in _WITH_TRACKED:
         raise StageError(
-            f"{format_name.value} lists images, and --all-frames adds frames that are stored only in "
-            f"their video; export {', '.join(f.value for f in _WITH_TRACKED)} with it"
+            f"{format_name.value} lists images, but frames added by --all-frames exist only in their "
+            f"video; use --all-frames with {', '.join(f.value for f in _WITH_TRACKED)}"
         )
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -116,7 +149,7 @@ def export(
         for one in wanted:
             folder = partial / one.value if format_name == Format.ALL else partial
             tracked = options.all_frames and one in _WITH_TRACKED
-            frames = chosen_frames(
+            frames = select_frames(
                 labelled, options.sequences, tracked=tracked, whole_map=one in _WITH_MAP
             )
             counts = {name: len(rows) for name, rows in frames.sequences()}
@@ -135,44 +168,61 @@ def export(
 
 
 def check_target(area: Area, target: Path, *, overwrite: bool) -> None:
-    """Raises StageError unless the folder is free, or an export of ours that may be replaced."""
+    """Raise StageError unless the folder is empty, or an earlier export that may be replaced."""
     inside = target.resolve()
     if inside == area.root.resolve() or any(
         area.folder(stage.partition("/")[0]).resolve() in (inside, *inside.parents)
         for stage in area.stages()
     ):
-        raise StageError(f"{target} belongs to the area itself; name another folder with --to")
+        raise StageError(f"{target} is part of the area; choose another folder with --to")
     if target.is_symlink() or (target.exists() and not target.is_dir()):
-        raise StageError(f"{target} is not a folder; name another with --to")
+        raise StageError(f"{target} is not a folder; choose another with --to")
     if not target.exists() or not any(target.iterdir()):
         return
     if not (target / RECORD).is_file():
-        raise StageError(f"{target} holds files that are no export; name another folder with --to")
+        raise StageError(f"{target} contains other files; choose another folder with --to")
     if not overwrite:
-        raise StageError(f"{target} holds an export already; --overwrite replaces it")
+        raise StageError(f"{target} already contains an export; use --overwrite to replace it")
 
 
-def chosen_frames(
+def select_frames(
     labelled: LabelledArea,
     sequences: Sequence[str],
     *,
     tracked: bool = False,
     whole_map: bool = False,
 ) -> ExportedFrames:
-    """Frames with a pose, of the sequences named or of all, sorted by sequence and time.
+    """Select frames with a pose, sorted by sequence and time.
 
-    tracked : tracked frames too; whole_map : all mapping frames, also those of other sequences.
+    Parameters
+    ----------
+    labelled : LabelledArea
+    sequences : sequence of str
+        Sequences to include; empty for all.
+    tracked : bool
+        Whether to include tracked frames.
+    whole_map : bool
+        Whether to include all mapping frames, also those of other sequences.
+
+    Returns
+    -------
+    ExportedFrames
+
+    Raises
+    ------
+    StageError
+        If a sequence is unknown, or no frame has a pose.
     """
     known = sorted({s for labels, _ in labelled.parts() for s in labels.sequences.tolist()})
     for name in sequences:
         if name not in known:
-            raise StageError(f"there is no sequence {name!r}; there are {', '.join(known)}")
+            raise StageError(f"there is no sequence {name!r}; the area has: {', '.join(known)}")
     kept = []
     for labels, seen in labelled.parts():
         mask = labels.registered & (tracked | ~labels.tracked)
         if sequences:
-            of_map = whole_map & ~np.isin(labels.sequences, list(labelled.evaluation))
-            mask &= of_map | np.isin(labels.sequences, list(sequences))
+            in_map = whole_map & ~np.isin(labels.sequences, list(labelled.evaluation))
+            mask &= in_map | np.isin(labels.sequences, list(sequences))
         rows = np.flatnonzero(mask)
         kept.append((labels.select(rows), seen.select(rows)))
     labels, seen = merge_labels(kept)
@@ -217,7 +267,7 @@ def _copy_images(area: Area, folder: Path, frames: ExportedFrames) -> None:
 
 
 def _record(area: Area, one: Format, frames: ExportedFrames) -> dict[str, Any]:
-    """What a folder holds, also where the format itself can't say it."""
+    """Return a description of the export, for facts that the format itself cannot express."""
     origin = frames.origin
     return {
         "format": one.value,

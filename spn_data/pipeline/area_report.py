@@ -1,4 +1,4 @@
-"""report.html: what the area holds, and whether it is ready to train on."""
+"""report.html: contents of an area, and whether it is ready for training."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.network_runs import read_runs
-from spn_data.labels.labels import Labels, sigmas
+from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
@@ -47,17 +47,35 @@ from spn_data.storage.stage_record import versions
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
-    """How much one page holds; what is beyond is thinned out, and the page says so."""
+    """Limits of the page; more points and frames are thinned out, which the page states."""
 
     max_points: int = 100_000
     max_frames: int = 30_000
 
 
 def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, AreaVerdict]:
-    """Write report.html at the area's root, in place of an earlier one; its path, and the verdict on it.
+    """Write report.html in the area's folder, replacing an earlier one.
 
-    Stale stages are named and otherwise left out. Raises StageError where the area holds no frames yet,
-    FormatError or InputError for a damaged file.
+    Stale stages are named but otherwise left out.
+
+    Parameters
+    ----------
+    area : Area
+    options : ReportOptions or None
+
+    Returns
+    -------
+    path : Path
+        The page.
+    verdict : AreaVerdict
+        Whether the area is ready for training.
+
+    Raises
+    ------
+    StageError
+        If the area has no frames yet.
+    FormatError, InputError
+        If a file is damaged.
     """
     options = options or ReportOptions()
     path, data = area.root / REPORT, report_data(area)
@@ -67,16 +85,18 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
 
 
 class _FreshStages(Area):
-    """The same area as if it did not hold its stale stages."""
+    """View of an area without its stale stages."""
 
     def __init__(self, area: Area):
         self._fresh = {stage for stage in area.stages() if area.stale_because(stage) is None}
         super().__init__(area.root)
 
     def has(self, stage: str) -> bool:
+        """Return whether a stage is complete and not stale."""
         return stage in self._fresh
 
     def sequences(self, group: str) -> tuple[str, ...]:
+        """Return the names of the stages of a group that are not stale."""
         return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
 
 
@@ -85,9 +105,9 @@ def _utc(iso: str) -> str:
 
 
 def report_data(area: Area) -> ReportData:
-    """All that the report shows. Raises as `write_report`."""
+    """Collect the contents of the report; raises the same errors as `write_report`."""
     if not area.has(FRAMES):
-        raise StageError(f"{area.root} holds no frames; run {command_of(FRAMES)} first")
+        raise StageError(f"{area.root} contains no frames; run {command_of(FRAMES)} first")
     stages = tuple(
         StageFacts(area.record(stage), area.stale_because(stage), command_of(stage))
         for stage in area.stages()
@@ -112,7 +132,7 @@ def report_data(area: Area) -> ReportData:
     return ReportData(
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
-        # Not the time of writing: of an area that has not changed, the page does not change either.
+        # Not the time of writing, so that the page of an unchanged area does not change.
         made=_utc(max(stage.record.finished for stage in stages)),
         version=versions()["squeezeposenet-toolkit"],
         units="m" if geo is not None else "model",
@@ -142,29 +162,41 @@ def frame_table(
     strata: Mapping[str, str],
     groups: Mapping[str, str],
 ) -> FrameTable:
-    """One row a frame: mapping candidates, mapping's tracked frames, evaluation frames, in this order.
+    """Return one row per frame: mapping candidates, their tracked frames, evaluation frames.
 
-    labelled : None where there is no model; chosen frames are then just "chosen". residuals : (fix minus
-    pose, is an outlier) by name; strata, groups : by name.
+    Parameters
+    ----------
+    candidates : Frames
+        Candidate frames of the mapping flights.
+    labelled : LabelledArea or None
+        None if there is no model; the status of selected frames is then "chosen".
+    residuals : mapping of str to (ndarray of shape (3,), bool)
+        Fix minus pose, and whether it is an outlier, by frame.
+    strata, groups : mapping of str to str
+        Coverage stratum and group of the split, by frame.
+
+    Returns
+    -------
+    FrameTable
     """
     if labelled is None:
-        return _of_candidates(candidates, candidates.names != "")
+        return _candidate_rows(candidates, candidates.names != "")
     labelled_names = set(labelled.tracked.names.tolist())
     rest = ~candidates.chosen & ~np.isin(candidates.names, list(labelled_names))
     parts = [
-        _of_labels(labelled.mapping, evaluation=False),
-        _of_labels(labelled.tracked, evaluation=False),
-        _of_candidates(candidates, rest),
-        *(_of_labels(labels, evaluation=True) for labels in labelled.evaluation.values()),
+        _label_rows(labelled.mapping, evaluation=False),
+        _label_rows(labelled.tracked, evaluation=False),
+        _candidate_rows(candidates, rest),
+        *(_label_rows(labels, evaluation=True) for labels in labelled.evaluation.values()),
     ]
     frames = FrameTable.concatenate(parts)
     order = np.lexsort((frames.time_s, frames.sequences, frames.evaluation))
     return frames.select(order).with_facts(residuals, strata, groups)
 
 
-def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
+def _label_rows(labels: Labels, *, evaluation: bool) -> FrameTable:
     n = len(labels)
-    sigma_m, sigma_deg = sigmas(labels.covariance)
+    sigma_m, sigma_deg = pose_sigmas(labels.covariance)
     return FrameTable(
         names=labels.names,
         sequences=labels.sequences,
@@ -183,8 +215,8 @@ def _of_labels(labels: Labels, *, evaluation: bool) -> FrameTable:
     )
 
 
-def _of_candidates(frames: Frames, mask: np.ndarray) -> FrameTable:
-    """Candidates without a pose, with the reason why they were not chosen."""
+def _candidate_rows(frames: Frames, mask: np.ndarray) -> FrameTable:
+    """Return candidates without a pose, with the reason why they were not chosen."""
     found = frames.select(mask)
     n = len(found)
     unknown = np.full(n, np.nan)
@@ -211,7 +243,7 @@ def _residuals(
 ) -> dict[str, tuple[np.ndarray, bool]]:
     names = value.get("frames", [])
     if len(names) != len(geo.residuals_m):
-        raise FormatError(f"{path}: its residuals are not those of its frames")
+        raise FormatError(f"{path}: the numbers of residuals and frames differ")
     return {
         str(name): (residual, bool(outlier))
         for name, residual, outlier in zip(names, geo.residuals_m, geo.outlier, strict=True)
@@ -219,13 +251,13 @@ def _residuals(
 
 
 def _tangents(camera: Camera) -> tuple[float, float]:
-    """Of half the horizontal and vertical field of view."""
+    """Return the tangents of half the horizontal and vertical field of view."""
     fx, fy = camera.focal_px
     return camera.width / 2 / fx, camera.height / 2 / fy
 
 
 def _coverage(area: Area, folder: str) -> CoverageFacts | None:
-    """What `spn-data coverage` found, of evaluation sequences or of planned waypoints."""
+    """Read the result of `spn-data coverage` for evaluation sequences or planned waypoints."""
     value = coverage_stage.read_coverage(area, folder)
     if value is None:
         return None
@@ -234,7 +266,7 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
             str(name): {**summary["strata"], "failed": summary["failed"]}
             for name, summary in value["sequences"].items()
         }
-        again = tuple(
+        stops = tuple(
             PlaceToFly(
                 (float(stop["x_m"]), float(stop["y_m"]), float(stop["z_m"])),
                 (float(stop["lat_deg"]), float(stop["lon_deg"])),
@@ -247,11 +279,11 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
         limits = _limits(value["options"])
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(area.folder(folder), error) from error
-    return CoverageFacts(counts, again, limits, coverage_stage.stale_because(area, value))
+    return CoverageFacts(counts, stops, limits, coverage_stage.stale_because(area, value))
 
 
 def _strata(area: Area) -> dict[str, str]:
-    """Stratum of each evaluation frame by name, where coverage was measured."""
+    """Read the coverage stratum of each evaluation frame, by name; empty before `spn-data coverage`."""
     strata: dict[str, str] = {}
     folder = area.folder(COVERAGE)
     try:
@@ -268,7 +300,7 @@ def _damaged(folder: Path, error: Exception) -> FormatError:
 
 def _limits(options: Mapping[str, Any] | None) -> str:
     if options is None:
-        return "There are no strata: lengths of this map are no metres."
+        return "There are no strata, because the map is not in metres."
     high, medium = (
         f"at most {options[f'{s}_m']:g} m and {options[f'{s}_deg']:g} deg from a mapping frame"
         for s in ("high", "medium")

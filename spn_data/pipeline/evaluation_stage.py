@@ -22,6 +22,7 @@ from spn_data.area.names import (
     POSES,
     REGISTRATION,
 )
+from spn_data.capture.frames import Frames
 from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
@@ -32,7 +33,7 @@ from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
 from spn_data.inputs.source_fingerprints import fingerprints
-from spn_data.labels.labels import Labels, sigmas, write_label_observations, write_labels
+from spn_data.labels.labels import Labels, pose_sigmas, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
@@ -44,20 +45,31 @@ from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
 
-_MISFIT = 2.0  # times the map's own residuals
-# Relative difference of focal lengths from which two lenses contradict each other if they are one, and up
-# to which they may be one.
+_MISFIT = 2.0  # ratio of residuals of sequence and map
+# Relative differences of focal lengths: above the first, two estimates of one lens contradict each other;
+# above the second, they are taken to be of two lenses.
 _SAME_LENS, _OTHER_LENS = 0.02, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegisterStageOptions:
-    """What decides the labels of a sequence."""
+    """Options of the registration of a sequence.
+
+    Attributes
+    ----------
+    register : RegisterOptions
+    fov_deg : float or None
+        Horizontal field of view, if known.
+    camera_file : str or None
+        File of a calibrated camera to start from.
+    any_telemetry : bool
+        Whether to accept telemetry whose duration does not match the video.
+    """
 
     register: RegisterOptions = field(default_factory=RegisterOptions)
-    fov_deg: float | None = None  # horizontal field of view, where known
-    camera_file: str | None = None  # a calibrated camera to start from
-    any_telemetry: bool = False  # also telemetry whose length does not fit the video's
+    fov_deg: float | None = None
+    camera_file: str | None = None
+    any_telemetry: bool = False
 
 
 def register(
@@ -70,10 +82,33 @@ def register(
     dispatch: Dispatch,
     overwrite: bool = False,
 ) -> StageRecord:
-    """Register the frames of one video, or folder of photos, as an evaluation sequence.
+    """Register the frames of one video, or of a folder of photos, as an evaluation sequence.
 
-    name : of the sequence; the source's own where None. The map is only read: its hash is taken before and
-    after. Raises InputError where the source is part of the map, holds several sequences, or cannot be read.
+    The map is only read: its hash is recorded before and after.
+
+    Parameters
+    ----------
+    area : Area
+    video : Path
+    name : str or None
+        Name of the sequence; None: the name of the source.
+    options : RegisterStageOptions
+    progress : Progress
+    dispatch : Dispatch
+        Runs feature extraction and matching.
+    overwrite : bool
+        Whether a sequence with other options or inputs may be replaced.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    InputError
+        If the source is part of the map, contains several sequences, or cannot be read.
+    StageError
+        If the model is missing or stale, or the map changes meanwhile.
     """
     source = find_source(area, video, name)
     given = None if options.camera_file is None else read_camera(Path(options.camera_file))
@@ -99,10 +134,10 @@ def _register(
     dispatch: Dispatch,
 ) -> StageRecord:
     stopwatch = Stopwatch()
-    before = {stage: map_hash(area.folder(stage)) for stage in (MODEL, GEO) if area.has(stage)}
+    before = _map_hashes(area)
     with stopwatch.step("frames"):
         check_telemetry(source)
-        taken = sample_frames(
+        sampled = sample_frames(
             work.path,
             source,
             given,
@@ -111,18 +146,9 @@ def _register(
             fov_deg=options.fov_deg,
             any_telemetry=options.any_telemetry,
         )
-    chosen = taken.frames.select(taken.frames.chosen)
-    to_match = FramesToMap(
-        folder=work.path / STORED,
-        names=tuple(chosen.names.tolist()),
-        sequences=chosen.sequences,
-        cameras=chosen.cameras,
-        positions_m=np.full((len(chosen), 3), np.nan),
-        start_cameras={str(chosen.cameras[0]): taken.start},
-        masks={},
-    )
+    chosen = sampled.frames.select(sampled.frames.chosen)
     found = register_sequence(
-        to_match,
+        _frames_to_match(work.path / STORED, chosen, sampled.start),
         work.path,
         area.folder(MODEL),
         options.register,
@@ -130,50 +156,83 @@ def _register(
         dispatch=dispatch,
         stopwatch=stopwatch,
     )
-    labels = labels_of(chosen, found)
-    solution, covariance = found.solution, found.covariance
-    world_from_model = read_world_from_model(area)
-    labels = labels.transformed(world_from_model)
+    labels = labels_of(chosen, found).transformed(read_world_from_model(area))
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
         write_label_observations(work.path / OBSERVATIONS, found.seen)
-        lens = {} if covariance is None else _lens_json(covariance)
-        camera = {"version": VERSION, **camera_to_json(solution.camera), **lens}
-        write_json(work.path / CAMERA, {**camera, "start": _start_json(taken.start)})
-        gnss = _gnss(area, labels, taken.track)
-        after = {stage: map_hash(area.folder(stage)) for stage in before}
+        _write_camera(work.path / CAMERA, found, sampled.start)
+        gnss = _gnss(area, labels, sampled.track)
+        after = _map_hashes(area)
         if after != before:
             raise StageError(f"{area.root}: the map changed while {source.sequence} was registered")
-        write_json(
-            work.path / REGISTRATION,
-            {
-                "version": VERSION,
-                "world_from_model": world_from_model.to_json(),
-                "map_before": before[MODEL],
-                "map_after": after[MODEL],
-                "geo_before": before.get(GEO),
-                "geo_after": after.get(GEO),
-                "gnss": None if gnss is None else asdict(gnss),
-                "map_sigma_px": found.map_sigma_px,
-                "sigma_px": None if covariance is None else covariance.sigma_px,
-                "design_effect": None if covariance is None else covariance.design_effect,
-            },
-        )
-    notes = [*taken.notes, *_misfit(found)]
+        _write_registration(work.path / REGISTRATION, area, found, gnss, before)
+    notes = [*sampled.notes, *_misfit_notes(found)]
     if labels.registered.any():
-        notes += lens_remarks(solution.camera, _mapping_lenses(area))
+        notes += lens_notes(found.solution.camera, _mapping_lenses(area))
     if gnss is not None:
         notes.append(gnss.describe())
     return work.finish(
-        counts=_counts(labels, solution.camera, gnss),
+        counts=_counts(labels, found.solution.camera, gnss),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=tuple(notes),
     )
 
 
-def _misfit(found: RegisteredSequence) -> list[str]:
-    """A word where the sequence fits the map much worse than the map fits itself."""
+def _map_hashes(area: Area) -> dict[str, str]:
+    """Return the hash of the map, and of its georegistered version if there is one, by stage."""
+    return {stage: map_hash(area.folder(stage)) for stage in (MODEL, GEO) if area.has(stage)}
+
+
+def _frames_to_match(folder: Path, chosen: Frames, start: tuple[Camera, bool]) -> FramesToMap:
+    """Return the sampled frames of one sequence as input of matching, without positions."""
+    return FramesToMap(
+        folder=folder,
+        names=tuple(chosen.names.tolist()),
+        sequences=chosen.sequences,
+        cameras=chosen.cameras,
+        positions_m=np.full((len(chosen), 3), np.nan),
+        start_cameras={str(chosen.cameras[0]): start},
+        masks={},
+    )
+
+
+def _write_camera(path: Path, found: RegisteredSequence, start: tuple[Camera, bool]) -> None:
+    """Write the estimated camera with its covariance, and the one it started from."""
+    covariance = found.covariance
+    lens = {} if covariance is None else _lens_json(covariance)
+    camera = {"version": VERSION, **camera_to_json(found.solution.camera), **lens}
+    write_json(path, {**camera, "start": _start_json(start)})
+
+
+def _write_registration(
+    path: Path,
+    area: Area,
+    found: RegisteredSequence,
+    gnss: GnssCheck | None,
+    map_hashes: Mapping[str, str],
+) -> None:
+    """Write registration.json; the hashes of the map are the same before and after registration."""
+    covariance = found.covariance
+    write_json(
+        path,
+        {
+            "version": VERSION,
+            "world_from_model": read_world_from_model(area).to_json(),
+            "map_before": map_hashes[MODEL],
+            "map_after": map_hashes[MODEL],
+            "geo_before": map_hashes.get(GEO),
+            "geo_after": map_hashes.get(GEO),
+            "gnss": None if gnss is None else asdict(gnss),
+            "map_sigma_px": found.map_sigma_px,
+            "sigma_px": None if covariance is None else covariance.sigma_px,
+            "design_effect": None if covariance is None else covariance.design_effect,
+        },
+    )
+
+
+def _misfit_notes(found: RegisteredSequence) -> list[str]:
+    """Return a note if the sequence fits the map much worse than the map fits itself."""
     if found.covariance is None:
         return []
     here_px, map_px = found.covariance.sigma_px, found.map_sigma_px
@@ -181,13 +240,13 @@ def _misfit(found: RegisteredSequence) -> list[str]:
         return []
     return [
         f"its residuals ({here_px:.2f} px) are {here_px / map_px:.1f} times the map's own ({map_px:.2f} px): "
-        "the map is bent or its lens is wrong, as after a flight at one height that looks one way, and "
-        "labels may be off by more than is stated"
+        "the map is bent (doming) or its lens is wrong, as after a flight at one height with one viewing "
+        "direction, and label errors may exceed the stated covariance"
     ]
 
 
 def _mapping_lenses(area: Area) -> dict[str, Camera]:
-    """The mapping lenses as mapping estimated them, by key."""
+    """Return the mapping cameras as estimated by the reconstruction, by key."""
     sizes = read_json(area.folder(FRAMES) / CAMERAS)["cameras"]
     estimated = area.record(MODEL).counts["cameras"]
     return {
@@ -196,17 +255,17 @@ def _mapping_lenses(area: Area) -> dict[str, Camera]:
     }
 
 
-def lens_remarks(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
-    """A word where a lens came out a little apart from one of the map's that may be the same."""
+def lens_notes(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
+    """Return a note if the focal length differs slightly from that of a mapping lens that may be the same."""
     for key, lens in mapping.items():
-        apart = camera.focal_px[0] / lens.focal_px[0] - 1
+        difference = camera.focal_px[0] / lens.focal_px[0] - 1
         same_size = (camera.width, camera.height) == (lens.width, lens.height)
-        if same_size and _SAME_LENS < abs(apart) < _OTHER_LENS:
+        if same_size and _SAME_LENS < abs(difference) < _OTHER_LENS:
             return [
-                f"its focal length came out at {camera.focal_px[0]:.0f} px, that of {key} (images as large) "
-                f"at {lens.focal_px[0]:.0f} px. If both are one lens, one of them is wrong, and "
-                f"with it heights by about {abs(apart):.0%}: a flight at one height that looks one way "
-                "hardly tells a focal length. Map from two heights, or give --camera"
+                f"its estimated focal length is {camera.focal_px[0]:.0f} px, that of {key} (same image size) "
+                f"is {lens.focal_px[0]:.0f} px. If both are the same lens, one of them is wrong, and "
+                f"with it heights by about {abs(difference):.0%}: a flight at one height with one viewing "
+                "direction hardly determines the focal length. Map from two heights, or give --camera"
             ]
     return []
 
@@ -228,7 +287,7 @@ def _gnss(area: Area, labels: Labels, track: Telemetry | None) -> GnssCheck | No
 
 def _counts(labels: Labels, camera: Camera, gnss: GnssCheck | None) -> dict[str, Any]:
     registered = labels.registered
-    sigma, sigma_deg = sigmas(labels.covariance[registered])
+    sigma, sigma_deg = pose_sigmas(labels.covariance[registered])
     reasons: dict[str, int] = {}
     for reason in labels.reason[~registered].tolist():
         kind = "ambiguous" if reason.startswith("ambiguous") else "too little agreement"

@@ -1,9 +1,7 @@
-"""Stage 1-frames: videos and photos with telemetry to chosen frames."""
+"""Stage 1-frames: frames chosen from videos and photos, with telemetry."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -29,6 +27,7 @@ from spn_data.capture.video import probe
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.geometry.geodesy import metres_from_first_fix
+from spn_data.inputs.file_links import link_or_copy
 from spn_data.inputs.flight_telemetry import check_telemetry, source_telemetry, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.source_fingerprints import fingerprints
@@ -39,25 +38,45 @@ from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
 from spn_data.work.timing import Progress, Stopwatch
 
-# Names beside the folders of the sequences.
+# Names in the stage folder that are not sequences.
 _RESERVED = (TELEMETRY, MASKS, FRAMES_TABLE, CAMERAS, "stage.json", "started.json")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FramesOptions:
-    """How frames are made from sources."""
+    """Options of the selection of frames.
+
+    Attributes
+    ----------
+    selection : SelectionOptions
+    fov_deg : mapping of str to float
+        Horizontal field of view by sequence; "*" for all.
+    camera_files : mapping of str to str
+        Files of calibrated cameras (`camera_file`) by sequence; "*" for all.
+    mask : str or None
+        An image, or a folder of `<sequence>.png`.
+    any_telemetry : bool
+        Whether to accept telemetry whose duration does not match the video.
+    """
 
     selection: SelectionOptions = field(default_factory=SelectionOptions)
-    # Horizontal field of view, and files of whole cameras (`camera_file`), by sequence; "*" for all.
     fov_deg: Mapping[str, float] = field(default_factory=dict)
     camera_files: Mapping[str, str] = field(default_factory=dict)
-    mask: str | None = None  # an image, or a folder of <sequence>.png
-    any_telemetry: bool = False  # also telemetry whose length does not fit the video's
+    mask: str | None = None
+    any_telemetry: bool = False
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What lies before the user, ahead of any work."""
+    """Sources of an area and their expected cost, before any work.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+    ignored : tuple of (Path, str)
+        Files that are not used, with the reason.
+    cost : ExtractionCost
+    """
 
     sources: tuple[Source, ...]
     ignored: tuple[tuple[Path, str], ...]
@@ -71,36 +90,51 @@ def plan(
     extended: Area | None = None,
     tested: Area | None = None,
 ) -> Plan:
-    """Sources of all inputs, with names that no two of them and none of the area to extend have.
+    """Find the sources of all inputs, and give each sequence a unique name.
 
-    tested : the area whose evaluation sequences must stay out of the map, and keep their names.
-    Sources whose every file is in the area to extend are ignored; InputError where there are no others, and
-    for the file of an evaluation sequence.
+    Parameters
+    ----------
+    inputs : list of Path
+        Videos, or folders with videos or photos.
+    options : FramesOptions
+    extended : Area or None
+        Area to extend. Sources whose files are all in it are ignored, and its names are not used again.
+    tested : Area or None
+        Area whose evaluation sequences must not become part of the map, and keep their names.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        If there is no new source, or a file belongs to an evaluation sequence.
     """
     sources: list[Source] = []
     ignored: list[tuple[Path, str]] = []
     names = set(_RESERVED)
-    held: set[str] = set()
+    mapped_files: set[str] = set()
     if extended is not None:
         frames = read_frames(extended.folder(FRAMES) / FRAMES_TABLE)
         names |= {name.lower() for name in np.unique(frames.sequences).tolist()}
-        held = set(extended.record(FRAMES).inputs.values())
-    evaluated = {} if tested is None else _evaluated(tested)
+        mapped_files = set(extended.record(FRAMES).inputs.values())
+    evaluated = {} if tested is None else _evaluation_files(tested)
     names |= {name.lower() for name in evaluated.values()}
     for path in inputs:
         found = discover(path)
         ignored += found.ignored
         for source in found.sources:
             prints = {part: content_fingerprint(part) for part in source.parts}
-            for part, print_ in prints.items():
-                if print_ in evaluated:
+            for part, fingerprint in prints.items():
+                if fingerprint in evaluated:
                     raise InputError(
-                        f"is of the evaluation sequence {evaluated[print_]}, which would be no test of a "
-                        "map that holds it; to map it all the same, remove its folders in "
+                        f"belongs to the evaluation sequence {evaluated[fingerprint]}, which would not be an "
+                        "independent test of a map that contains it; to map it anyway, remove its folders in "
                         f"{EVALUATION} and {TRACKED}",
                         path=part,
                     )
-            known = [part for part, print_ in prints.items() if print_ in held]
+            known = [part for part, fingerprint in prints.items() if fingerprint in mapped_files]
             if len(known) == len(source.parts):
                 ignored += [(part, "already in the area") for part in known]
                 continue
@@ -111,7 +145,7 @@ def plan(
             sources.append(replace(source, sequence=name))
     if not sources:
         raise InputError(
-            "nothing to add: what it holds is already in the area",
+            "nothing to add: all files are already in the area",
             path=", ".join(str(path) for path in inputs),
         )
     return Plan(
@@ -121,18 +155,18 @@ def plan(
     )
 
 
-def _evaluated(area: Area) -> dict[str, str]:
-    """Name of the evaluation sequence of each video or photo, by the file's fingerprint."""
+def _evaluation_files(area: Area) -> dict[str, str]:
+    """Return the evaluation sequence of each video or photo, by the fingerprint of the file."""
     return {
-        print_: name
+        fingerprint: name
         for name in area.sequences(EVALUATION)
-        for file, print_ in area.record(f"{EVALUATION}/{name}").inputs.items()
+        for file, fingerprint in area.record(f"{EVALUATION}/{name}").inputs.items()
         if Path(file).suffix.lower() in VIDEO_SUFFIXES | PHOTO_SUFFIXES
     }
 
 
-def masks_of(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:
-    """The mask of each sequence that has one. InputError where a folder of masks has none of them."""
+def find_masks(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:
+    """Return the mask of each sequence that has one; raise InputError if a folder contains none of them."""
     if given is None:
         return {}
     path = Path(given)
@@ -142,7 +176,7 @@ def masks_of(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:
     found = {name: file for name, file in files.items() if file.exists()}
     if not found:
         raise InputError(
-            f"holds no mask: none of {', '.join(f.name for f in files.values())}", path=path
+            f"contains no mask: none of {', '.join(f.name for f in files.values())}", path=path
         )
     return found
 
@@ -155,22 +189,40 @@ def choose_frames(
     *,
     extend: Area | None = None,
     overwrite: bool = False,
-    tell: Callable[[str, TelemetrySummary | None], None] = lambda *_: None,
+    on_telemetry: Callable[[str, TelemetrySummary | None], None] = lambda *_: None,
 ) -> StageRecord:
-    """Choose and write frames of the sources; `tell` hears each source's telemetry as it is read.
+    """Select frames of the sources and write them as images.
 
-    extend : the area whose frames are kept and come first.
+    Parameters
+    ----------
+    area : Area
+    found : Plan
+    options : FramesOptions
+    progress : Progress
+    extend : Area or None
+        Area whose frames are kept and come first.
+    overwrite : bool
+        Whether frames of other sources or options may be replaced.
+    on_telemetry : callable
+        Called with the name of each sequence and the summary of its telemetry, as soon as it is read.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    InputError
+        If masks, telemetry or cameras do not fit the sources, or too few frames are usable.
+    StageError
+        If there is not enough disk space.
     """
-    masks = masks_of(found.sources, options.mask)
+    masks = find_masks(found.sources, options.mask)
     inputs = fingerprints(found.sources, masks)
     if extend is not None:
         inputs = {**extend.record(FRAMES).inputs, **inputs}
-    for source in found.sources:
-        if not options.any_telemetry:
-            check_telemetry(source)
-        if source.sequence in masks:
-            _check_mask(masks[source.sequence], source)
-    # Masks and cameras count by their content, wherever they lie.
+    _check_sources(found.sources, masks, options)
+    # Masks and cameras are identified by their content, not by their path.
     given = {name: read_camera(Path(path)) for name, path in options.camera_files.items()}
     made_with = asdict(replace(options, mask=None, camera_files={}))
     made_with["cameras"] = {name: camera_to_json(camera) for name, camera in given.items()}
@@ -179,40 +231,25 @@ def choose_frames(
         return work
     check_space(work.path, found.cost.disk_bytes)
     stopwatch = Stopwatch()
-    notes: list[str] = []
     for name in (TELEMETRY, MASKS, ".analysis"):
         (work.path / name).mkdir(exist_ok=True)
     cameras: dict[str, dict[str, object]] = {}
-    kept: list[Frames] = []
+    parts: list[Frames] = []
     if extend is not None:
-        kept, cameras = _take_over(extend, work.path)
-    candidates, tracks = [], []
-    for source in found.sources:
-        with stopwatch.step("analysis"):
-            measured = _analyse(source, work.path / ".analysis", found.cost, progress)
-        track = source_telemetry(source, measured, any_telemetry=options.any_telemetry)
-        check_usable(measured.measured, options.selection, source.parts[0].name)
-        tell(source.sequence, None if track is None else summarize(track))
-        notes += measured.notes
-        notes += [] if track is not None else unread_tracks(source)
-        candidates.append(measured)
-        tracks.append(track)
-    _check_some_fit(candidates)
+        parts, cameras = _reuse_frames(extend, work.path)
+    candidates, tracks, notes = _measure(
+        found, work.path / ".analysis", options, progress, stopwatch, on_telemetry
+    )
     choices = _choose(candidates, tracks, options.selection)
-    parts = []
     done_before = 0
     total = sum(int(choice.chosen.sum()) for choice in choices)
     for one, track, choice in zip(candidates, tracks, choices, strict=True):
-        zoom = None if track is None else track.at(one.measured.time_s).zoom
-        frames = build_frames(one, choice, focal=zoom)
-        if track is not None:
-            frames = frames.with_telemetry(track.at(frames.time_s))
-            write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", track)
+        frames = _frames_with_telemetry(one, track, choice, work.path / TELEMETRY)
         cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
             _write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:
-            notes.append(f"{one.source.sequence}: no mask of that name")
+            notes.append(f"{one.source.sequence}: no mask with this name")
         with stopwatch.step("frames"):
             extract_chosen(
                 one.source,
@@ -222,25 +259,78 @@ def choose_frames(
             )
         done_before += int(choice.chosen.sum())
         parts.append(frames)
-    frames = Frames.concatenate([*kept, *parts])
+    frames = Frames.concatenate(parts)
     write_frames(work.path / FRAMES_TABLE, frames)
     write_json(work.path / CAMERAS, {"version": 1, "cameras": cameras})
     return work.finish(
-        counts={
-            "candidates": len(frames),
-            "chosen": int(frames.chosen.sum()),
-            "sequences": len(np.unique(frames.sequences)),
-            "with_fix": int((frames.has_fix & frames.chosen).sum()),
-            "unreadable": int((frames.status == "unreadable").sum()),
-        },
+        counts=_counts(frames),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=tuple(notes),
     )
 
 
-def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict[str, object]]]:
-    """The frames of an area, linked rather than copied where the disk allows."""
+def _check_sources(
+    sources: tuple[Source, ...], masks: Mapping[str, Path], options: FramesOptions
+) -> None:
+    """Raise InputError if telemetry or masks do not fit, before hours are spent on the videos."""
+    for source in sources:
+        if not options.any_telemetry:
+            check_telemetry(source)
+        if source.sequence in masks:
+            _check_mask(masks[source.sequence], source)
+
+
+def _measure(
+    found: Plan,
+    cache: Path,
+    options: FramesOptions,
+    progress: Progress,
+    stopwatch: Stopwatch,
+    on_telemetry: Callable[[str, TelemetrySummary | None], None],
+) -> tuple[list[Candidates], list[Telemetry | None], list[str]]:
+    """Measure the candidate frames of each source and read its telemetry; return both with notes."""
+    candidates: list[Candidates] = []
+    tracks: list[Telemetry | None] = []
+    notes: list[str] = []
+    for source in found.sources:
+        with stopwatch.step("analysis"):
+            measured = _analyse(source, cache, found.cost, progress)
+        track = source_telemetry(source, measured, any_telemetry=options.any_telemetry)
+        check_usable(measured.measured, options.selection, source.parts[0].name)
+        on_telemetry(source.sequence, None if track is None else summarize(track))
+        notes += measured.notes
+        notes += [] if track is not None else unread_tracks(source)
+        candidates.append(measured)
+        tracks.append(track)
+    _check_enough_readable(candidates)
+    return candidates, tracks, notes
+
+
+def _frames_with_telemetry(
+    candidates: Candidates, track: Telemetry | None, choice: FrameChoice, folder: Path
+) -> Frames:
+    """Build the frame table of a source; write its telemetry to a folder."""
+    zoom = None if track is None else track.at(candidates.measured.time_s).zoom
+    frames = build_frames(candidates, choice, focal=zoom)
+    if track is None:
+        return frames
+    write_track(folder / f"{candidates.source.sequence}.csv", track)
+    return frames.with_telemetry(track.at(frames.time_s))
+
+
+def _counts(frames: Frames) -> dict[str, int]:
+    return {
+        "candidates": len(frames),
+        "chosen": int(frames.chosen.sum()),
+        "sequences": len(np.unique(frames.sequences)),
+        "with_fix": int((frames.has_fix & frames.chosen).sum()),
+        "unreadable": int((frames.status == "unreadable").sum()),
+    }
+
+
+def _reuse_frames(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict[str, object]]]:
+    """Link the frames, telemetry and masks of an area; return its frame table and cameras."""
     folder = extend.folder(FRAMES)
     frames = read_frames(folder / FRAMES_TABLE)
     chosen = [folder / name for name in frames.names[frames.chosen].tolist()]
@@ -249,17 +339,12 @@ def _take_over(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict
         link = target / path.relative_to(folder)
         link.parent.mkdir(exist_ok=True)
         if not link.exists():
-            try:
-                os.link(path, link)
-            except OSError:  # a disk without hard links
-                copy = link.with_name(f"{link.name}.part")
-                shutil.copy2(path, copy)
-                copy.replace(link)
+            link_or_copy(path, link)
     return [frames], dict(read_json(folder / CAMERAS)["cameras"])
 
 
 def _analyse(source: Source, folder: Path, cost: ExtractionCost, progress: Progress) -> Candidates:
-    """Measurements of a source; those of videos are kept, so that an interrupted run has them."""
+    """Measure a source; measurements of videos are cached for a resumed run."""
     step = f"analysis {source.sequence}"
     total = cost.candidates if source.kind is SourceKind.VIDEO else len(source.parts)
     return analyse(
@@ -294,20 +379,20 @@ def _positions(rows: Telemetry) -> np.ndarray:
     return np.column_stack([metres_from_first_fix(rows.lat_lon_deg), rows.rel_alt_m])
 
 
-def _check_some_fit(candidates: list[Candidates]) -> None:
+def _check_enough_readable(candidates: list[Candidates]) -> None:
     if sum(int(one.measured.readable.sum()) for one in candidates) < 3:
-        raise InputError("fewer than three images can be read, a model needs more")
+        raise InputError("fewer than three images can be read, too few for a model")
 
 
 def _check_mask(path: Path, source: Source) -> None:
-    """Raises InputError where the mask does not fit, before hours are spent on the video."""
+    """Raise InputError if a mask does not fit its video."""
     if source.kind is SourceKind.VIDEO:
         info = probe(source.parts[0])
         load_mask(path, info.width, info.height)
 
 
 def _write_mask(path: Path, frames: Frames, folder: Path) -> None:
-    """The source's mask at its size."""
+    """Write the mask of a source in the size of its images."""
     row = int(np.flatnonzero(frames.width > 0)[0])
     usable = load_mask(path, int(frames.width[row]), int(frames.height[row]))
     ok, data = cv2.imencode(".png", usable.astype(np.uint8) * 255)

@@ -1,4 +1,4 @@
-"""Stage 3-geo: the model in East-North-Up metres, and how far to trust that."""
+"""Stage 3-geo: the model in ENU metres, with the uncertainty of its georegistration."""
 
 from __future__ import annotations
 
@@ -29,15 +29,21 @@ from spn_data.work.timing import Progress, Stopwatch
 
 @dataclass(frozen=True, kw_only=True)
 class GeoStageOptions:
-    """How the model is put into the world."""
+    """Options of georegistration.
+
+    Attributes
+    ----------
+    fit : GeoregisterOptions
+    time_offset_s : mapping of str to float
+        Added to the times of the telemetry, by sequence ("*" for all). It is estimated for other sequences.
+    """
 
     fit: GeoregisterOptions = field(default_factory=GeoregisterOptions)
-    # Added to the telemetry's times, by sequence ("*" for all); a sequence not named here is estimated.
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
 
 
 def recorded_options(record: StageRecord) -> GeoStageOptions:
-    """The options that a georegistration was made with. Raises FormatError where they cannot be read."""
+    """Return the options of an earlier georegistration; raise FormatError if they cannot be read."""
     try:
         fit = dict(record.options["fit"])
         sigma, reference, origin = fit["gnss_sigma_m"], fit["height_reference"], fit["origin"]
@@ -58,12 +64,12 @@ def recorded_options(record: StageRecord) -> GeoStageOptions:
 
 
 def has_fixes(area: Area) -> bool:
-    """Any telemetry of the area's frames holds a position."""
+    """Return whether any telemetry of the mapping flights has a position."""
     return any(track.has_fix.any() for track in read_tracks(area).values())
 
 
 def read_tracks(area: Area) -> dict[str, Telemetry]:
-    """Telemetry of each sequence, as it was read, by sequence."""
+    """Return the stored telemetry of each mapping sequence, without time offsets."""
     folder = area.folder(FRAMES) / TELEMETRY
     return {path.stem: read_track(path) for path in sorted(folder.glob("*.csv"))}
 
@@ -71,9 +77,26 @@ def read_tracks(area: Area) -> dict[str, Telemetry]:
 def georegister(
     area: Area, options: GeoStageOptions, progress: Progress, *, overwrite: bool = False
 ) -> StageRecord:
-    """Put the area's model, and all labels in it, into East-North-Up metres.
+    """Georegister the area's model, and transform all labels with it, to ENU metres.
 
-    Raises GeometryError where telemetry does not determine the answer.
+    Parameters
+    ----------
+    area : Area
+    options : GeoStageOptions
+    progress : Progress
+    overwrite : bool
+        Whether a georegistration with other options may be replaced.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    GeometryError
+        If the telemetry does not determine the similarity.
+    StageError
+        If frames or model are missing or stale.
     """
     begun = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
     if isinstance(begun, StageRecord):
@@ -82,9 +105,9 @@ def georegister(
         try:
             record = _georegister(area, begun, options, progress)
         except GeometryError:
-            begun.discard()  # nothing in it is worth going on from
+            begun.discard()  # nothing in it could be reused
             raise
-    move_labels(area)  # also those that an interrupted call has left behind
+    move_labels(area)  # also after an interrupted call that did not get this far
     return record
 
 
@@ -95,8 +118,8 @@ def _georegister(
     tracks = read_tracks(area)
     if not any(track.has_fix.any() for track in tracks.values()):
         raise GeometryError(
-            f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model). With "
-            "telemetry beside the sources, spn-data reconstruct VIDEO --overwrite places it"
+            f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model). Put "
+            "telemetry next to the sources and run spn-data reconstruct VIDEO --overwrite"
         )
     scene = read_scene(area.folder(MODEL))
     frames = registered_frames(area, scene)
@@ -128,7 +151,7 @@ def _georegister(
 
 
 def registered_frames(area: Area, scene: Scene) -> Frames:
-    """Rows of frames.csv of the scene's images, in the scene's order."""
+    """Return the frames of a scene's images, in the order of the scene."""
     frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     row = {name: k for k, name in enumerate(frames.names.tolist())}
     return frames.select(np.array([row[name] for name in scene.names], dtype=np.int64))
@@ -141,7 +164,7 @@ def _time_offsets(
     options: GeoStageOptions,
     progress: Progress,
 ) -> dict[str, TimeOffset]:
-    """What is added to each flight's telemetry times: given, else estimated. Photos carry their own."""
+    """Return the time offset of each flight, given or estimated; photos with their own tags have none."""
     offsets: dict[str, TimeOffset] = {}
     moving = [name for name, track in tracks.items() if track.kind != "exif"]
     for k, name in enumerate(moving):
@@ -185,5 +208,5 @@ def _counts(result: GeoFit) -> dict[str, Any]:
 
 
 def _rounded(value: float, digits: int = 4) -> float | None:
-    """A figure for stage.json; None where there is none."""
+    """Return a number for stage.json; None if it is not finite."""
     return finite_or_none(round(float(value), digits))

@@ -1,4 +1,4 @@
-"""A data set from a folder in the format of Cambridge Landmarks: lists, images, reconstruction.nvm."""
+"""Import of a folder in the format of Cambridge Landmarks: lists, images, reconstruction.nvm."""
 
 from __future__ import annotations
 
@@ -37,27 +37,45 @@ LISTS = {
     Role.VALIDATION: VALIDATION_LIST,
     Role.TEST: TEST_LIST,
 }
-_NO_PLACE = (
-    "the world of these lists has no known origin and no known up: it can't be flown by as it is"
+_NOT_GEOREFERENCED = (
+    "the lists are not georeferenced (unknown origin and up direction), so the poses cannot be used for "
+    "navigation"
 )
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """Of `spn-data import`."""
+    """Options of the import.
 
-    # Of the images in dataset.h5, in pixels; the height follows.
+    Attributes
+    ----------
+    width_px : int
+        Width of the images in dataset.h5; the height follows.
+    units : str
+        Unit of the positions in the lists: "m", or "model" if it is unknown.
+    keep_outliers : bool
+        Whether to keep frames whose position is absurdly far from all others.
+    """
+
     width_px: int = 480
-    # What the lists' positions are in: "m", or "model" where it means nothing.
     units: str = "m"
-    # Whether positions absurdly far from all others are written too.
     keep_outliers: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """What was written. counts : frames by group; with_focal : those with known intrinsics."""
+    """Result of an import.
+
+    Attributes
+    ----------
+    counts : dict of str to int
+        Number of frames by group.
+    has_images : bool
+    with_focal : int
+        Number of frames with known intrinsics.
+    notes : tuple of str
+    """
 
     counts: dict[str, int]
     has_images: bool
@@ -67,7 +85,7 @@ class Imported:
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """N frames of all lists: names, (N,) role of each, poses, image files (None: there are none)."""
+    """N frames of all lists: names, (N,) roles, poses, image files (None if missing)."""
 
     names: tuple[str, ...]
     roles: np.ndarray
@@ -91,26 +109,45 @@ def import_cambridge(
     *,
     overwrite: bool = False,
 ) -> Imported:
-    """Write `target` from dataset_train.txt, and what lies beside it of the other lists, images and NVM.
+    """Write a data set from dataset_train.txt and, if present, the other lists, images and NVM model.
 
-    Images are reduced to the options' width and freed of the distortion that the NVM model states; none is
-    cut to a common view, for VisualSFM gives each image a focal length of its own. Raises InputError where
-    a list is missing or damaged, or `target` exists and `overwrite` is false.
+    Images are resized to the width of the options and undistorted by the NVM model. They are not cropped to
+    a common field of view, because VisualSFM estimates one focal length per image.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder with the lists.
+    target : Path
+        HDF5 file to write.
+    options : ImportOptions
+    progress : Progress
+    overwrite : bool
+        Whether `target` may be replaced.
+
+    Returns
+    -------
+    Imported
+
+    Raises
+    ------
+    InputError
+        If a list is missing or damaged, or `target` exists and `overwrite` is false.
     """
     if target.suffix.lower() not in (".h5", ".hdf5") or target.is_dir():
-        raise InputError("is not the name of an HDF5 file: it ends in .h5", path=target)
+        raise InputError("is not the name of an HDF5 file; it must end in .h5", path=target)
     if target.exists() and not overwrite:
-        raise InputError("exists already; --overwrite replaces it", path=target)
+        raise InputError("already exists; use --overwrite to replace it", path=target)
     frames, notes = _read_lists(folder, options)
     if not (frames.roles == Role.TRAIN).any():
-        raise InputError("lists no frame to train on", path=folder / LISTS[Role.TRAIN])
+        raise InputError("contains no training frame", path=folder / LISTS[Role.TRAIN])
     model = None
     if (folder / NVM).is_file():
         is_training = frames.roles == Role.TRAIN
         model = NvmFrames(read_nvm(folder / NVM), frames.names, frames.poses, is_training)
-        notes += _of_model(frames, model)
+        notes += _model_notes(frames, model)
     else:
-        notes.append(f"no {NVM}: focal lengths are unknown, and there are no points")
+        notes.append(f"no {NVM}: focal lengths are unknown and there are no map points")
     has_images = any(file is not None for file in frames.files)
     info = DatasetInfo(
         units=options.units,
@@ -141,29 +178,31 @@ def import_cambridge(
 
 
 def _read_lists(folder: Path, options: ImportOptions) -> tuple[_Frames, list[str]]:
-    """Frames of all lists that are there, and sentences on all that is odd about them."""
+    """Read the frames of all lists; return them with notes on anomalies."""
     if not folder.is_dir():
-        raise InputError("is no folder", path=folder)
+        raise InputError("is not a folder", path=folder)
     lists = {
         role: read_cambridge(folder / name)
         for role, name in LISTS.items()
         if role is Role.TRAIN or (folder / name).is_file()
     }
-    notes = [_NO_PLACE]
+    notes = [_NOT_GEOREFERENCED]
     if Role.TEST not in lists:
-        notes.append(f"no {LISTS[Role.TEST]}: there is nothing to evaluate on")
+        notes.append(f"no {LISTS[Role.TEST]}: there are no frames to evaluate on")
     listed: dict[str, str] = {}
     kept = []
     for role, found in lists.items():
         for name in found.names:
             if name in listed:
-                raise InputError(f"{name} is in {listed[name]} too", path=folder / LISTS[role])
+                raise InputError(f"{name} is also in {listed[name]}", path=folder / LISTS[role])
             listed[name] = LISTS[role]
         notes += [f"{LISTS[role]}: {sentence}" for sentence in find_anomalies(found)]
         far = position_outliers(found.poses.centers)
         if far.any() and not options.keep_outliers:
             names = [name for name, is_far in zip(found.names, far, strict=True) if is_far]
-            notes.append(f"{_some(names)}: left out for that position; --keep-outliers keeps it")
+            notes.append(
+                f"{_first_name(names)}: left out because of its position; use --keep-outliers to keep it"
+            )
         kept.append(_frames(folder, found, role, far & (not options.keep_outliers)))
     frames = _Frames(
         tuple(name for part in kept for name in part.names),
@@ -181,34 +220,36 @@ def _frames(folder: Path, found: CambridgeList, role: Role, dropped: np.ndarray)
 
 
 def _image_file(folder: Path, name: str) -> Path | None:
-    """The image as it is listed, or converted to another format since."""
+    """Return the listed image file, or the same image converted to another format; None if missing."""
     path = folder / name
     candidates = [path, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _without_missing_images(frames: _Frames, notes: list[str]) -> _Frames:
-    there = np.array([file is not None for file in frames.files], dtype=bool)
-    if not there.any():
-        notes.append("no image of the lists is there: poses alone, which can't be trained on")
+    exists = np.array([file is not None for file in frames.files], dtype=bool)
+    if not exists.any():
+        notes.append(
+            "none of the listed images exists: the data set has only poses and cannot be used for training"
+        )
         return frames
-    if not there.all():
-        gone = [name for name, is_there in zip(frames.names, there, strict=True) if not is_there]
-        notes.append(f"{_some(gone)}: left out, the image is missing")
-    return frames.select(np.flatnonzero(there))
+    if not exists.all():
+        missing = [name for name, found in zip(frames.names, exists, strict=True) if not found]
+        notes.append(f"{_first_name(missing)}: left out because the image is missing")
+    return frames.select(np.flatnonzero(exists))
 
 
-def _of_model(frames: _Frames, model: NvmFrames) -> list[str]:
+def _model_notes(frames: _Frames, model: NvmFrames) -> list[str]:
     notes = []
     for rows, what in (
         (~model.is_known, f"not in {NVM}, so the focal length is unknown"),
         (
             model.is_known & ~model.has_points,
-            f"the pose in {NVM} is another; its points are left out",
+            f"the pose in {NVM} is different, so its map points are left out",
         ),
     ):
         if rows.any():
-            notes.append(f"{_some([frames.names[k] for k in np.flatnonzero(rows)])}: {what}")
+            notes.append(f"{_first_name([frames.names[k] for k in np.flatnonzero(rows)])}: {what}")
     return notes
 
 
@@ -233,10 +274,10 @@ def _frame(
         camera = None if model is None else model.camera(k, width, height)
     except GeometryError as error:
         raise InputError(
-            f"its lens in {NVM} can't be used: {error}; without that file the images are taken as they are",
+            f"its lens in {NVM} cannot be used: {error}; remove that file to use the images as they are",
             path=file,
         ) from error
-    # Any focal length will do to reduce an image without knowing its own.
+    # Any focal length will do to resize an image whose focal length is unknown.
     assumed = Camera.from_horizontal_fov(width, height, 60.0)
     renderer = _renderer(_Key(assumed if camera is None else camera), options.width_px)
     frame = replace(frame, image=cv2.cvtColor(renderer.render(image), cv2.COLOR_BGR2RGB))
@@ -254,7 +295,7 @@ def _frame(
 
 
 class _Key:
-    """A camera by its values, to keep its renderer by."""
+    """Hashable camera, compared by value, as the key of cached renderers."""
 
     def __init__(self, camera: Camera):
         self.camera = camera
@@ -273,6 +314,6 @@ def _renderer(key: _Key, width_px: int) -> PinholeRenderer:
     return PinholeRenderer(camera, canonical_camera([camera], RenderingOptions(width_px=width_px)))
 
 
-def _some(names: Sequence[str]) -> str:
-    """The first name, and how many more."""
+def _first_name(names: Sequence[str]) -> str:
+    """Return the first name and the number of further ones."""
     return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")

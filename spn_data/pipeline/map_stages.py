@@ -1,4 +1,4 @@
-"""From sources to a georeferenced model: the stages of an area in their order, and its extension."""
+"""Mapping of an area: frames, model and georegistration, and its extension by new sources."""
 
 from __future__ import annotations
 
@@ -28,27 +28,38 @@ from spn_data.telemetry.track import TelemetrySummary
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """Of all stages."""
+    """Options of all mapping stages.
+
+    Attributes
+    ----------
+    frames : FramesOptions
+    model : ReconstructOptions
+    geo : GeoStageOptions or None
+        None: as the area was georegistered before, or the defaults.
+    """
 
     frames: FramesOptions = field(default_factory=FramesOptions)
     model: ReconstructOptions = field(default_factory=ReconstructOptions)
-    geo: GeoStageOptions | None = (
-        None  # None: as the area was georegistered before, else the defaults
-    )
+    geo: GeoStageOptions | None = None
 
 
 class Watcher(Protocol):
-    """Who looks on while the stages are made."""
+    """Observer of the mapping stages."""
 
-    def progress(self, step: str, done: int, total: int) -> None: ...
+    def progress(self, step: str, done: int, total: int) -> None:
+        """Report that `done` of `total` units of a step are done."""
 
-    def planned(self, found: Plan, model_cost: tuple[float, int]) -> None: ...
+    def planned(self, found: Plan, model_cost: tuple[float, int]) -> None:
+        """Report sources and expected cost (seconds, bytes) of the model, before any work."""
 
-    def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None: ...
+    def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None:
+        """Report the telemetry of a sequence; None if it has none."""
 
-    def stage(self, record: StageRecord) -> None: ...
+    def stage(self, record: StageRecord) -> None:
+        """Report that a stage is complete."""
 
-    def unchanged(self, record: StageRecord) -> None: ...
+    def unchanged(self, record: StageRecord) -> None:
+        """Report that a stage was up to date."""
 
 
 def reconstruct(
@@ -59,10 +70,27 @@ def reconstruct(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Frames, model and georegistration of the inputs. A stage made of the same is left as it is.
+    """Choose frames, reconstruct the model and georegister it.
 
-    Without telemetry there is no stage 3-geo. Raises StageError where telemetry does not determine the
-    place in the world; the model stands then all the same.
+    A stage with the same inputs and options is left unchanged. Without telemetry there is no stage 3-geo.
+
+    Parameters
+    ----------
+    area : Area
+    inputs : list of Path
+        Videos, or folders with videos or photos.
+    options : MapOptions
+    watcher : Watcher
+    overwrite : bool
+        Whether stages with other inputs or options may be replaced.
+
+    Raises
+    ------
+    StageError
+        If the reconstruction fails, or the telemetry does not determine the georegistration; the model is
+        then complete.
+    InputError
+        If an input cannot be used.
     """
     found = plan(inputs, options.frames, tested=area)
     _stages(area, found, inputs, options, watcher, overwrite=overwrite, extended=None)
@@ -76,11 +104,26 @@ def add(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Extend the area by the inputs; it stays as it is until its next version is complete.
+    """Extend an area by further sources; it does not change until its next version is complete.
 
-    Frames, features and matches are taken over, the origin is kept, the map is made anew. Sources that the
-    area holds already are passed over; InputError where there are no others. overwrite : starts anew where
-    another addition is unfinished.
+    Frames, features and matches are reused and the origin is kept, but the map is reconstructed again.
+    Sources that are already in the area are skipped.
+
+    Parameters
+    ----------
+    area : Area
+    inputs : list of Path
+    options : MapOptions
+    watcher : Watcher
+    overwrite : bool
+        Whether to discard another, unfinished extension.
+
+    Raises
+    ------
+    StageError
+        If the area has no model, or as in `reconstruct`.
+    InputError
+        If there is no new source, or an input cannot be used.
     """
     for stage in (FRAMES, MODEL):
         if not area.has(stage):
@@ -108,7 +151,7 @@ def _stages(
     overwrite: bool,
     extended: Area | None,
 ) -> None:
-    def tell(record: StageRecord, before: StageRecord | None) -> None:
+    def report(record: StageRecord, before: StageRecord | None) -> None:
         (watcher.unchanged if record == before else watcher.stage)(record)
 
     watcher.planned(found, _model_cost(found, options.model))
@@ -120,15 +163,16 @@ def _stages(
         watcher.progress,
         extend=extended,
         overwrite=overwrite,
-        tell=watcher.telemetry,
+        on_telemetry=watcher.telemetry,
     )
+    # Paths are relative to the folder that the area will finally have.
+    final = area if extended is None else extended
     earlier = () if extended is None else extended.facts.sources
-    lasting = area if extended is None else extended
-    given = [lasting.stored_path(path) for path in inputs]
-    area.write_facts(Facts(sources=(*earlier, *given), evaluation=lasting.facts.evaluation))
-    tell(frames, before.get(FRAMES))
+    added = [final.stored_path(path) for path in inputs]
+    area.write_facts(Facts(sources=(*earlier, *added), evaluation=final.facts.evaluation))
+    report(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
-    tell(model, before.get(MODEL))
+    report(model, before.get(MODEL))
     if not has_fixes(area):
         return
     try:
@@ -136,9 +180,9 @@ def _stages(
         geo = georegister(area, geo_options, watcher.progress, overwrite=overwrite)
     except GeometryError as error:
         raise StageError(
-            f"{area.folder(MODEL)} is complete, but its place in the world is refused: {error}"
+            f"{area.folder(MODEL)} is complete, but it cannot be georegistered: {error}"
         ) from error
-    tell(geo, before.get(GEO))
+    report(geo, before.get(GEO))
 
 
 def _geo_options(area: Area, options: MapOptions) -> GeoStageOptions:
@@ -148,7 +192,7 @@ def _geo_options(area: Area, options: MapOptions) -> GeoStageOptions:
 
 
 def _model_cost(found: Plan, options: ReconstructOptions) -> tuple[float, int]:
-    """(seconds, bytes) that the model of the frames to choose is expected to take."""
+    """Return the expected time (s) and disk space (bytes) of the model."""
     frames = max(1, found.cost.chosen)
     reduced = options.features.max_image_size_px**2 * 9 / 16 / 1e6
     megapixels = min(found.cost.chosen_megapixels / frames, reduced)

@@ -1,4 +1,4 @@
-"""Stage 2-model: chosen frames to one COLMAP model in its own gauge."""
+"""Stage 2-model: one COLMAP model of the chosen frames, in its own gauge."""
 
 from __future__ import annotations
 
@@ -49,15 +49,32 @@ def build_model(
     extend: Area | None = None,
     overwrite: bool = False,
 ) -> StageRecord:
-    """Reconstruct the area's frames into one model.
+    """Reconstruct one model from the chosen frames of an area.
 
-    extend : the area whose features and matches are taken over, if they were made with the same options.
+    Parameters
+    ----------
+    area : Area
+    options : ReconstructOptions
+    progress : Progress
+    extend : Area or None
+        Area whose features and matches are reused, if they were computed with the same options.
+    overwrite : bool
+        Whether a model with other options may be replaced.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    StageError
+        If too few frames can be registered.
     """
     made_of = {k: v for k, v in asdict(options).items() if k not in ("threads", "cluster")}
     work = area.begin(MODEL, made_of, {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
         return work
-    notes = () if extend is None else _take_over(extend, work)
+    notes = () if extend is None else _reuse_features(extend, work)
     frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     chosen = frames.select(frames.chosen)
     stopwatch = Stopwatch()
@@ -67,7 +84,7 @@ def build_model(
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
     unlabelled = _write_labels(work.path, result, chosen, stopwatch)
-    _name_results(work.path, result)
+    _move_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen, shutters),
         seconds=stopwatch.seconds,
@@ -77,22 +94,22 @@ def build_model(
             *result.attempts,
             *passages,
             *unlabelled,
-            *_focal_remarks(result.scene, to_map),
-            *(told for shutter in shutters if (told := shutter.describe())),
+            *_focal_notes(result.scene, to_map),
+            *(note for shutter in shutters if (note := shutter.describe())),
         ),
     )
 
 
-def _take_over(extend: Area, work: StageWork) -> tuple[str, ...]:
-    """Features and matches of an area, where they were made with the same options; else a note on it."""
+def _reuse_features(extend: Area, work: StageWork) -> tuple[str, ...]:
+    """Copy features and matches of an area; return a note if they were computed with other options."""
     before = extend.record(MODEL).made_of["options"]
     now = work.record.made_of["options"]
     for group in ("features", "matching"):
         for name, value in now[group].items():
             if before[group].get(name) != value:
                 return (
-                    f"features and matches are made anew: the area's were made with {name} = "
-                    f"{before[group].get(name)!r}, now {value!r}",
+                    "features and matches are recomputed: those of the area were computed with "
+                    f"{name} = {before[group].get(name)!r}, now {value!r}",
                 )
     if not (work.path / DATABASE).exists():
         copied = work.path / "copied.db"
@@ -102,7 +119,7 @@ def _take_over(extend: Area, work: StageWork) -> tuple[str, ...]:
 
 
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
-    """What reconstruction needs of the chosen frames, from stage 1."""
+    """Collect the input of the reconstruction from stage 1-frames."""
     folder = area.folder(FRAMES)
     start = read_json(folder / CAMERAS)["cameras"]
     masks = {p.stem: p for p in sorted((folder / MASKS).glob("*.png"))}
@@ -127,7 +144,7 @@ def _start_camera(key: str, start: Mapping[str, dict[str, Any]]) -> tuple[Camera
 
 
 def rough_positions(frames: Frames) -> np.ndarray:
-    """(N, 3) ENU metres by telemetry as it is, to find neighbours; NaN where there is no fix."""
+    """Return (N, 3) ENU metres from raw telemetry, to find neighbours; NaN without a fix."""
     known = frames.has_fix
     positions = np.full((len(frames), 3), np.nan)
     if known.any():
@@ -139,31 +156,31 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
-_FOCAL_SURPRISE = 1.1  # ratio to a focal length that was known
+_FOCAL_CHANGE = 1.1  # ratio of estimated and known focal length that deserves a note
 
 
-def _focal_remarks(scene: Scene, frames: FramesToMap) -> list[str]:
-    """A word where a focal length came out far from what it was said to be."""
+def _focal_notes(scene: Scene, frames: FramesToMap) -> list[str]:
+    """Return a note for each focal length that differs much from its known value."""
     return [
-        f"camera {change.camera}: the focal length came out at {change.estimated_px:.0f} px, "
+        f"camera {change.camera}: the focal length was estimated as {change.estimated_px:.0f} px, "
         f"{change.estimated_px / change.known_px - 1:+.0%} from the known {change.known_px:.0f} px. "
-        "A flight at one height that looks one way hardly determines it, and heights are off by as much; or "
-        "the video is cropped. --camera settles it"
-        for change in focal_changes(scene, frames, _FOCAL_SURPRISE)
+        "A flight at one height with one viewing direction hardly determines it, and heights have the same "
+        "relative error; or the video is cropped. Give a calibrated lens with --camera"
+        for change in focal_changes(scene, frames, _FOCAL_CHANGE)
     ]
 
 
 def _write_labels(
     work: Path, result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
 ) -> tuple[str, ...]:
-    """Write the labels of the mapping frames in the model's gauge; return a note if that is impossible."""
+    """Write labels of the mapping frames in the model's gauge; return a note if that is impossible."""
     reasons = {row.name: row.reason for row in result.registrations}
     model = (result.scene, result.observations, result.points)
     try:
         with stopwatch.step("covariance"):
             labels, seen = mapping_labels(chosen, *model, reasons)
     except GeometryError as error:
-        return (f"no covariance of the mapping frames: {error}",)
+        return (f"the mapping frames have no covariances: {error}",)
     write_labels(work / POSES, labels)
     write_label_observations(work / OBSERVATIONS, seen)
     return ()
@@ -172,7 +189,7 @@ def _write_labels(
 def _shutters(
     result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
 ) -> tuple[ShutterDiagnosis, ...]:
-    """Rolling shutter and stabilisation of each video; photos are taken too far apart to tell."""
+    """Diagnose rolling shutter and stabilisation of each video; the interval of photos is too long."""
     with stopwatch.step("shutter"):
         scene = result.scene
         row = {name: k for k, name in enumerate(chosen.names.tolist())}
@@ -184,8 +201,11 @@ def _shutters(
         )
 
 
-def _name_results(work: Path, result: ReconstructResult) -> None:
-    """The results under their names; what an interrupted run goes on from stays until the stage is done."""
+def _move_results(work: Path, result: ReconstructResult) -> None:
+    """Move the results to their final names.
+
+    Files that a resumed run needs are kept until the stage is complete.
+    """
     if result.database != work / DATABASE:
         (work / DATABASE).unlink()
         result.database.rename(work / DATABASE)

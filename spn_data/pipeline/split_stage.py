@@ -1,4 +1,4 @@
-"""Stage 5-split: frames divided into groups, as dataset.h5 and in the format of Cambridge Landmarks."""
+"""Stage 5-split: frames split into groups, as dataset.h5 and in the format of Cambridge Landmarks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from spn_data.work.timing import Progress, Stopwatch
 
 
 class CambridgeFrames(StrEnum):
-    """Which frames cambridge/ holds: its images are of full size."""
+    """Frames to write to cambridge/, where images have full size."""
 
     CHOSEN = "chosen"
     ALL = "all"
@@ -44,12 +44,21 @@ class CambridgeFrames(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class SplitStageOptions:
-    """How frames are divided, and what their images are made into."""
+    """Options of the split and of the images in the data set.
+
+    Attributes
+    ----------
+    split : SplitOptions
+    native : bool
+        Whether images of each lens are undistorted to its own field of view, instead of a common one.
+    width_px : int or None
+        Width of images in dataset.h5. None: 480, or that of the lens if `native`.
+    cambridge : CambridgeFrames
+        Frames to write to cambridge/.
+    """
 
     split: SplitOptions = field(default_factory=SplitOptions)
-    # Each lens keeps its own view, undistorted, instead of the one that all of them share.
     native: bool = False
-    # Width of images in dataset.h5. None: 480, or the lens's own where `native`.
     width_px: int | None = None
     cambridge: CambridgeFrames = CambridgeFrames.CHOSEN
 
@@ -62,10 +71,28 @@ def split_area(
     video_folder: Path | None = None,
     overwrite: bool = False,
 ) -> StageRecord:
-    """Divide the area's frames and write what networks train on; audit it at the end.
+    """Split the frames of an area, write the data set for training, and audit it.
 
-    video_folder : where the videos of tracked frames lie, besides the places that the area remembers.
-    Raises GeometryError where a group would be empty, StageError for stages missing or stale.
+    Parameters
+    ----------
+    area : Area
+    options : SplitStageOptions
+    progress : Progress
+    video_folder : Path or None
+        Where to look first for the videos of tracked frames.
+    overwrite : bool
+        Whether a split with other options may be replaced.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    GeometryError
+        If a group would be empty.
+    StageError
+        If a stage is missing or stale, or a video is not found.
     """
     work = area.begin(SPLIT, asdict(options), {}, overwrite=overwrite)
     if isinstance(work, StageRecord):
@@ -73,7 +100,7 @@ def split_area(
     try:
         return _split(area, work, options, video_folder, progress)
     except GeometryError:
-        work.discard()  # nothing in it is worth going on from
+        work.discard()  # nothing in it could be reused
         raise
 
 
@@ -136,7 +163,7 @@ def _write_files(
     which: CambridgeFrames,
     progress: Progress,
 ) -> None:
-    """dataset.h5 and cambridge/ in one pass over the images; none of them stays in memory."""
+    """Write dataset.h5 and cambridge/ in one pass over the images, without keeping them in memory."""
     labels = frames.labels
     listed = np.full(len(labels), which is not CambridgeFrames.NONE)
     if which is CambridgeFrames.CHOSEN:

@@ -1,4 +1,4 @@
-"""Stage 4-tracked/<sequence>: poses of the video frames between those that have one."""
+"""Stage 4-tracked/<sequence>: poses of the video frames between the chosen ones."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from spn_data.work.timing import Progress, Stopwatch
 
 
 def sequences_with_video(area: Area) -> list[str]:
-    """Mapping and evaluation sequences that are made of video. StageError where nothing is mapped."""
+    """Return mapping and evaluation sequences that are videos; raise StageError if there is no model."""
     area.record(MODEL)
     frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     names = np.unique(frames.sequences[frames.video_frame >= 0]).tolist()
@@ -69,10 +69,32 @@ def track_sequence(
     video: Path | None = None,
     overwrite: bool = False,
 ) -> StageRecord:
-    """Label the other frames of a mapping or evaluation sequence. The map is only read.
+    """Label the frames of a sequence that were not chosen, by tracking. The map is only read.
 
-    video : where to look for its files besides where they were. Raises StageError where the sequence is
-    unknown, is not made of video, or its video is not found.
+    Parameters
+    ----------
+    area : Area
+    sequence : str
+        A mapping or evaluation sequence.
+    progress : Progress
+    workers : int
+        Number of processes.
+    options : TrackingOptions or None
+    video : Path or None
+        Where to look first for the files of the video.
+    overwrite : bool
+        Whether labels with other options may be replaced.
+
+    Returns
+    -------
+    StageRecord
+
+    Raises
+    ------
+    InputError
+        If the sequence is unknown.
+    StageError
+        If it is not a video, or its video is not found.
     """
     options = options or TrackingOptions()
     frames = _frames_of(area, sequence)
@@ -127,14 +149,16 @@ def _frames_of(area: Area, sequence: str) -> Frames:
         frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
         frames = frames.select(frames.sequences == sequence)
     if not len(frames):
-        left = f"{TRACKED}/{sequence}"
-        more = f"; {left} is left of one, remove that folder" if area.has(left) else ""
-        raise InputError(f"there is no sequence {sequence!r} in {area.root}{more}")
+        leftover = f"{TRACKED}/{sequence}"
+        remedy = (
+            f"; {leftover} is a leftover of it: remove that folder" if area.has(leftover) else ""
+        )
+        raise InputError(f"there is no sequence {sequence!r} in {area.root}{remedy}")
     return frames
 
 
 def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, LabelObservations]:
-    """Labels of the frames that were chosen, and the points that they see."""
+    """Return the labels of the chosen frames, and the map points that they observe."""
     if sequence in labelled.evaluation:
         labels, seen = labelled.evaluation[sequence], labelled.evaluation_seen[sequence]
         rows = np.flatnonzero(~labels.tracked)
@@ -147,7 +171,7 @@ def _known(labelled: LabelledArea, sequence: str) -> tuple[Labels, LabelObservat
 def _with_covariances(
     area: Area, labelled: LabelledArea, labels: Labels, seen: LabelObservations, sequence: str
 ) -> Labels:
-    """The labels with what their points, the map's errors and the lens leave uncertain."""
+    """Add covariances from the errors of measurements, map and lens to the labels."""
     scene, observations, points = read_map(map_folder(area))
     map_covariance = MapCovariance.of(scene, observations)
     covariance = np.full((len(labels), 6, 6), np.nan)
@@ -176,9 +200,9 @@ def _points_of(seen: LabelObservations, row: int, points: MapPoints) -> PointObs
 def _camera_id(
     labelled: LabelledArea, key: str, names: tuple[str, ...], camera_ids: np.ndarray
 ) -> int:
-    """COLMAP's id of a mapping lens."""
-    mine = set(labelled.mapping.names[labelled.mapping.cameras == key].tolist())
-    return next(int(i) for name, i in zip(names, camera_ids, strict=True) if name in mine)
+    """Return the COLMAP id of a mapping camera."""
+    names_of_key = set(labelled.mapping.names[labelled.mapping.cameras == key].tolist())
+    return next(int(i) for name, i in zip(names, camera_ids, strict=True) if name in names_of_key)
 
 
 def _own_lens(area: Area, sequence: str, camera: Camera) -> LensUncertainty:
@@ -186,9 +210,9 @@ def _own_lens(area: Area, sequence: str, camera: Camera) -> LensUncertainty:
     value = read_json(path)
     try:
         names = lens_parameters(camera)
-        estimated = tuple(value["estimated"])  # none, where the lens was held
+        estimated = tuple(value["estimated"])  # empty if the lens was held fixed
         if estimated not in (names, ()):
-            raise ValueError("its covariance is of other parameters")
+            raise ValueError("its covariance is for other parameters")
         matrix = np.array(value["covariance"], np.float64).reshape((len(estimated),) * 2)
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: cannot be read ({error})") from error

@@ -185,7 +185,7 @@ def mask(path: Path, height: int, width: int, value: int) -> None:
 def test_masks_that_do_not_fit_are_refused_before_any_work(flight1: Path, tmp_path: Path) -> None:
     area = ("--area", tmp_path / "area")
     mask(tmp_path / "other" / "other.png", 180, 320, 255)
-    assert "holds no mask: none of flight1.png" in refused(
+    assert "contains no mask: none of flight1.png" in refused(
         flight1, *area, "--mask", tmp_path / "other"
     )
     mask(tmp_path / "tall.png", 320, 180, 255)

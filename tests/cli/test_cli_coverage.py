@@ -229,26 +229,26 @@ def test_options_that_do_not_fit_are_refused(area, words, message):
 def test_what_can_not_be_done_is_one_line(area, finished_area, tmp_path):
     """No sequence, no plan, an unknown camera, a file that is there: each is an error of one line."""
     shown = run("--area", finished_area, exit_code=1)
-    assert "no evaluation sequence is registered; spn-data register VIDEO --name NAME" in shown
+    assert "no evaluation sequence is registered; add one with spn-data register VIDEO" in shown
     assert "1-frames is missing" in run("--area", tmp_path / "none", exit_code=1)
     assert "cannot be read" in run("--area", area, "--waypoints", tmp_path / "no.csv", exit_code=1)
     plan = tmp_path / "plan.csv"
     plan.write_text("x,y,z,heading_deg,pitch_deg,camera\n0,0,4,0,0,wide\n")
     shown = run("--area", area, "--waypoints", plan, exit_code=1)
-    assert "plan.csv:2: the area holds no camera 'wide'; it holds" in shown
+    assert "plan.csv:2: the area has no camera 'wide'; cameras are" in shown
     for own in (area / "area.toml", area / FRAMES / "frames.csv"):
         before = own.read_bytes()
         shown = run("--area", area, "--fly-again", own, "--overwrite", exit_code=1)
-        assert "is not the name of a CSV file" in shown or "lies in a stage of an area" in shown
+        assert "is not the name of a CSV file" in shown or "is inside a stage of an area" in shown
         assert own.read_bytes() == before
     shown = run("--area", area, "--fly-again", plan, exit_code=1)
-    assert "exists already; --overwrite replaces it" in shown
+    assert "already exists; use --overwrite to replace it" in shown
     assert plan.read_text().startswith("x,y,z")
     run("--area", area, "--fly-again", plan, "--overwrite")
     assert plan.read_text().startswith("stop,lat_deg")
     shutil.rmtree(area / GEO)
     shown = run("--area", area, "--waypoints", plan, exit_code=1)
-    assert "the map has no East, North and Up" in shown
+    assert "--waypoints needs a georegistered map" in shown
 
 
 def test_every_option_is_documented():

@@ -89,7 +89,7 @@ def test_a_refused_georegistration_leaves_the_model_and_nothing_unfinished(
     wild = ("--gnss-sigma", "1000", "1000", "--ignore-gimbal")
     result = run("reconstruct", flight1, "--area", area, *FAST, *wild)
     assert result.exit_code == 1
-    assert "2-model is complete, but its place in the world is refused" in result.stderr
+    assert "2-model is complete, but it cannot be georegistered" in result.stderr
     assert not Area(area).partial(GEO).exists()
     assert Area(area).facts.sources == (str(flight1),)
     assert run("reconstruct", flight1, "--area", area, *FAST).exit_code == 0
@@ -132,7 +132,7 @@ def test_add_extends_an_area_and_keeps_what_it_had(
     assert not (area / ".next").exists()
     again = run("reconstruct", flight2, "--area", area, "--add", *FAST)
     assert again.exit_code == 1
-    assert "nothing to add: what it holds is already in the area" in again.stderr
+    assert "nothing to add: all files are already in the area" in again.stderr
 
 
 @pytest.mark.slow
@@ -158,7 +158,8 @@ def test_adding_with_other_options_says_that_features_are_made_anew(
     assert result.exit_code == 0, result.output
     told = " ".join(result.stdout.split())
     assert (
-        "features and matches are made anew: the area's were made with max_features = 800" in told
+        "features and matches are recomputed: those of the area were computed with max_features = 800"
+        in told
     )
 
 
@@ -215,7 +216,7 @@ def test_a_focal_length_far_from_what_was_given_is_told(flight1: Path, tmp_path:
     record = Area(tmp_path / "area").record(MODEL)
     assert 66 < record.counts["cameras"]["flight1"]["fov_deg"] < 78
     assert any(
-        note.startswith("camera flight1: the focal length came out") for note in record.notes
+        note.startswith("camera flight1: the focal length was estimated") for note in record.notes
     )
 
 

@@ -99,7 +99,7 @@ def test_a_folder_that_is_no_area_is_refused(tmp_path):
     ran = run(folder)
     assert ran.exit_code == 1
     assert ran.output.splitlines() == [
-        f"Error: {folder} holds no frames; run spn-data reconstruct first"
+        f"Error: {folder} contains no frames; run spn-data reconstruct first"
     ]
     assert not folder.exists()
 
@@ -112,4 +112,4 @@ def test_damaged_residuals_are_an_error(area):
     path.write_text(json.dumps(value))
     ran = run(area)
     assert ran.exit_code == 1
-    assert "its residuals are not those of its frames" in ran.output
+    assert "the numbers of residuals and frames differ" in ran.output

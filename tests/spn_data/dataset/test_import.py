@@ -72,8 +72,8 @@ def test_lists_alone_say_what_they_lack(shared_data, tmp_path):
     assert done.with_focal == 0
     notes = "\n".join(done.notes)
     for part in (
-        "no known origin and no known up",
-        "no image of the lists",
+        "unknown origin and up direction",
+        "none of the listed images",
         "focal lengths are unknown",
     ):
         assert part in notes
@@ -97,7 +97,7 @@ def test_the_outlier_of_great_court_is_left_out_and_reported(shared_data, tmp_pa
     assert done.counts == {"train": 1531, "test": 760}
     notes = [note for note in done.notes if OUTLIER in note]
     assert any("from the median position" in note for note in notes)
-    assert f"{OUTLIER}: left out for that position; --keep-outliers keeps it" in notes
+    assert f"{OUTLIER}: left out because of its position; use --keep-outliers to keep it" in notes
     with Dataset(tmp_path / "dataset.h5") as dataset:
         assert OUTLIER not in dataset.groups["train"].names
         assert np.abs(dataset.groups["train"].poses.centers).max() < 1000
@@ -195,7 +195,7 @@ def test_points_of_another_world_are_left_out(scene, tmp_path):
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
     assert done.with_focal == 6
     assert (
-        f"{NAMES[0]} and 5 more: the pose in reconstruction.nvm is another; its points are left out"
+        f"{NAMES[0]} and 5 more: the pose in reconstruction.nvm is different, so its map points are left out"
         in (done.notes)
     )
     with Dataset(tmp_path / "dataset.h5") as dataset:
@@ -221,13 +221,13 @@ def test_a_missing_image_is_left_out_and_reported(scene, tmp_path):
     (scene / NAMES[2]).unlink()
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
     assert done.counts == {"train": 3, "test": 2}
-    assert f"{NAMES[1]}: left out, the image is missing" in done.notes
+    assert f"{NAMES[1]}: left out because the image is missing" in done.notes
 
 
 def test_an_image_in_two_lists_is_refused(scene, tmp_path):
     """What trains must not test."""
     write_cambridge(scene / "dataset_validation.txt", [NAMES[0]], poses()[:1])
-    with pytest.raises(InputError, match=r"seq1/frame00000.png is in dataset_train.txt too"):
+    with pytest.raises(InputError, match=r"seq1/frame00000.png is also in dataset_train.txt"):
         run(scene, tmp_path / "dataset.h5")
     assert not (tmp_path / "dataset.h5").exists()
 
@@ -236,7 +236,7 @@ def test_a_folder_without_a_training_list_is_refused(tmp_path):
     """The message names the file that is missing."""
     with pytest.raises(InputError, match=r"dataset_train\.txt: does not exist"):
         run(tmp_path, tmp_path / "dataset.h5")
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         run(tmp_path / "nothing", tmp_path / "dataset.h5")
 
 
@@ -275,10 +275,10 @@ def test_the_command_tells_what_it_did(scene, tmp_path):
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 0, done.output
     assert "train 4, test 2; focal length known of 6" in " ".join(done.output.split())
-    assert "no known origin and no known up" in " ".join(done.output.split())
+    assert "unknown origin and up direction" in " ".join(done.output.split())
     again = CliRunner().invoke(main, words)
     assert again.exit_code == 1
-    assert "exists already; --overwrite replaces it" in again.output
+    assert "already exists; use --overwrite to replace it" in again.output
     assert CliRunner().invoke(main, [*words, "--overwrite"]).exit_code == 0
 
 
@@ -315,6 +315,6 @@ def test_only_files_that_are_data_sets_are_replaced(scene, tmp_path):
 
 def test_lists_without_a_frame_are_refused(tmp_path):
     write_cambridge(tmp_path / "dataset_train.txt", [], Poses(np.zeros((0, 3)), np.zeros((0, 4))))
-    with pytest.raises(InputError, match="lists no frame to train on"):
+    with pytest.raises(InputError, match="contains no training frame"):
         run(tmp_path, tmp_path / "dataset.h5")
     assert not (tmp_path / "dataset.h5").exists()

@@ -451,7 +451,7 @@ def test_without_a_place_everything_says_that_it_is_no_metres(
     assert done.exit_code == 0, done.output
     told = " ".join(done.output.split())
     assert "lengths are in units of the model, not metres" in told
-    assert "geojson is left out: it needs a place in the world" in told
+    assert "geojson is left out: it needs a georegistered map" in told
     out = tmp_path / "out"
     written = {path.name for path in out.iterdir() if path.is_dir()}
     assert written == {*FORMATS} - {"geojson", "kml", "all"}
@@ -479,7 +479,7 @@ def test_a_target_is_refused_unless_it_is_free_or_an_earlier_export(
     assert run("tum", target, area).exit_code == 0
     done = run("kml", target, area)
     assert done.exit_code == 1
-    assert "holds an export already; --overwrite replaces it" in done.output
+    assert "already contains an export; use --overwrite to replace it" in done.output
     assert run("kml", target, area, "--overwrite").exit_code == 0
     assert sorted(path.name for path in target.iterdir()) == ["export.json", "frames.kml"]
     assert run("all", target, area, "--overwrite", "--no-images").exit_code == 0
@@ -489,21 +489,21 @@ def test_a_target_is_refused_unless_it_is_free_or_an_earlier_export(
     (mine / "thesis.txt").write_text("years of work")
     done = run("tum", mine, area, "--overwrite")
     assert done.exit_code == 1
-    assert "holds files that are no export" in done.output
+    assert "contains other files" in done.output
     assert (mine / "thesis.txt").read_text() == "years of work"
     done = run("tum", mine / "thesis.txt", area, "--overwrite")
     assert "is not a folder" in done.output
     for inside in (area, area / "3-geo", area / "3-geo" / "new", area / "4-eval" / "new"):
         done = run("tum", inside, area, "--overwrite")
         assert done.exit_code == 1
-        assert "belongs to the area itself" in done.output
+        assert "is part of the area" in done.output
 
 
 def test_what_can_not_be_exported_is_said(area: Path, tmp_path: Path) -> None:
     done = run("tum", tmp_path / "out", area, "--sequence", "../../etc")
-    assert "there is no sequence '../../etc'; there are again, flight1" in done.output
+    assert "there is no sequence '../../etc'; the area has: again, flight1" in done.output
     done = run("nvm", tmp_path / "out", area, "--all-frames")
-    assert "lists images, and --all-frames adds frames" in done.output
+    assert "lists images, but frames added by --all-frames" in done.output
     done = run("tum", tmp_path / "out", tmp_path / "no-area")
     assert done.exit_code == 1
     assert not (tmp_path / "out").exists()

@@ -384,7 +384,7 @@ def test_an_evaluation_flight_stays_out_of_the_map(registered: Path, flight2: Pa
     for how in ("--add", "--overwrite"):
         result = run("reconstruct", flight2, how, "--area", registered)
         assert result.exit_code == 1
-        assert "flight2.mp4: is of the evaluation sequence medium" in result.stderr
+        assert "flight2.mp4: belongs to the evaluation sequence medium" in result.stderr
         assert "remove its folders" in result.stderr
 
 
@@ -404,7 +404,7 @@ def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
     assert "4-tracked/medium is stale" in refused.stderr
     told = run("register", "--all-frames", "--name", "medium", "--area", area)
     assert told.exit_code == 1
-    assert "4-tracked/medium is left of one, remove that folder" in told.stderr
+    assert "4-tracked/medium is a leftover of it: remove that folder" in told.stderr
 
 
 def test_frames_between_need_a_map(tmp_path: Path) -> None:
@@ -560,14 +560,14 @@ def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
 
 def test_a_lens_that_may_be_the_maps_own_is_compared_with_it() -> None:
     """10 % apart on images of one size is told; the same lens, another one and another size are not."""
-    from spn_data.pipeline.evaluation_stage import lens_remarks
+    from spn_data.pipeline.evaluation_stage import lens_notes
 
     def lens(focal_px: float, width: int = 800) -> Camera:
         return Camera("RADIAL", width, 600, np.array([focal_px, width / 2, 300.0, 0.0, 0.0]))
 
-    (told,) = lens_remarks(lens(486.0), {"east": lens(440.0)})
+    (told,) = lens_notes(lens(486.0), {"east": lens(440.0)})
     assert "486 px" in told
     assert "east" in told
     assert "about 10%" in told
     for other in (lens(482.0), lens(800.0), lens(440.0, 1000)):
-        assert lens_remarks(lens(486.0), {"east": other}) == []
+        assert lens_notes(lens(486.0), {"east": other}) == []
