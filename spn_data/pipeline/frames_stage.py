@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from spn_data.area.area import Area
@@ -15,7 +14,6 @@ from spn_data.capture.candidates import Candidates, analyse, build_frames
 from spn_data.capture.extraction import ExtractionCost, check_space, estimate_cost, extract_chosen
 from spn_data.capture.frames import Frames, read_frames, write_frames
 from spn_data.capture.photo_selection import choose_photos
-from spn_data.capture.photos import load_mask
 from spn_data.capture.selection import (
     FrameChoice,
     SelectionOptions,
@@ -23,13 +21,13 @@ from spn_data.capture.selection import (
     choose_all,
 )
 from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, SourceKind, discover
-from spn_data.capture.video import probe
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.geometry.geodesy import metres_from_first_fix
 from spn_data.inputs.file_links import link_or_copy
 from spn_data.inputs.flight_telemetry import check_telemetry, source_telemetry, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.sequence_masks import check_mask, find_masks, write_mask
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import read_json, write_json
@@ -165,22 +163,6 @@ def _evaluation_files(area: Area) -> dict[str, str]:
     }
 
 
-def find_masks(sources: tuple[Source, ...], given: str | None) -> dict[str, Path]:
-    """Return the mask of each sequence that has one; raise InputError if a folder contains none of them."""
-    if given is None:
-        return {}
-    path = Path(given)
-    if not path.is_dir():
-        return {source.sequence: path for source in sources}
-    files = {source.sequence: path / f"{source.sequence}.png" for source in sources}
-    found = {name: file for name, file in files.items() if file.exists()}
-    if not found:
-        raise InputError(
-            f"contains no mask: none of {', '.join(f.name for f in files.values())}", path=path
-        )
-    return found
-
-
 def choose_frames(
     area: Area,
     found: Plan,
@@ -247,7 +229,7 @@ def choose_frames(
         frames = _frames_with_telemetry(one, track, choice, work.path / TELEMETRY)
         cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
-            _write_mask(masks[one.source.sequence], frames, work.path / MASKS)
+            write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:
             notes.append(f"{one.source.sequence}: no mask with this name")
         with stopwatch.step("frames"):
@@ -278,7 +260,7 @@ def _check_sources(
         if not options.any_telemetry:
             check_telemetry(source)
         if source.sequence in masks:
-            _check_mask(masks[source.sequence], source)
+            check_mask(masks[source.sequence], source)
 
 
 def _measure(
@@ -382,19 +364,3 @@ def _positions(rows: Telemetry) -> np.ndarray:
 def _check_enough_readable(candidates: list[Candidates]) -> None:
     if sum(int(one.measured.readable.sum()) for one in candidates) < 3:
         raise InputError("fewer than three images can be read, too few for a model")
-
-
-def _check_mask(path: Path, source: Source) -> None:
-    """Raise InputError if a mask does not fit its video."""
-    if source.kind is SourceKind.VIDEO:
-        info = probe(source.parts[0])
-        load_mask(path, info.width, info.height)
-
-
-def _write_mask(path: Path, frames: Frames, folder: Path) -> None:
-    """Write the mask of a source in the size of its images."""
-    row = int(np.flatnonzero(frames.width > 0)[0])
-    usable = load_mask(path, int(frames.width[row]), int(frames.height[row]))
-    ok, data = cv2.imencode(".png", usable.astype(np.uint8) * 255)
-    assert ok
-    (folder / f"{frames.sequences[0]}.png").write_bytes(data.tobytes())
