@@ -7,6 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+# The centre of the upper-left pixel is (0.5, 0.5) in COLMAP's convention, (0, 0) in OpenCV's.
+_HALF_PIXEL = 0.5
+# The shifts between them as homographies of pixels.
+OPENCV_FROM_COLMAP = np.array([[1, 0, -_HALF_PIXEL], [0, 1, -_HALF_PIXEL], [0, 0, 1]])
+COLMAP_FROM_OPENCV = np.array([[1, 0, _HALF_PIXEL], [0, 1, _HALF_PIXEL], [0, 0, 1]])
+
 # Parameter names of each model, in COLMAP's order.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -15,6 +21,16 @@ MODELS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
+
+
+def opencv_pixels(pixels: np.ndarray) -> np.ndarray:
+    """Convert pixels from COLMAP's convention to OpenCV's: from a first pixel centre of 0.5 to 0."""
+    return pixels - _HALF_PIXEL
+
+
+def colmap_pixels(pixels: np.ndarray) -> np.ndarray:
+    """Convert pixels from OpenCV's convention, or array indices, to COLMAP's: from 0 to 0.5."""
+    return pixels + _HALF_PIXEL
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +102,6 @@ class Camera:
         return np.array([[fx, 0, self._get("cx")], [0, fy, self._get("cy")], [0, 0, 1.0]])
 
     @property
-    def opencv_matrix(self) -> np.ndarray:
-        """Calibration matrix K (3, 3) in OpenCV's convention: the upper-left pixel centre is (0, 0)."""
-        k = self.matrix
-        k[:2, 2] -= 0.5
-        return k
-
-    @property
     def opencv_distortion(self) -> np.ndarray:
         """Distortion coefficients (k1, k2, p1, p2) in OpenCV's order."""
         return np.array([self._get("k1"), self._get("k2"), self._get("p1"), self._get("p2")])
@@ -118,19 +127,22 @@ class Camera:
         points = np.asarray(points_cam, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = np.where(points[:, 2:] > 0, points[:, :2] / points[:, 2:], np.nan)
+        k = self.matrix
+        return self.distort(xy) * np.array([k[0, 0], k[1, 1]]) + k[:2, 2]
+
+    def distort(self, rays: np.ndarray) -> np.ndarray:
+        """Apply the lens distortion to normalised image coordinates (N, 2), x/z and y/z."""
         k1, k2, p1, p2 = self.opencv_distortion
-        x, y = xy[:, 0], xy[:, 1]
+        x, y = rays[:, 0], rays[:, 1]
         r2 = x * x + y * y
         radial = 1 + k1 * r2 + k2 * r2 * r2
-        distorted = np.stack(
+        return np.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
                 y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
             ],
             axis=1,
         )
-        k = self.matrix
-        return distorted * np.array([k[0, 0], k[1, 1]]) + k[:2, 2]
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
         """Undistort pixels to normalised image coordinates.

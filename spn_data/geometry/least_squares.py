@@ -55,13 +55,7 @@ def projection_jacobians(camera: Camera, points_cam: np.ndarray) -> tuple[np.nda
     xy_by_point = np.stack(
         [np.stack([1 / z, zero, -x / z], axis=-1), np.stack([zero, 1 / z, -y / z], axis=-1)], axis=1
     )
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ],
-        axis=1,
-    )
+    distorted = camera.distort(np.column_stack([x, y]))
     one = np.ones_like(x)
     by_lens = np.zeros((len(z), 2, LENS))
     by_lens[:, 0, 0], by_lens[:, 1, 1] = distorted[:, 0], distorted[:, 1]

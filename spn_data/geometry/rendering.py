@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import Camera, opencv_pixels
 
 _WIDEST_TAN = np.tan(np.deg2rad(85.0))  # a pinhole image wider than 170 degrees is useless
 _BORDER_POINTS = 512  # per side
@@ -162,7 +162,7 @@ class PinholeRenderer:
         self._samples = self._samples_per_side(corners, shape, sample_step_px)
         fine = target.scaled(target.width * self._samples, target.height * self._samples)
         source = _project(camera, _grid(fine, fine.width, fine.height, first=0.5))
-        source = (source - 0.5).reshape(fine.height, fine.width, 2).astype(np.float32)
+        source = opencv_pixels(source).reshape(fine.height, fine.width, 2).astype(np.float32)
         self._maps = cv2.convertMaps(source, None, cv2.CV_16SC2)
 
     @property

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.geometry.camera import colmap_pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +136,8 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
     order = np.argsort([-p.response for p in points], kind="stable")[: options.max_features]
     xy = np.array([points[i].pt for i in order], dtype=np.float64)
     size_angle = np.array([(points[i].size / 2, np.deg2rad(points[i].angle)) for i in order])
-    # OpenCV's pixel centres are at integers.
     factors = np.array([width / small_width, height / small_height])
-    xy = (xy + 0.5) * factors
+    xy = colmap_pixels(xy) * factors
     size_angle[:, 0] *= factors.mean()
     keypoints = np.concatenate([xy, size_angle], axis=1).astype(np.float32)
     return Features(keypoints, root_sift(raw[order]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import Camera, colmap_pixels
 
 TILE_PX = 32
 
@@ -33,8 +33,8 @@ class RayGrid:
     ) -> RayGrid:
         """Compute the rays of image rows, with samples at the given offsets (S, 2) from pixel centres."""
         samples = len(offsets_px)
-        x = (np.arange(camera.width) + 0.5)[:, None] + offsets_px[:, 0]
-        y = (np.arange(first_row, last_row) + 0.5)[:, None, None] + offsets_px[:, 1]
+        x = colmap_pixels(np.arange(camera.width))[:, None] + offsets_px[:, 0]
+        y = colmap_pixels(np.arange(first_row, last_row))[:, None, None] + offsets_px[:, 1]
         pixels = np.stack(np.broadcast_arrays(x[None], y), axis=-1)
         rays = camera.unproject(pixels.reshape(-1, 2)).astype(np.float32)
         rays = rays.reshape(last_row - first_row, camera.width * samples, 2)

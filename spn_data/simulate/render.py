@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import OPENCV_FROM_COLMAP, Camera
 from spn_data.simulate.faces import MAX_CORNERS, Face, Texture
 from spn_data.simulate.rays import TILE_PX, RayGrid
 
@@ -214,8 +214,7 @@ class SceneRenderer:
         base = self._textures[face].levels[0].shape
         image = self._textures[face].levels[level]
         sx, sy = image.shape[1] / base[1], image.shape[0] / base[0]
-        # OpenCV's texel centres are at integers, ours at half-integers.
-        level_from_texel = np.array([[sx, 0, -0.5], [0, sy, -0.5], [0, 0, 1]])
+        level_from_texel = OPENCV_FROM_COLMAP @ np.diag([sx, sy, 1.0])
         texel_from_ray = level_from_texel @ self._texel_from_face[face] @ face_from_ray[face]
         texels = cv2.perspectiveTransform(rays, texel_from_ray)
         return cv2.remap(image, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import Camera, colmap_pixels, opencv_pixels
 from spn_data.geometry.grouping import rank_within_group
 from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
@@ -152,9 +152,8 @@ def track_points(
     rows = np.flatnonzero(found)
     if len(rows) == 0:
         return result, found
-    half = np.float32(0.5)  # OpenCV's pixel centres are at integers
-    start = pixels[rows].astype(np.float32) - half
-    there = expected[rows].astype(np.float32) - half
+    start = opencv_pixels(pixels[rows].astype(np.float32))
+    there = opencv_pixels(expected[rows].astype(np.float32))
     search = (
         (options.window_px, options.window_px),
         levels,
@@ -167,7 +166,7 @@ def track_points(
     )
     closed = np.linalg.norm(back - start, axis=1) <= options.round_trip_px
     inside = np.all((there >= 0) & (there <= [width - 1, height - 1]), axis=1)
-    result[rows] = there.astype(np.float64) + 0.5
+    result[rows] = colmap_pixels(there.astype(np.float64))
     found[rows] = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed & inside
     return result, found
 
@@ -233,7 +232,7 @@ def _rough_pose(
 
 
 def _project(camera: Camera, poses: Poses, xyz: np.ndarray) -> np.ndarray:
-    return camera.project((xyz - poses.centers[0]) @ poses.rotations[0].T)
+    return camera.project(poses.to_camera(xyz))
 
 
 @dataclass(frozen=True, eq=False)

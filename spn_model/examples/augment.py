@@ -12,11 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from spn_data.geometry.camera import COLMAP_FROM_OPENCV, OPENCV_FROM_COLMAP
 from spn_data.geometry.pose import Poses, rotations_from_vectors
-
-# OpenCV's origin is the centre of the upper-left pixel.
-_CV2_FROM_COLMAP = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
-_COLMAP_FROM_CV2 = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +92,7 @@ class Warp:
             image = half
         return cv2.warpPerspective(
             image,
-            _CV2_FROM_COLMAP @ homography @ _COLMAP_FROM_CV2,
+            OPENCV_FROM_COLMAP @ homography @ COLMAP_FROM_OPENCV,
             (self.width, self.height),
             flags=cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,

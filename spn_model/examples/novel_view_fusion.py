@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from spn_data.dataset.hdf5_reader import FramePoints
+from spn_data.geometry.camera import colmap_pixels, opencv_pixels
 from spn_data.geometry.pose import Poses
 from spn_model.examples.ground import Ground
 from spn_model.examples.point_targets import Surface, SurfaceOptions, cell_centers, surface
@@ -92,7 +93,7 @@ def fused_view(
         normals = _normals(inverse, small)
         inverse = np.where(np.isnan(seen.inverse_depth), inverse, np.nan)
         y, x = np.nonzero(np.isfinite(inverse))
-        at = np.column_stack([x, y]) + 0.5
+        at = colmap_pixels(np.column_stack([x, y]))
         xyz = replace(seen, inverse_depth=inverse).xyz(at)
         normal = normals[y, x] @ pose.rotations[0]
         colours, shown = _painted(
@@ -217,7 +218,7 @@ def _ground_depth(
     above = ~ground.is_at_or_below(points.xyz)
     before = Occluders.from_points(
         points.pixels[above],
-        (points.xyz[above] - pose.centers[0]) @ pose.rotations[0][2],
+        pose.depths(points.xyz[above]),
         size,
         _BEFORE_PX,
     )
@@ -256,8 +257,8 @@ def _colours(image: np.ndarray, at: np.ndarray, finer: float) -> np.ndarray:
     if by > 1:
         size = (image.shape[1] // by, image.shape[0] // by)
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # OpenCV's origin is the centre of the upper-left pixel, and maps need fewer than 32767 rows.
-    maps = (at / by - 0.5).astype(np.float32)
+    maps = opencv_pixels(at / by).astype(np.float32)
+    # OpenCV's maps need fewer than 32767 rows.
     side = int(np.ceil(np.sqrt(len(maps))))
     maps = np.resize(maps, (side, side, 2))
     drawn = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

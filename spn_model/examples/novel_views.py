@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from spn_data.geometry.camera import opencv_pixels
 from spn_data.geometry.pose import Poses, rotations_from_vectors
 from spn_model.examples.point_targets import Surface, cell_centers
 
@@ -58,11 +59,11 @@ def nearby_pose(generator: np.random.Generator, seen: Surface, options: NovelVie
     xyz = xyz[np.isfinite(xyz[:, 0])]
     if not len(xyz):
         raise ValueError("the surface that the image shows is unknown")
-    center, rotation = seen.pose.centers[0], seen.pose.rotations[0]
     # Without this limit, the sky and distant hills would pull the view away from the scene.
-    depth = (xyz - center) @ rotation[2]
+    depth = seen.pose.depths(xyz)
     aim = np.median(xyz[depth < 3 * np.median(depth)], axis=0)
     up = np.array(options.up)
+    center, rotation = seen.pose.centers[0], seen.pose.rotations[0]
     aside = generator.uniform(-1, 1, 3) * options.side_m
     move = aside + up * (generator.uniform(0, options.rise_m) - aside @ up)
     before, after = aim - center, aim - center - move
@@ -155,12 +156,12 @@ def warp_to_pose(
     """
     step, (rows, columns) = seen.step_px, seen.inverse_depth.shape
     source = _pixels(seen)
-    x = (seen.xyz(source) - pose.centers[0]) @ pose.rotations[0].T
+    x = pose.to_camera(seen.xyz(source))
     with np.errstate(invalid="ignore"):
         ahead = x[:, 2] > _NEAREST
     source, x = source[ahead], x[ahead]
     projected = x @ seen.matrix.T
-    at = projected[:, :2] / projected[:, 2:] / step - 0.5
+    at = opencv_pixels(projected[:, :2] / projected[:, 2:] / step)
     inside = _within(at, -1, columns, rows)
     source, at, depth = source[inside], at[inside], x[inside, 2]
     sums = _splat(at, depth, np.column_stack([source, 1 / depth]), columns, rows)

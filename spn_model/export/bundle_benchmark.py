@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import Camera, colmap_pixels, opencv_pixels
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.json_files import write_json
 from spn_model.evaluation.validation import spread_rows
@@ -110,6 +111,38 @@ def benchmark(
     )
 
 
+def benchmark_on_dataset(
+    folder: Path, dataset: Path, options: BenchmarkOptions | None = None
+) -> tuple[BundleCost, ...]:
+    """Time each graph of a bundle on frames rendered from a data set.
+
+    Parameters
+    ----------
+    folder : Path
+        Bundle.
+    dataset : Path
+        Data set whose images are used.
+    options : BenchmarkOptions, optional
+        What is timed.
+
+    Returns
+    -------
+    tuple of BundleCost
+        One for each graph of the bundle.
+
+    Raises
+    ------
+    InputError, FormatError
+        If the bundle or the data set cannot be used.
+    StageError
+        If the process fails; the message holds its last line.
+    """
+    options = options or BenchmarkOptions()
+    with tempfile.TemporaryDirectory(prefix="spn-benchmark-") as scratch:
+        frames, camera = render_flight_frames(folder, dataset, Path(scratch), options.frames)
+        return benchmark(folder, frames, camera, options)
+
+
 def render_flight_frames(
     folder: Path, dataset: Path, scratch: Path, count: int
 ) -> tuple[list[Path], Path]:
@@ -146,7 +179,7 @@ def render_flight_frames(
         *_SIZE, min(view.horizontal_fov_deg * _FIELD_OF_VIEW_FACTOR, 160), _DISTORTION
     )
     rays = camera.unproject(
-        np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in _SIZE)), -1).reshape(-1, 2)
+        np.stack(np.meshgrid(*(colmap_pixels(np.arange(n)) for n in _SIZE)), -1).reshape(-1, 2)
     )
     with Dataset(dataset) as data:
         groups = [group for group in evaluation_groups(data) if group.image_size is not None]
@@ -161,7 +194,7 @@ def render_flight_frames(
         for k, (group, row) in enumerate(chosen[:count]):
             image = cv2.cvtColor(group.image(row), cv2.COLOR_RGB2BGR)
             own = view.scaled(image.shape[1], image.shape[0])
-            at = own.project(np.column_stack([rays, np.ones(len(rays))])) - 0.5
+            at = opencv_pixels(own.project(np.column_stack([rays, np.ones(len(rays))])))
             at = at.reshape(_SIZE[1], _SIZE[0], 2).astype(np.float32)
             seen = cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             paths.append(scratch / f"{k}.png")

@@ -7,7 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.camera import (
+    MODELS,
+    OPENCV_FROM_COLMAP,
+    Camera,
+    colmap_pixels,
+    opencv_pixels,
+)
 
 PARAMS = {
     "SIMPLE_PINHOLE": [900.0, 640.0, 355.0],
@@ -40,10 +46,12 @@ def test_projection_agrees_with_opencv_half_a_pixel_off(model):
     """OpenCV's upper-left pixel has its centre at (0, 0), COLMAP's at (0.5, 0.5)."""
     camera = _camera(model)
     zero = np.zeros(3)
-    theirs, _ = cv2.projectPoints(
-        _points(), zero, zero, camera.opencv_matrix, camera.opencv_distortion
-    )
-    assert camera.project(_points()) == pytest.approx(theirs.reshape(-1, 2) + 0.5, abs=1e-9)
+    matrix = OPENCV_FROM_COLMAP @ camera.matrix
+    theirs, _ = cv2.projectPoints(_points(), zero, zero, matrix, camera.opencv_distortion)
+    ours = camera.project(_points())
+    assert ours == pytest.approx(theirs.reshape(-1, 2) + 0.5, abs=1e-9)
+    assert colmap_pixels(opencv_pixels(ours)) == pytest.approx(ours, abs=1e-9)
+    assert opencv_pixels(ours) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
 
 
 @pytest.mark.parametrize("model", MODELS)
