@@ -37,10 +37,8 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def a_scene(names: list[str], poses: Poses) -> Scene:
-    none = np.zeros(0)
-    return Scene(
-        tuple(names), poses, np.ones(len(names), int), {}, np.zeros((0, 3)), none, none.astype(int)
-    )
+    none = np.zeros(0, int)
+    return Scene(tuple(names), poses, np.ones(len(names), int), {}, np.zeros((0, 3)), none)
 
 
 def some_poses(n: int) -> Poses:

@@ -39,8 +39,6 @@ class Scene:
     cameras : dict of int to Camera
         By COLMAP's camera id.
     points : ndarray, shape (P, 3)
-    point_errors_px : ndarray, shape (P,)
-        Mean reprojection errors.
     track_lengths : ndarray, shape (P,)
     """
 
@@ -49,7 +47,6 @@ class Scene:
     camera_ids: np.ndarray
     cameras: dict[int, Camera]
     points: np.ndarray
-    point_errors_px: np.ndarray
     track_lengths: np.ndarray
 
 
@@ -139,7 +136,6 @@ def scene_of(native: pycolmap.Reconstruction) -> Scene:
         np.array([i for i, _ in points], np.int64),
         np.array([p.xyz for _, p in points]).reshape(-1, 3),
         np.array([p.color for _, p in points], np.uint8).reshape(-1, 3),
-        np.array([p.error for _, p in points]),
         np.array([p.track.length() for _, p in points], dtype=np.int64),
     )
     return _scene(native, table)
@@ -157,7 +153,6 @@ def _scene(native: pycolmap.Reconstruction, points: PointTable) -> Scene:
         np.array([image.camera_id for image in images], dtype=np.int64),
         {i: from_native_camera(camera) for i, camera in native.cameras.items()},
         points.xyz,
-        points.errors_px,
         points.track_lengths,
     )
 
@@ -184,11 +179,6 @@ def read_map(folder: Path) -> tuple[Scene, MapObservations, MapPoints]:
     """
     scene, observations, points, _ = read_map_with_keypoints(folder)
     return scene, observations, points
-
-
-def read_observations(folder: Path) -> tuple[Scene, MapObservations]:
-    """Read a model with its measurements. Raises FormatError as `read_map` does."""
-    return read_map(folder)[:2]
 
 
 def read_map_with_keypoints(

@@ -28,15 +28,12 @@ class PointTable:
         In the model's frame.
     colors : ndarray, shape (P, 3), uint8
         RGB.
-    errors_px : ndarray, shape (P,)
-        Mean reprojection errors.
     track_lengths : ndarray, shape (P,), int64
     """
 
     ids: np.ndarray
     xyz: np.ndarray
     colors: np.ndarray
-    errors_px: np.ndarray
     track_lengths: np.ndarray
 
 
@@ -51,7 +48,6 @@ def read_points(folder: Path) -> PointTable:
         records["id"].astype(np.int64),
         records["xyz"].copy(),
         records["color"].copy(),
-        records["error"].copy(),
         records["length"].astype(np.int64),
     )
 

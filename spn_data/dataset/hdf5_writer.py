@@ -82,7 +82,7 @@ class DatasetWriter:
             for key, value in info.to_attributes().items():
                 _set_attribute(self._file, key, value)
             self._groups = {
-                name: _Group(self._file.create_group(name), Role(role), info.has_images)
+                name: _Group(self._file.create_group(name), Role(role))
                 for name, role in groups.items()
             }
         except BaseException:
@@ -154,14 +154,13 @@ class _SizeMismatch(Exception):
 class _Group:
     """Group being written: images immediately, everything else in blocks of frames."""
 
-    def __init__(self, group: h5py.Group, role: Role, has_images: bool):
+    def __init__(self, group: h5py.Group, role: Role):
         self._group = group
         self._frames: list[DatasetFrame] = []
         self._mask_idx: list[int] = []
         self._masks: dict[bytes, int] = {}
         self._images: h5py.Dataset | None = None
         self._count = 0
-        self._has_images = has_images
         _set_attribute(group, "role", role.value)
         for name, column in COLUMNS.items():
             _create(group, name, column, _FRAMES_A_BLOCK)

@@ -253,7 +253,7 @@ class TelemetrySummary:
         Time between the first and the last record.
     gaps : tuple of (float, float)
         (from_s, to_s) of gaps without a fix.
-    has_rel_alt, has_abs_alt, has_gimbal, has_sigma : bool
+    has_rel_alt, has_abs_alt, has_gimbal : bool
         Whether any record states these values.
     abs_reference : HeightReference
         Reference of the absolute height.
@@ -271,7 +271,6 @@ class TelemetrySummary:
     has_abs_alt: bool
     abs_reference: HeightReference
     has_gimbal: bool
-    has_sigma: bool
     notes: tuple[str, ...]
 
 
@@ -312,6 +311,5 @@ def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySumma
         bool(np.isfinite(telemetry.abs_alt_m).any()),
         telemetry.abs_reference,
         bool(np.isfinite(telemetry.gimbal_deg[:, 1:]).all(axis=1).any()),
-        bool(np.isfinite(telemetry.sigma_m).all(axis=1).any()),
         telemetry.notes,
     )

@@ -13,7 +13,7 @@ from spn_data.colmap.job import MappingJob
 from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
 from spn_data.colmap.model import (
     count_registered,
-    read_observations,
+    read_map,
     read_scene,
     scene_of,
     upgrade_camera,
@@ -292,7 +292,7 @@ def test_a_camera_that_is_fuller_already_stays_as_it_is() -> None:
 
 def test_residuals_are_projected_minus_measured(mapped: Path) -> None:
     """Against pycolmap's own projection of its own points."""
-    scene, seen = read_observations(mapped)
+    scene, seen, _ = read_map(mapped)
     native = pycolmap.Reconstruction(str(mapped))
     image = next(
         native.images[i] for i in native.reg_image_ids() if native.images[i].name == scene.names[3]
@@ -314,7 +314,7 @@ def test_a_transformed_model_is_the_model_seen_from_the_other_frame(
     assert error.max() < 1e-9
     assert error_deg.max() < 1e-9
     assert np.abs(world_from_model.apply(before.points) - after.points).max() < 1e-9
-    _, residuals = read_observations(mapped), read_observations(tmp_path / "world")[1]
+    residuals = read_map(tmp_path / "world")[1]
     assert np.abs(residuals.residuals_px).max() < 1e-2
 
 

@@ -27,7 +27,6 @@ from spn_data.telemetry.track import Telemetry
 
 STANDARD = preset("standard", seed=3)
 STRAIGHT = replace(STANDARD, mapping_paths=MappingPaths.STRAIGHT)
-CALM = GnssOptions(burst_interval_s=float("inf"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from spn_data.colmap import pycolmap
-from spn_data.colmap.model import MapObservations, Scene, read_observations
+from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import projection_jacobians
 from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
@@ -114,7 +114,7 @@ def film(tmp: Path, seed: int, flaws: Flaws, frames: int = 38, iterations: int =
     options.ceres.solver_options.max_num_iterations = iterations
     pycolmap.bundle_adjustment(model, options)
     model.write(str(tmp))
-    scene, seen = read_observations(tmp)
+    scene, seen, _ = read_map(tmp)
     return Filmed(scene, seen, time_s, truth, float(np.percentile(np.concatenate(moved), 95)))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from spn_data.colmap import pycolmap
-from spn_data.colmap.model import MapObservations, Scene, read_observations
+from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import POSE
@@ -79,7 +79,7 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
     lengths = np.bincount(seen.point_idx, minlength=points)
     assert lengths.min() >= 3
     names = tuple(f"a/{k:03d}.jpg" for k in range(frames))
-    scene = Scene(names, poses, ids, cameras, cloud, np.zeros(points), lengths)
+    scene = Scene(names, poses, ids, cameras, cloud, lengths)
     return Small(scene, seen)
 
 
@@ -109,7 +109,7 @@ def adjusted(scene: Scene, seen: MapObservations, pixels: np.ndarray) -> Small:
 def _observed(model: pycolmap.Reconstruction) -> tuple[Scene, MapObservations]:
     with TemporaryDirectory() as folder:
         model.write(folder)
-        return read_observations(Path(folder))
+        return read_map(Path(folder))[:2]
 
 
 def drifting(rng: np.random.Generator, seen: MapObservations, sigma_px: float) -> np.ndarray:
