@@ -13,7 +13,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
-from spn_data.storage.json_files import finite_or_none
+from spn_data.storage.json_files import finite_or_none, number_or
 
 VERSION = 1
 
@@ -150,18 +150,18 @@ class GeoFit:
                     float(origin["alt_m"]),
                     HeightReference(origin["height_reference"]),
                 ),
-                {name: _number(m) for name, m in value["vertical_offsets_m"].items()},
+                {name: number_or(m) for name, m in value["vertical_offsets_m"].items()},
                 _array(value["residuals_m"], 3),
                 np.array(value["outlier"], dtype=bool),
                 _array(value["gravity_deg"], 2),
                 {name: _triple(v) for name, v in value["gimbal_bias_deg"].items()},
-                {name: (_number(v[0]), _number(v[1])) for name, v in value["noise_m"].items()},
+                {name: (number_or(v[0]), number_or(v[1])) for name, v in value["noise_m"].items()},
                 Uncertainty(
-                    _number(stated["horizontal_m"]),
-                    _number(stated["vertical_m"], math.inf),
-                    _number(stated["tilt_deg"]),
-                    _number(stated["heading_deg"]),
-                    _number(stated["scale"]),
+                    number_or(stated["horizontal_m"]),
+                    number_or(stated["vertical_m"], math.inf),
+                    number_or(stated["tilt_deg"]),
+                    number_or(stated["heading_deg"]),
+                    number_or(stated["scale"]),
                     _array(stated["covariance"], 7, math.inf),
                     _array([stated["middle_m"]], 3)[0],
                 ),
@@ -191,12 +191,8 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _number(value: Any, unknown: float = math.nan) -> float:
-    return unknown if value is None else float(value)
-
-
 def _triple(value: Any) -> tuple[float, float, float]:
-    return _number(value[0]), _number(value[1]), _number(value[2])
+    return number_or(value[0]), number_or(value[1]), number_or(value[2])
 
 
 def _array(rows: Any, width: int, unknown: float = math.nan) -> np.ndarray:
@@ -206,4 +202,4 @@ def _array(rows: Any, width: int, unknown: float = math.nan) -> np.ndarray:
 
 def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
     counts = ("folds", "frames", "fixes", "outliers")
-    return {k: int(v) if k in counts else _number(v) for k, v in fields.items()}
+    return {k: int(v) if k in counts else number_or(v) for k, v in fields.items()}

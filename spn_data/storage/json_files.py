@@ -57,6 +57,11 @@ def finite_or_none(value: float | np.floating[Any]) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def number_or(value: float | None, unknown: float = math.nan) -> float:
+    """Return a number read from JSON as a float, or `unknown` for null."""
+    return unknown if value is None else float(value)
+
+
 def finite(value: Any) -> Any:
     """Return nested plain values with None (JSON null) for every float that is NaN or infinite.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from spn_data.area.names import CONFIG, ERRORS, METRICS
 from spn_data.errors import FormatError, InputError
-from spn_data.storage.json_files import read_json
+from spn_data.storage.json_files import number_or, read_json
 from spn_model.evaluation.metrics import AxisErrors, Spread, Summary, Within
 
 _TEXT_COLUMNS = ("method", "group", "name", "stratum")
@@ -114,10 +114,10 @@ def _summary(value: Mapping[str, Any]) -> Summary:
         axes=tuple(
             AxisErrors(
                 str(axis["axis"]),
-                _number(axis["signed_median"], math.nan),
-                _number(axis["signed_mean"], math.nan),
-                _number(axis["absolute_median"], math.inf),
-                _number(axis["absolute_p95"], math.inf),
+                number_or(axis["signed_median"], math.nan),
+                number_or(axis["signed_mean"], math.nan),
+                number_or(axis["absolute_median"], math.inf),
+                number_or(axis["absolute_p95"], math.inf),
             )
             for axis in value["axes"]
         ),
@@ -126,14 +126,10 @@ def _summary(value: Mapping[str, Any]) -> Summary:
 
 def _spread(value: Mapping[str, Any]) -> Spread:
     return Spread(
-        median=_number(value["median"], math.inf),
-        mean=_number(value["mean"], math.nan),
-        p95=_number(value["p95"], math.inf),
+        median=number_or(value["median"], math.inf),
+        mean=number_or(value["mean"], math.nan),
+        p95=number_or(value["p95"], math.inf),
     )
-
-
-def _number(value: Any, unknown: float) -> float:
-    return unknown if value is None else float(value)
 
 
 def _column(cells: list[str], name: str) -> np.ndarray:
