@@ -1,16 +1,15 @@
-"""`spn-model benchmark`: what a bundle costs on this machine."""
+"""The command `spn-model benchmark`."""
 
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from spn_cli import console, options
-from spn_data.area.names import DATASET
+from spn_data.area.names import DATASET, SPLIT
 
 if TYPE_CHECKING:
     from spn_model.export.bundle_benchmark import BundleCost
@@ -21,43 +20,36 @@ _STEPS = ("preprocessing", "graph", "decoding", "total")
 @click.command()
 @click.argument("bundle", required=False, type=click.Path(path_type=Path))
 @options.area
-@click.option("--run", "name", help="Trained network whose bundle is timed, instead of BUNDLE.")
+@click.option("--run", "name", help="Run whose bundle is benchmarked, instead of BUNDLE.")
 @click.option(
     "--frame",
     "frames",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="Image of the flying camera; may be repeated.  [default: the data set's, as of 1280x720]",
+    help="Image of the flying camera; may be repeated.  [default: rendered from the data set at 1280x720]",
 )
 @click.option(
     "--camera",
     "camera_file",
     type=click.Path(path_type=Path),
-    help="The flying camera (JSON: model, width, height, params), with --frame.",
+    help="Camera of --frame (JSON: model, width, height, params).",
 )
 @click.option(
     "--poses",
     type=click.IntRange(1, 100_000),
     default=100,
     show_default=True,
-    help="How many are timed, of each graph.",
+    help="Number of poses to time with each graph.",
 )
 @click.option(
-    "--threads", type=click.IntRange(1, 256), default=1, show_default=True, help="Of the network."
+    "--threads",
+    type=click.IntRange(1, 256),
+    default=1,
+    show_default=True,
+    help="Number of threads of the network.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
-def benchmark(bundle: Path | None, area_folder: Path, **chosen: Any) -> None:
-    """Time the program on board: each step of a pose, file sizes, and the memory of its process.
-
-    \b
-    Example:
-        spn-model benchmark --area fields/north --run first
-        spn-model benchmark bundle/ --frame frame.jpg --camera cam.json
-    """
-    run(bundle, area_folder, **chosen)
-
-
-def run(
+def benchmark(
     bundle: Path | None,
     area_folder: Path,
     *,
@@ -68,36 +60,46 @@ def run(
     threads: int,
     as_json: bool,
 ) -> None:
-    from spn_data.area import names as names_of
-    from spn_model.export.bundle_benchmark import BenchmarkOptions, render_flight_frames
-    from spn_model.export.bundle_benchmark import benchmark as work
+    """Measure latency of each step, file size and memory of the onboard program on this machine.
+
+    \b
+    Example:
+        spn-model benchmark --area fields/north --run first
+        spn-model benchmark bundle/ --frame frame.jpg --camera cam.json
+    """
+    from spn_model.export.bundle_benchmark import (
+        BenchmarkOptions,
+        benchmark_on_dataset,
+    )
+    from spn_model.export.bundle_benchmark import (
+        benchmark as benchmark_on_frames,
+    )
+    from spn_model.runs.run_files import RunFiles
 
     if (bundle is None) == (name is None):
-        raise click.UsageError("give BUNDLE or --run")
+        raise click.UsageError("give either BUNDLE or --run")
     if bool(frames) != (camera_file is not None):
-        raise click.UsageError("--frame and --camera go together: a frame's camera must be known")
+        raise click.UsageError("--frame and --camera go together: a frame needs its camera")
     area = options.open_area(area_folder)
-    folder = bundle if name is None else area.run_folder(name) / names_of.BUNDLE
+    folder = bundle if name is None else RunFiles(area.run_folder(name)).bundle
     assert folder is not None
     wanted = BenchmarkOptions(poses=poses, threads=threads)
-    with tempfile.TemporaryDirectory(prefix="spn-benchmark-") as scratch:
-        images, camera = list(frames), camera_file
-        if camera is None:
-            source = area.folder(names_of.SPLIT) / DATASET
-            images, camera = render_flight_frames(folder, source, Path(scratch), wanted.frames)
-        found = work(folder, images, camera, wanted)
+    if camera_file is None:
+        costs = benchmark_on_dataset(folder, area.folder(SPLIT) / DATASET, wanted)
+    else:
+        costs = benchmark_on_frames(folder, frames, camera_file, wanted)
     if as_json:
-        plain = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in found}
+        plain = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in costs}
         click.echo(json.dumps(plain, indent=1, sort_keys=True))
         return
-    _show(found)
+    _show(costs)
 
 
-def _show(found: tuple[BundleCost, ...]) -> None:
-    first = found[0].found
+def _show(costs: tuple[BundleCost, ...]) -> None:
+    first = costs[0].found
     width, height = first["frame"]
     rows = []
-    for one in found:
+    for one in costs:
         spent, memory = one.found["milliseconds"], one.found["memory_mb"]
         rows.append(
             (
@@ -116,6 +118,6 @@ def _show(found: tuple[BundleCost, ...]) -> None:
         ("graph", *_STEPS, "of bare", "file", "memory", "with a pose"),
     )
     console.out.print(
-        "of bare: processor's time of our call of onnxruntime against its own on the same tensor. "
-        "memory: greatest of the program's process."
+        "of bare: CPU time of our onnxruntime call relative to a bare call on the same tensor. "
+        "memory: peak of the onboard process."
     )

@@ -1,4 +1,4 @@
-"""Options that several commands share, and parameter types of the domain."""
+"""Options shared by several commands, and their parameter types."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spn_data.area.area import Area
+from spn_data.area.names import DATASET, SPLIT
 
 if TYPE_CHECKING:
     from spn_data.pipeline.geo_stage import GeoStageOptions
@@ -21,33 +22,39 @@ area = click.option(
     help="Folder of the area.  [default: the current folder]",
 )
 overwrite = click.option(
-    "--overwrite", is_flag=True, help="Make anew what stands already and was made otherwise."
+    "--overwrite", is_flag=True, help="Redo what exists but was made with other options or inputs."
 )
 seed = click.option(
     "--seed",
     type=click.IntRange(0, 2**31 - 1),
     default=0,
     show_default=True,
-    help="Of everything random.",
+    help="Random seed.",
 )
-threads = click.option("--threads", type=click.IntRange(1, 1024), help="[default: all cores]")
+threads = click.option(
+    "--threads", type=click.IntRange(1, 1024), help="Number of CPU threads.  [default: all cores]"
+)
 cluster = click.option(
     "--cluster",
     metavar="ADDRESS",
     default="",
-    help="Dask scheduler whose workers find features and matches, as in tcp://10.0.0.5:8786.",
+    help="Address of a Dask scheduler whose workers extract and match features, e.g. tcp://10.0.0.5:8786.",
 )
 device = click.option(
-    "--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."
+    "--device",
+    default="auto",
+    show_default=True,
+    help="Device of the network: auto, cpu, cuda or cuda:N.",
 )
 
 
 class Finite(click.FloatRange):
-    """A number within bounds; neither infinite nor NaN, which passes any comparison."""
+    """Finite number within bounds; NaN is rejected too, although it passes comparisons with bounds."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
+        """Return the number; fail if it is out of bounds or not finite."""
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number", param, ctx)
@@ -55,7 +62,7 @@ class Finite(click.FloatRange):
 
 
 class PerSequence(click.ParamType[tuple[str, float]]):
-    """`VALUE` for all sequences or `SEQUENCE=VALUE` for one, as ("*" or the sequence, value)."""
+    """Number for all sequences (`VALUE`) or one (`SEQUENCE=VALUE`), as ("*" or the sequence, value)."""
 
     name = "[SEQUENCE=]VALUE"
 
@@ -65,31 +72,33 @@ class PerSequence(click.ParamType[tuple[str, float]]):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, float]:
+        """Return the sequence and the number; fail if the number is out of bounds."""
         if isinstance(value, tuple):
             return value
         sequence, _, number = str(value).rpartition("=")
         try:
-            found = float(number)
+            parsed = float(number)
         except ValueError:
             self.fail(f"{number!r} is not a number", param, ctx)
-        if not self._low <= found <= self._high:
-            self.fail(f"{found:g} lies outside {self._low:g} to {self._high:g}", param, ctx)
-        return sequence or "*", found
+        if not self._low <= parsed <= self._high:
+            self.fail(f"{parsed:g} is not between {self._low:g} and {self._high:g}", param, ctx)
+        return sequence or "*", parsed
 
 
 class FilePerSequence(click.ParamType[tuple[str, str]]):
-    """`FILE` for all sequences or `SEQUENCE=FILE` for one, as ("*" or the sequence, file)."""
+    """File for all sequences (`FILE`) or one (`SEQUENCE=FILE`), as ("*" or the sequence, path)."""
 
     name = "[SEQUENCE=]FILE"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, str]:
+        """Return the sequence and the path; fail if there is no such file."""
         if isinstance(value, tuple):
             return value
         sequence, _, path = str(value).rpartition("=")
         if not Path(path).is_file():
-            self.fail(f"{path!r} is no file", param, ctx)
+            self.fail(f"{path!r} is not a file", param, ctx)
         return sequence or "*", path
 
 
@@ -98,20 +107,28 @@ camera = click.option(
     "camera_files",
     type=FilePerSequence(),
     multiple=True,
-    help="Calibrated camera (JSON: model, width, height, params) to start from.",
+    help="Calibrated camera (JSON: model, width, height, params) as initial value.",
 )
 fov = click.option(
     "--fov",
     "fov_deg",
     type=PerSequence(5, 170),
     multiple=True,
-    help="Horizontal field of view in degrees, where known.",
+    help="Horizontal field of view in degrees, as initial value.",
 )
 
 
 def open_area(folder: Path) -> Area:
-    """The area in a folder, which need not exist yet."""
+    """Return the area in a folder, which need not exist yet."""
     return Area(folder)
+
+
+def dataset_or_split(area: Area, dataset: Path | None) -> Path:
+    """Return the given data set, or the area's own; raise StageError if that is missing or stale."""
+    if dataset is not None:
+        return dataset
+    area.check_fresh(SPLIT)
+    return area.folder(SPLIT) / DATASET
 
 
 _GEOREGISTRATION = (
@@ -120,27 +137,27 @@ _GEOREGISTRATION = (
         "gnss_sigma_m",
         type=(Finite(0, min_open=True), Finite(0, min_open=True)),
         metavar="H V",
-        help="Standard deviation of a fix in metres, horizontal (per axis) and vertical.  "
-        "[default: the source's own, else that of its kind]",
+        help="Standard deviation of a GNSS fix in metres, horizontal (per axis) and vertical.  "
+        "[default: the source's own, otherwise that of its kind]",
     ),
     click.option(
         "--time-offset",
         "time_offset_s",
         type=PerSequence(-3600, 3600),
         multiple=True,
-        help="Seconds to add to telemetry's times.  [default: estimated]",
+        help="Seconds to add to telemetry times.  [default: estimated]",
     ),
     click.option(
         "--heights",
         type=click.Choice(["auto", "relative", "absolute"]),
         default="auto",
         show_default=True,
-        help="Heights above take-off, or what the source calls absolute.",
+        help="Heights to use: above take-off, or absolute as given by the source.",
     ),
     click.option(
         "--height-reference",
         type=click.Choice(["ellipsoid", "amsl"]),
-        help="What --takeoff-alt, or absolute heights, count from.",
+        help="Reference of --takeoff-alt or of absolute heights.",
     ),
     click.option(
         "--takeoff-alt",
@@ -154,14 +171,14 @@ _GEOREGISTRATION = (
         type=Finite(0, min_open=True),
         default=60.0,
         show_default=True,
-        help="Seconds over which GNSS errors stay alike.",
+        help="Correlation time of GNSS errors in seconds.",
     ),
-    click.option("--ignore-gimbal", is_flag=True, help="Leave gimbal angles out."),
+    click.option("--ignore-gimbal", is_flag=True, help="Do not use gimbal angles."),
 )
 
 
 def georegistration(command: Any) -> Any:
-    """The options of georegistration, in the order of the list above."""
+    """Add the options of georegistration to a command, in the order of the list above."""
     for option in reversed(_GEOREGISTRATION):
         command = option(command)
     return command
@@ -177,13 +194,13 @@ def geo_options(
     correlation_time_s: float,
     ignore_gimbal: bool,
 ) -> GeoStageOptions:
-    """What those options say."""
+    """Return the options of georegistration as given on the command line."""
     from spn_data.geometry.geodesy import HeightReference
     from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
     from spn_data.pipeline.geo_stage import GeoStageOptions
 
     if takeoff_alt_m is not None and height_reference is None:
-        raise click.UsageError("--takeoff-alt needs --height-reference: what does it count from?")
+        raise click.UsageError("--takeoff-alt needs --height-reference")
     fit = GeoregisterOptions(
         gnss_sigma_m=gnss_sigma_m,
         heights=Heights(heights),

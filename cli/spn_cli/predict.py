@@ -1,16 +1,19 @@
-"""`spn-model predict`: poses of any images or video."""
+"""The command `spn-model predict`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from spn_cli import console, options
 
+if TYPE_CHECKING:
+    from spn_model.prediction.predict import Predicted
+
 _REASONS_SHOWN = 6
-_SEEN = 0.98  # of the network's view, below which the user is told
+_VIEW_SEEN = 0.98  # share of the network's view below which a note is shown
 
 
 @click.command()
@@ -18,12 +21,12 @@ _SEEN = 0.98  # of the network's view, below which the user is told
     "inputs", metavar="SOURCES...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
 @options.area
-@click.option("--run", "name", required=True, help="Trained network that tells the poses.")
+@click.option("--run", "name", required=True, help="Run whose network estimates the poses.")
 @click.option(
     "--camera",
     "camera_file",
     type=click.Path(path_type=Path),
-    help="The flying camera (JSON: model, width, height, params).  [default: photos' own metadata]",
+    help="Camera of the sources (JSON: model, width, height, params).  [default: photo metadata]",
 )
 @click.option(
     "--to",
@@ -39,54 +42,34 @@ _SEEN = 0.98  # of the network's view, below which the user is told
     multiple=True,
     default=("csv",),
     show_default=True,
-    help="What is written; may be repeated. The CSV is always there.",
+    help="Format to write; may be repeated. The CSV file is always written.",
 )
 @click.option(
     "--every",
     type=click.IntRange(1, 1_000_000),
     default=1,
     show_default=True,
-    help="Take each so-many-th frame of a video.",
+    help="Use every Nth frame of a video.",
 )
 @click.option(
     "--fps",
     type=options.Finite(0.001, 1000),
-    help="Take at most so many frames a second of a video.  [default: all]",
+    help="Use at most this many frames per second of a video.  [default: all]",
 )
 @click.option(
     "--batch",
     type=click.IntRange(1, 1024),
     default=8,
     show_default=True,
-    help="Images given to the network at once.",
+    help="Batch size.",
 )
 @options.device
 @options.threads
 @click.option("--overwrite", is_flag=True, help="Replace predicted poses in that folder.")
 @click.pass_context
 def predict(
-    context: click.Context, /, inputs: tuple[Path, ...], area_folder: Path, **chosen: Any
-) -> None:
-    """Tell the poses of images, folders of images, or videos.
-
-    The flying camera must be known: 4-eval/<name>/camera.json of a registered flight, or a calibration.
-    Photos may bring a focal length of their own. A frame without a pose has a row that says why.
-
-    \b
-    Example:
-        spn-model predict flight.mp4 --run first --camera cam.json --to poses/
-    """
-    from spn_model.prediction.predict import PredictionStopped
-
-    try:
-        run(inputs, area_folder, **chosen)
-    except PredictionStopped as stopped:
-        _tell(stopped.predicted)
-        click.echo("Stopped: the frames so far are written, the rest is not done.", err=True)
-        context.exit(130)
-
-
-def run(
+    context: click.Context,
+    /,
     inputs: tuple[Path, ...],
     area_folder: Path,
     *,
@@ -101,75 +84,61 @@ def run(
     threads: int | None,
     overwrite: bool,
 ) -> None:
-    import os
+    """Estimate camera poses of images and videos.
 
-    from spn_data.area.names import CHECKPOINT
-    from spn_data.errors import StageError
-    from spn_data.geometry.camera_file import camera_to_json, read_camera
-    from spn_data.storage.fingerprints import content_fingerprint
-    from spn_model.models.checkpoint import load
-    from spn_model.prediction.flights import FrameFilter, find_flights
-    from spn_model.prediction.predict import PredictOptions, check_target
-    from spn_model.prediction.predict import predict as work
-    from spn_model.training import machine
+    SOURCES are images, videos, or folders of them. Their camera must be known: 4-eval/<name>/camera.json of
+    a registered flight, a calibration, or the focal length in the metadata of photos. A frame without a pose
+    has a row that states the reason.
 
-    file = options.open_area(area_folder).run_folder(name) / CHECKPOINT
-    if not file.is_file():
-        raise StageError(
-            f"{file.parent} holds no trained network; run spn-model train --run {name} first"
-        )
-    folder = Path(os.path.abspath(target))
-    check_target(folder, overwrite=overwrite)
-    given = None if camera_file is None else read_camera(camera_file)
-    flights, notes = find_flights(inputs, given)
-    chosen = machine.choose(device, threads or 0, "float32")
-    with machine.limited_threads(chosen):
-        network = load(file, chosen.device)
-        if network.view.camera is None and not network.model.any_camera:
-            notes.append(
-                "the network was trained on images of several cameras, each as it was: poses of another "
-                "camera's images are only as right as that is like them."
-            )
-        for note in notes:
-            console.note(note)
+    \b
+    Example:
+        spn-model predict flight.mp4 --run first --camera cam.json --to poses/
+    """
+    from spn_model.prediction.flights import FrameFilter
+    from spn_model.prediction.predict import WGS84, PredictionStopped, PredictOptions
+    from spn_model.runs.run_files import RunFiles
+    from spn_model.runs.run_prediction import prepare_prediction
+
+    run = RunFiles(options.open_area(area_folder).run_folder(name))
+    prediction = prepare_prediction(
+        *(run, inputs, camera_file, target),
+        device=device,
+        threads=threads or 0,
+        overwrite=overwrite,
+    )
+    for note in prediction.notes:
+        console.note(note)
+    wanted = PredictOptions(
+        choice=FrameFilter(every=every, fps=fps),
+        formats=tuple(dict.fromkeys(("csv", *formats))),
+        batch=batch,
+    )
+    try:
         with console.progress() as progress:
-            found = work(
-                network,
-                flights,
-                folder,
-                progress,
-                PredictOptions(
-                    choice=FrameFilter(every=every, fps=fps),
-                    formats=tuple(dict.fromkeys(("csv", *formats))),
-                    batch=batch,
-                ),
-                facts={
-                    "run": name,
-                    "checkpoint": content_fingerprint(file),
-                    "kind": network.model.kind,
-                    "camera": None if given is None else camera_to_json(given),
-                },
-                overwrite=overwrite,
-            )
-    _tell(found)
-    place = network.view.origin
-    if "wgs84" in formats and place is not None:
-        console.out.print(f"Heights in wgs84.csv are above: {place.height_reference.value}.")
-    if network.view.units != "m":
-        console.note("lengths are in units of the model, not metres.")
+            found = prediction.write(progress, wanted)
+    except PredictionStopped as stopped:
+        _show(stopped.predicted)
+        click.echo("Stopped: the poses so far are written; the rest is missing.", err=True)
+        context.exit(130)
+    _show(found)
+    view = prediction.network.view
+    if "wgs84" in formats and view.origin is not None:
+        console.out.print(f"Heights in {WGS84} are above: {view.origin.height_reference.value}.")
+    if view.units != "m":
+        console.note("lengths are in model units, not metres.")
 
 
-def _tell(found: Any) -> None:
+def _show(found: Predicted) -> None:
     counts = found.counts
     total = sum(counts.values())
     console.out.print(
-        f"{found.folder}: {counts['estimated']} of {total} frames have a pose; "
-        f"{1000 * found.seconds / max(1, total - counts['unreadable']):.0f} ms an image for the network."
+        f"{found.folder}: {counts['estimated']} of {total} frames have a pose; the network took "
+        f"{1000 * found.seconds / max(1, total - counts['unreadable']):.0f} ms per image."
     )
     for reason, number in found.reasons[:_REASONS_SHOWN]:
         console.note(f"{number} without a pose: {reason}")
-    if found.seen < _SEEN:
+    if found.seen < _VIEW_SEEN:
         console.note(
-            f"the flying camera fills {found.seen:.0%} of the view that the network was trained on; the "
-            "rest of its images is black, and poses are less sure."
+            f"the flying camera fills {found.seen:.0%} of the view that the network was trained on; the rest "
+            "of its images is black, and poses are less certain."
         )

@@ -1,10 +1,11 @@
-"""A training as it goes: a live table on a terminal, a line now and then elsewhere."""
+"""Display of a training: a live table on a terminal, otherwise a line from time to time."""
 
 from __future__ import annotations
 
+import signal
 import time
-from collections.abc import Mapping
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
@@ -21,58 +22,70 @@ _PLAIN_EVERY_S = 60.0
 _SHOWN = 12  # rows of the live table
 _NAMES = {
     "validation": "validation",
-    "held out": "validation, before it was learnt too",
-    "views": "rendered views that are not trained on",
+    "held out": "validation, before training on it",
+    "views": "held-out rendered views",
     "training": "training images",
 }
 
 
-class Following:
-    """Shows rows of the log; knows whether a stop is wanted. Enter it while training runs."""
+class TrainingDisplay:
+    """Display of log rows, which requests a stop after Ctrl-C; see `spn_model.runs.run_training.RunWatch`.
 
-    def __init__(self, recipe: Recipe, unit: str, *, shows: bool):
+    Only the first process of a training displays anything.
+    """
+
+    def __init__(self, recipe: Recipe):
+        from spn_model.training.machine import is_main_process
+
         self._stages = {stage.name: k for k, stage in enumerate(recipe.stages)}
         self._shares = recipe.budget_shares
-        self._unit, self._shows = unit, shows
+        self._unit, self._shows = "m", is_main_process()
         self._stop = False
-        self._judged: list[tuple[str, ...]] = []
+        self._validated: list[tuple[str, ...]] = []
         self._status = "Preparing the training images."
         self._printed = -_PLAIN_EVERY_S
-        live = shows and console.out.is_terminal
+        live = self._shows and console.out.is_terminal
         self._live = Live(console=console.out, refresh_per_second=4) if live else None
 
-    def __enter__(self) -> Following:
-        if self._live is not None:
-            self._live.start()
-            self._live.update(self._table())
-        return self
+    @contextmanager
+    def training(self, unit: str, *, resumes: bool) -> Iterator[None]:
+        """Show the training within the block, and let Ctrl-C request a stop."""
+        self._unit = unit
+        with _stop_signals(self.stop), self._live_table():
+            if resumes:
+                self.say("Resuming the interrupted training.")
+            yield
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._live is not None:
+    @contextmanager
+    def _live_table(self) -> Iterator[None]:
+        if self._live is None:
+            yield
+            return
+        self._live.start()
+        self._live.update(self._table())
+        try:
+            yield
+        finally:
             self._status = ""
             self._live.update(self._table())
             self._live.stop()
 
     def stop(self) -> None:
-        """The step that runs is finished, the state is saved, the training ends."""
+        """Request a stop after the current step."""
         self._stop = True
         self.say("Stopping after this step.")
 
     def wants_stop(self) -> bool:
+        """Return whether a stop was requested."""
         return self._stop
 
     def say(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line."""
         if self._shows:
             console.out.print(Text(text), soft_wrap=True)
 
     def row(self, values: Mapping[str, Any]) -> None:
-        """See `spn_model.training.training_record.Watch`."""
+        """Show a row of the log, see `spn_model.training.training_record.Watch`."""
         if values["event"] == "steps":
             self._status = self._steps(values)
             now = time.monotonic()
@@ -85,7 +98,7 @@ class Following:
                 _NAMES[values["event"]],
                 *_errors(values),
             )
-            self._judged.append(cells)
+            self._validated.append(cells)
             if self._live is None and self._shows:
                 done, what, m, deg, m95, deg95, poses = cells
                 self.say(
@@ -101,7 +114,7 @@ class Following:
         left = f", about {console.duration(left_s)} left" if left_s > 1 else ""
         return (
             f"{done:.0%} {values['stage']}: {values['images']:,} images, "
-            f"{values['images_per_s']:.1f} a second, loss {values['loss']:.4g}"
+            f"{values['images_per_s']:.1f} per second, loss {values['loss']:.4g}"
             f" {values['figures']}{left}"
         )
 
@@ -113,13 +126,13 @@ class Following:
         table = Table(box=None)
         for title in ("", "", f"median {self._unit}", "°", f"95 % {self._unit}", "°", "poses"):
             table.add_column(title, justify="right")
-        for cells in self._judged[-_SHOWN:]:
+        for cells in self._validated[-_SHOWN:]:
             table.add_row(*(Text(cell) for cell in cells))
         return Group(table, Text(self._status))
 
 
 def errors_table(facts: Mapping[str, Any], unit: str) -> None:
-    """Errors of the kept checkpoint and of the training's end; what the training took."""
+    """Print errors of the kept checkpoint and of the last network, and the time of the training."""
     rows = []
     for title, found in (("kept", facts["kept"]), ("at the end", facts["latest"])):
         for event, name in _NAMES.items():
@@ -130,7 +143,7 @@ def errors_table(facts: Mapping[str, Any], unit: str) -> None:
     console.out.print(
         f"Trained for {console.duration(facts['train_s'])} "
         f"({facts['images_shown']:,} images, {facts['precision']}, {facts['threads']} threads, "
-        f"{facts['device']}); judging took {console.duration(facts['validate_s'])} more."
+        f"{facts['device']}), plus {console.duration(facts['validate_s'])} of validation."
     )
 
 
@@ -140,3 +153,22 @@ def _errors(values: Mapping[str, Any]) -> tuple[str, ...]:
         for name, digits in (("median_m", 2), ("median_deg", 1), ("p95_m", 2), ("p95_deg", 1))
     ]
     return (*figures, f"{values['located']} of {values['frames']}")
+
+
+@contextmanager
+def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` on SIGINT and SIGTERM within the block; a second Ctrl-C interrupts at once."""
+    signals = (int(signal.SIGINT), int(signal.SIGTERM))
+    before: dict[int, Any] = {}
+
+    def handle(number: int, _: object) -> None:
+        stop()
+        signal.signal(signal.SIGINT, before[signals[0]])
+
+    for number in signals:
+        before[number] = signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -43,4 +43,5 @@ RUNS = "runs"
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIGURES, BUNDLE = "errors.csv", "figures", "bundle"
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
+RETRIEVAL = ".retrieval.json"  # in RUNS: cache of the retrieval baselines
 COMPARED = "compared"  # in RUNS: several runs evaluated together

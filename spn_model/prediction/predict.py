@@ -123,8 +123,8 @@ def predict(
     Raises
     ------
     StageError
-        If the folder holds something else, if the disk is full, and for WGS84 without a georeferenced
-        network.
+        If the folder holds something else, if the disk is full, and for WGS84 without a georegistered
+        map.
     PredictionStopped
         After Ctrl-C: the folder holds the frames done so far and is marked as incomplete.
     """
@@ -133,7 +133,7 @@ def predict(
     origin = network.view.origin
     if "wgs84" in options.formats and origin is None:
         raise StageError(
-            "wgs84 needs a georeferenced network, but this one was trained in a map without an origin; "
+            "wgs84 needs a georegistered map, but the network was trained in a map without an origin; "
             "write csv or tum, or georegister the area and train again"
         )
     partial = folder.with_name(f".{folder.name}.partial")

@@ -177,6 +177,11 @@ class Ranks:
             distributed.barrier()
 
 
+def is_main_process() -> bool:
+    """Return whether this process is the first of those started by `torchrun`, or the only one."""
+    return int(os.environ.get("RANK", "0")) == 0
+
+
 @contextmanager
 def process_group(device: str) -> Iterator[Ranks]:
     """Join the processes that `torchrun` started, if any, for the duration of the block."""

@@ -88,7 +88,7 @@ def test_a_finished_run_is_left_as_it_is(place):
     for words in ((), ("--overwrite",)):
         again = trained(place, *words)
         assert again.exit_code == 0
-        assert "is trained already" in again.output
+        assert "is already trained" in again.output
         assert "validation, kept" in again.output
     assert checkpoint.stat().st_mtime_ns == before
 
@@ -103,16 +103,16 @@ def test_a_finished_run_is_left_as_it_is(place):
     ],
 )
 def test_another_option_over_a_run_is_refused(place, words, told):
-    """It says what differs; --overwrite trains anew, another --run stands beside it."""
+    """It says what differs; --overwrite trains again, another --run keeps it."""
     assert trained(place).exit_code == 0
     refused = trained(place, *words)
     assert refused.exit_code == 1
     assert told in refused.output
-    assert "--overwrite trains anew, another --run leaves it" in refused.output
+    assert "use --overwrite to train again, or another --run to keep it" in refused.output
     assert trained(place, *words, "--run", "b").exit_code == 0
     anew = trained(place, *words, "--overwrite")
     assert anew.exit_code == 0
-    assert "is trained already" in trained(place, *words).output
+    assert "is already trained" in trained(place, *words).output
 
 
 def test_another_data_set_over_a_run_is_refused(place):
@@ -146,11 +146,11 @@ def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
         alive.set()
         thread.join()
     assert cut.exit_code == 130, cut.output
-    assert "the same command goes on from here" in cut.output
+    assert "run the same command to resume" in cut.output
     assert (folder / "state.safetensors").exists()
     resumed = trained(place, "--run", "cut", "--images", "1600")
     assert resumed.exit_code == 0, resumed.output
-    assert "Going on from where it was stopped" in resumed.output
+    assert "Resuming the interrupted training" in resumed.output
     both = [
         load(place / "area" / "runs" / name / "last.safetensors").model.network.state_dict()
         for name in ("whole", "cut")
@@ -160,7 +160,7 @@ def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
 
 
 def test_a_full_disk_is_one_line(place, monkeypatch):
-    """The file that could not be written is named, and that the same command goes on."""
+    """The file that could not be written is named, and that the same command resumes."""
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -170,7 +170,7 @@ def test_a_full_disk_is_one_line(place, monkeypatch):
     ran = trained(place)
     assert ran.exit_code == 1
     assert "No space left on device" in ran.output
-    assert "make room, and the same command goes on" in ran.output
+    assert "free some space and run the same command to resume" in ran.output
 
 
 def test_what_nothing_can_be_trained_with_leaves_no_run(place):
@@ -189,7 +189,7 @@ def test_what_nothing_can_be_trained_with_leaves_no_run(place):
             assert told in ran.output
             assert len(ran.output.strip().splitlines()) == 1
     mended = trained(place, "--recipe", str(place / "bad.toml"), "--seed", "9")
-    assert "has no option 'frosen'" in mended.output  # and not: stands already
+    assert "has no option 'frosen'" in mended.output  # and not: already exists
 
 
 def test_an_area_without_a_split_is_refused(place):

@@ -250,7 +250,7 @@ def test_the_command_makes_a_bundle_once(hall, network, tmp_path):
     assert {p.name for p in (run / "bundle").iterdir()} == FILES - {"model-int8.onnx"}
     second = CliRunner().invoke(main, arguments)
     assert second.exit_code == 0
-    assert "stands already, made of the same" in second.output
+    assert "unchanged, made from the same network" in second.output
     assert (run / "bundle" / "bundle.json").stat().st_mtime_ns == before
     fingerprint = json.loads((run / "bundle" / "bundle.json").read_text())["run"]["checkpoint"]
     spread = {"median": 0.5, "mean": 0.6, "p95": 1.25}

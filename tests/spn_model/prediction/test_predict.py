@@ -150,9 +150,7 @@ def test_frames_of_a_video_have_its_own_times(network, video, tmp_path):
 def test_without_a_camera_there_is_no_pose(network, video, photos, tmp_path):
     """A video or photos of an unknown lens are refused; the line names the remedy."""
     for source in (video, photos):
-        with pytest.raises(
-            InputError, match=r"camera is unknown.*--camera FILE.*camera\.json"
-        ):
+        with pytest.raises(InputError, match=r"camera is unknown.*--camera FILE.*camera\.json"):
             find_flights([source], None)
 
 
@@ -240,7 +238,7 @@ def test_tum_and_wgs84_hold_the_same_poses(network, photos, tmp_path):
 def test_wgs84_needs_a_place_in_the_world(network, photos, tmp_path):
     """A map of unknown place has no latitude; nothing is written, and what can be is named."""
     lost = replace(network, view=replace(network.view, origin=None))
-    with pytest.raises(StageError, match="wgs84 needs a georeferenced network"):
+    with pytest.raises(StageError, match="wgs84 needs a georegistered map"):
         predicted(lost, photos, tmp_path / "out", formats=("csv", "wgs84"))
     assert not (tmp_path / "out").exists()
 

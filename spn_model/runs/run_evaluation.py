@@ -1,0 +1,171 @@
+"""Evaluation of trained networks of an area, with results in the folders of their runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spn_data.area.names import COMPARED, GEO, MODEL, RETRIEVAL
+from spn_data.errors import InputError
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.work.timing import Progress
+from spn_model.evaluation.comparison_files import network_facts, select_network, write_comparison
+from spn_model.evaluation.evaluate import EvaluateOptions, NetworkComparison, compare
+from spn_model.models.checkpoint import load
+from spn_model.runs.run_files import RunFiles
+from spn_model.training import machine
+from spn_model.training.training_figure import read_log, training_figure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EvaluatedRuns:
+    """Comparison of runs of one area.
+
+    Attributes
+    ----------
+    runs : tuple of RunFiles
+        Files of the runs.
+    comparison : NetworkComparison
+        Errors of their networks and of the baselines.
+    facts : mapping of str to mapping
+        Facts of each network by name of its run, for `facts` of metrics.json.
+    """
+
+    runs: tuple[RunFiles, ...]
+    comparison: NetworkComparison
+    facts: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenEvaluation:
+    """Result files of an evaluation.
+
+    Attributes
+    ----------
+    folders : tuple of Path
+        Folders with metrics.json, errors.csv and figures.
+    notes : tuple of str
+        One sentence each.
+    """
+
+    folders: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def evaluate_runs(
+    runs: Sequence[RunFiles],
+    dataset: Path,
+    progress: Progress,
+    options: EvaluateOptions,
+    *,
+    device: str = "auto",
+    threads: int = 0,
+) -> EvaluatedRuns:
+    """Evaluate the networks of runs of one area on a data set.
+
+    Parameters
+    ----------
+    runs : sequence of RunFiles
+        Files of the runs.
+    dataset : Path
+        Data set of the world that they were trained in.
+    progress : Progress
+        Receives the network's name, frames done, and frames in total.
+    options : EvaluateOptions
+        What is evaluated.
+    device : str
+        Device of the networks, see `machine.choose`.
+    threads : int
+        CPU threads; 0 for all cores.
+
+    Returns
+    -------
+    EvaluatedRuns
+
+    Raises
+    ------
+    StageError
+        If a run has no checkpoint.
+    InputError
+        If the device does not exist, or data set and networks do not belong together.
+    FormatError
+        If a file is damaged or of another version.
+    """
+    checkpoints = {run.name: run.require_checkpoint() for run in runs}
+    chosen = machine.choose(device, threads, "float32")
+    with machine.limited_threads(chosen):
+        networks = {name: load(path, chosen.device) for name, path in checkpoints.items()}
+        comparison = compare(
+            dataset,
+            networks,
+            (MODEL, GEO),
+            progress,
+            options,
+            kept=runs[0].folder.parent / RETRIEVAL,
+        )
+    facts = {
+        name: {**network_facts(network), "checkpoint": content_fingerprint(checkpoints[name])}
+        for name, network in networks.items()
+    }
+    return EvaluatedRuns(runs=tuple(runs), comparison=comparison, facts=facts)
+
+
+def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
+    """Write results and figures into the folder of each run, and those of several runs into one more.
+
+    Parameters
+    ----------
+    evaluated : EvaluatedRuns
+        Result of `evaluate_runs`.
+
+    Returns
+    -------
+    WrittenEvaluation
+
+    Raises
+    ------
+    StageError
+        If a file cannot be written.
+    """
+    comparison, notes = evaluated.comparison, []
+    unit = "m" if comparison.units == "m" else "model units"
+    facts: dict[str, dict[str, Any]] = {}
+    figures: dict[str, dict[str, str]] = {}
+    for run in evaluated.runs:
+        log = None
+        try:
+            log = read_log(run.log) if run.log.exists() else None
+        except InputError as error:
+            notes.append(f"the training curves are not drawn: {error}")
+        figures[run.name] = {} if log is None else {"training": training_figure(log, unit=unit)}
+        facts[run.name] = {
+            **evaluated.facts[run.name],
+            "course": None if log is None else log.facts(),
+        }
+    for run in evaluated.runs:
+        own = {run.name: facts[run.name]}
+        _write(run, select_network(comparison, run.name), own, figures[run.name])
+    folders = [run.folder for run in evaluated.runs]
+    if len(evaluated.runs) > 1:
+        folders.append(folders[0].parent / COMPARED)
+        _write(RunFiles(folders[-1]), comparison, facts, {})
+    return WrittenEvaluation(folders=tuple(folders), notes=tuple(notes))
+
+
+def _write(
+    files: RunFiles,
+    comparison: NetworkComparison,
+    runs: Mapping[str, Any],
+    figures: Mapping[str, str],
+) -> None:
+    files.folder.mkdir(parents=True, exist_ok=True)
+    write_comparison(
+        comparison,
+        {"runs": runs},
+        metrics=files.metrics,
+        errors=files.errors,
+        drawings=files.figures,
+        more_drawings=figures,
+    )

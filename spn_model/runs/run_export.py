@@ -1,0 +1,118 @@
+"""Export of the network of a run, with the metrics of its evaluation in the model card."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spn_data.area.names import GEO, MODEL
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.work.timing import Progress
+from spn_model.export.bundle_checks import BundleOptions
+from spn_model.export.bundle_export import export, is_up_to_date
+from spn_model.export.exported import ExportedBundle
+from spn_model.models.checkpoint import load
+from spn_model.runs.run_files import RunFiles
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExportedRun:
+    """Result of exporting a run.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the bundle.
+    bundle : ExportedBundle or None
+        What was written; None if the bundle was up to date.
+    is_evaluated : bool
+        Whether the model card contains metrics of this network.
+    notes : tuple of str
+        One sentence each.
+    """
+
+    folder: Path
+    bundle: ExportedBundle | None
+    is_evaluated: bool
+    notes: tuple[str, ...] = ()
+
+
+def export_run(
+    run: RunFiles,
+    dataset: Path,
+    progress: Progress,
+    options: BundleOptions,
+    *,
+    target: Path | None = None,
+    overwrite: bool = False,
+) -> ExportedRun:
+    """Export the network of a run as a bundle, unless an existing bundle is up to date.
+
+    Parameters
+    ----------
+    run : RunFiles
+        Files of the run.
+    dataset : Path
+        Data set of the training, or another one of the same world.
+    progress : Progress
+        Receives the step, items done, and items in total.
+    options : BundleOptions
+        Content and checks of the bundle.
+    target : Path, optional
+        Folder of the bundle; by default in the folder of the run.
+    overwrite : bool
+        Whether to replace a bundle in the folder, even if it is up to date.
+
+    Returns
+    -------
+    ExportedRun
+
+    Raises
+    ------
+    StageError
+        If the run has no checkpoint, the folder may not be replaced, or the disk does not accept the files.
+    InputError
+        If data set and network do not belong together.
+    FormatError
+        If the checkpoint is damaged or of another version.
+    GeometryError
+        If the graph gives other poses than PyTorch.
+    """
+    checkpoint, folder = run.require_checkpoint(), target or run.bundle
+    fingerprint = content_fingerprint(checkpoint)
+    metrics, notes = _read_metrics(run, fingerprint)
+    facts = {"run": run.name, "checkpoint": fingerprint, "evaluated": metrics is not None}
+    bundle = None
+    if overwrite or not is_up_to_date(folder, facts, options):
+        network = load(checkpoint)
+        bundle = export(
+            network,
+            dataset,
+            folder,
+            {**network.facts, **facts},
+            progress,
+            options,
+            world_names=(MODEL, GEO),
+            metrics=metrics,
+            overwrite=overwrite,
+        )
+    return ExportedRun(
+        folder=folder, bundle=bundle, is_evaluated=metrics is not None, notes=tuple(notes)
+    )
+
+
+def _read_metrics(run: RunFiles, fingerprint: str) -> tuple[dict[str, Any] | None, list[str]]:
+    """Return the metrics of the checkpoint with this fingerprint, if there are any, and notes."""
+    if not run.metrics.is_file():
+        return None, []
+    try:
+        metrics = json.loads(run.metrics.read_text(encoding="utf-8"))
+        is_same = metrics["facts"]["runs"][run.name]["checkpoint"] == fingerprint
+        has_run = any(run.name in methods for methods in metrics["groups"].values())
+        return (metrics if is_same and has_run else None), []
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return None, [
+            f"{run.metrics} cannot be read ({error!r}): the model card contains no errors."
+        ]
