@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -38,6 +39,8 @@ from spn_data.storage.stage_record import (
     read_record,
     versions,
 )
+
+_logger = logging.getLogger(__name__)
 
 _FACTS = "area.toml"
 _RECORD = "stage.json"
@@ -242,6 +245,7 @@ class Area:
         if self.has(stage):
             found = self.record(stage)
             if found.made_of == record.made_of:
+                _logger.debug("%s: up to date", stage)
                 return found
             if not overwrite:
                 change = difference(found, record)
@@ -269,6 +273,7 @@ class Area:
             shutil.rmtree(path, ignore_errors=True)
             _make_folder(path)
             write_json(started, {"version": VERSION, **asdict(record)})
+        _logger.debug("%s: %s", stage, "resumed" if resumed else "started")
         return StageWork(self, record, path, resumed=resumed)
 
     def put_in_place(self, stage: str, path: Path) -> None:
@@ -305,6 +310,7 @@ class Area:
             return
         try:
             with self.locked():
+                _logger.info("%s: completing the renames of a process that was killed", self.root)
                 for stage in self._half_replaced():
                     self._old(stage).rename(self.folder(stage))
                 if (self.root / _NEXT / _READY).exists():
@@ -391,5 +397,4 @@ def _make_folder(path: Path) -> None:
 
 
 def _has_files(path: Path) -> bool:
-    """Return whether an unfinished stage contains any files yet."""
     return any(p.is_file() and p.name != _STARTED for p in path.rglob("*"))

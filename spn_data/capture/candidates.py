@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -19,6 +20,8 @@ from spn_data.errors import InputError
 from spn_data.storage.files import atomic_writer
 from spn_data.telemetry.exif import telemetry_from_photos
 from spn_data.telemetry.track import Telemetry
+
+_logger = logging.getLogger(__name__)
 
 _CACHE_VERSION = 1  # increase whenever the measurements change
 _ZOOM_CHANGE = 0.02  # relative change of focal length that starts another camera
@@ -263,10 +266,14 @@ def _read_cache(path: Path, source: Source) -> Candidates | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             if str(data["identity"]) != _cache_key(source):
+                _logger.debug("%s: of other files, measured again", path)
                 return None
             measured = Measurements(**{f.name: data[f.name] for f in fields(Measurements)})
             starts, notes = data["part_start_s"].tolist(), data["notes"].tolist()
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        _logger.debug("%s: cannot be used (%r), measured again", path, error)
         return None
     return Candidates(source, measured, tuple(starts), None, None, tuple(notes))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import unicodedata
@@ -16,6 +17,8 @@ from spn_data.errors import InputError
 
 if TYPE_CHECKING:
     from spn_data.capture.video import VideoInfo
+
+_logger = logging.getLogger(__name__)
 
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
@@ -319,7 +322,8 @@ def _is_next_dji_part(
         probe = video.probe
     try:
         first, second = probe(before), probe(after)
-    except InputError:  # reported when the file is used
+    except InputError as error:  # reported when the file is used
+        _logger.debug("%s: not joined with %s: %s", after.name, before.name, error)
         return False
     same = (first.width, first.height, first.codec) == (second.width, second.height, second.codec)
     if not same or abs(first.fps - second.fps) > 0.01 * first.fps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +13,8 @@ from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
 from spn_data.matching.guided import match_guided
 from spn_data.matching.putative import MatchOptions, PutativeMatcher
+
+_logger = logging.getLogger(__name__)
 
 _MAX_ITERATIONS = 1000  # of the fundamental matrix estimation
 
@@ -181,7 +184,8 @@ def _epipolar_geometry(
             0.999,
             _MAX_ITERATIONS,
         )
-    except cv2.error:
+    except cv2.error as error:
+        _logger.debug("COLMAP decides on %d matches, as OpenCV failed: %s", len(matches), error)
         # OpenCV 5.0.0 raises if its local optimisation ends without a model: leave the decision to COLMAP.
         return None, np.ones(len(matches), bool)
     if fundamental is None or fundamental.shape != (3, 3):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from spn_data.area.area import Area
@@ -9,6 +10,8 @@ from spn_data.area.names import EVALUATION, FRAMES
 from spn_data.capture.sources import VIDEO_SUFFIXES, discover
 from spn_data.errors import InputError, StageError
 from spn_data.storage.fingerprints import content_fingerprint
+
+_logger = logging.getLogger(__name__)
 
 
 def find_videos(area: Area, sequence: str, given: Path | None = None) -> tuple[Path, ...]:
@@ -63,5 +66,6 @@ def _videos_in(folder: Path) -> list[Path]:
     """Return the videos in a folder; none if it no longer exists or has no video."""
     try:
         return [part for source in discover(folder).sources for part in source.parts]
-    except InputError:
+    except InputError as error:
+        _logger.debug("no videos found: %s", error)
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from spn_data.errors import InputError
 from spn_data.telemetry.dji_srt import telemetry_from_records
 from spn_data.telemetry.textfile import MAX_TEXT_BYTES
 from spn_data.telemetry.track import Telemetry
+
+_logger = logging.getLogger(__name__)
 
 _TEXT_CODECS = ("mov_text", "srt", "subrip", "text", "ass", "ssa")
 
@@ -52,6 +55,7 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
         try:
             return telemetry_from_records(records, source=str(path), has_lines=False)
         except InputError as error:
+            _logger.debug("a subtitle track is not telemetry: %s", error)
             failure = failure or error
     if failure is not None:
         raise failure

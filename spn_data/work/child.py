@@ -7,6 +7,7 @@ that started it.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import signal
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import StageError
+
+_logger = logging.getLogger(__name__)
 
 Event = dict[str, Any]
 _FULL_BYTES = 1_000_000
@@ -54,6 +57,7 @@ def run_child(module: str, job: Event, *, log: Path, on_event: Callable[[Event],
             text=True,
             start_new_session=True,  # Ctrl-C is forwarded below, once
         )
+        _logger.debug("%s: started as process %d, log in %s", module, child.pid, log)
         assert child.stdin is not None
         assert child.stdout is not None
         try:

@@ -16,6 +16,8 @@ from typing import Any
 from spn_data.errors import InputError
 from spn_data.work.parallel import Batch, Dispatch, WorkerDiedError, WorkerPool
 
+_logger = logging.getLogger(__name__)
+
 _CONNECT_S = 10.0
 _WAIT_FOR_WORKERS_S = 30.0
 _AHEAD = 2  # batches per thread of a worker: one running, one queued
@@ -163,6 +165,7 @@ def _client(address: str) -> Iterator[Any]:
         except TimeoutError as error:
             raise InputError(f"the scheduler at {address} has no workers") from error
         answers = client.run(fingerprint, on_error="return")
+        _logger.debug("%s: %d workers", address, len(answers))
         for worker, answer in answers.items():
             if not isinstance(answer, dict):
                 raise InputError(f"worker {worker} cannot load this program ({answer!r})")

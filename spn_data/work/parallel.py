@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import multiprocessing
 import os
 import signal
@@ -19,6 +20,8 @@ from types import FrameType
 from typing import Any, Self
 
 from spn_data.errors import SpnError
+
+_logger = logging.getLogger(__name__)
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Environment of a worker. By default the C library returns large blocks to the system at once, so that
@@ -175,6 +178,7 @@ class WorkerPool:
                     if label in suspects:
                         raise WorkerDiedError(label) from None
                     suspects.add(label)
+                    _logger.info("the worker of %s ended; the batch is repeated alone", label)
                     ready.insert(0, worker.batch)
                     continue
                 worker.batch = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import resource
 import time
 from collections.abc import Callable, Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from spn_data.work.parallel import living_workers_cpu_seconds
+
+_logger = logging.getLogger(__name__)
 
 # Called with the step's name, the amount done, and the total (0 if unknown).
 Progress = Callable[[str, int, int], None]
@@ -31,10 +34,13 @@ class Stopwatch:
     def step(self, name: str) -> Iterator[None]:
         """Measure the block as part of a step."""
         wall, cpu = time.perf_counter(), cpu_seconds()
+        _logger.debug("%s: started", name)
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - wall
+            seconds = time.perf_counter() - wall
+            _logger.debug("%s: ended after %.1f s", name, seconds)
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
             self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + cpu_seconds() - cpu
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,6 +39,8 @@ from spn_model.evaluation.validation import spread_rows
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.models.pose_model import PoseEstimates, PoseModel
 from spn_model.onboard.view import View
+
+_logger = logging.getLogger(__name__)
 
 _SAME_DEG, _SAME_M, _SAME_PX = 1e-9, 1e-3, 1e-3
 
@@ -208,6 +211,7 @@ def compare(
                     f"{name} was also trained on {', '.join(learned)}: its errors there are training errors, "
                     "and the baselines did not use those images."
                 )
+            _logger.debug("%s: poses of %d groups", name, len(chosen))
             parts, costs[name] = _estimate_poses(network.model, chosen, progress, name, options)
             for estimates, part in zip(found, parts, strict=True):
                 estimates.append(Estimates(name, part.poses, part.covariance))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from spn_data.storage.stage_record import versions
 from spn_data.work.timing import Progress
 from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
 from spn_model.evaluation.feature_maps import squeezenet_maps
+
+_logger = logging.getLogger(__name__)
 
 VERSION = 1  # of the cache; increase it if image descriptors change
 _METHODS = (VLAD, GEM)
@@ -106,7 +109,10 @@ def _read(
             method: [np.array(rows, dtype=np.int64) for rows in table["rows"][method]]
             for method in _METHODS
         }
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        _logger.debug("%s: cannot be used (%r), compared again", path, error)
         return None
     for of in found.values():
         if [rows.shape for rows in of] != [(len(group),) for group in groups]:

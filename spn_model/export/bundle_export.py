@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -44,6 +45,8 @@ from spn_model.onboard.bundle import (
     sha256_of,
     verified_path,
 )
+
+_logger = logging.getLogger(__name__)
 
 
 def export(
@@ -174,7 +177,8 @@ def is_up_to_date(folder: Path, facts: Mapping[str, Any], options: BundleOptions
         for graph in bundle.graphs.values():
             verified_path(graph)
         return bool(same and measured["options"] == asdict(options))
-    except (SpnError, KeyError, TypeError):
+    except (SpnError, KeyError, TypeError) as error:
+        _logger.debug("%s: not an up-to-date bundle: %r", folder, error)
         return False
 
 

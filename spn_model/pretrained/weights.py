@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import urllib.error
 import urllib.request
@@ -14,6 +15,8 @@ from urllib.parse import urlsplit
 
 from spn_data.errors import InputError
 from spn_data.work.timing import Progress
+
+_logger = logging.getLogger(__name__)
 
 SHIPPED = Path(__file__).parent
 _TIMEOUT_S = 30.0
@@ -191,6 +194,7 @@ def fetch(weights: Weights, progress: Progress) -> Path:
     target = weights.path
     if state(weights) == "yes":
         return target
+    _logger.debug("downloading %s to %s", weights.url, target)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f"{target.name}.{os.getpid()}.part")
     try:

@@ -6,6 +6,7 @@ images, a training that was killed and resumed therefore ends with the same weig
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Iterator
@@ -37,6 +38,8 @@ from spn_model.training.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
 from spn_model.training.training_loss import Diverged, LossMonitor
 from spn_model.training.training_record import Clock, Files, Record, Watch, select_validation_frames
 from spn_model.training.training_state import Position, read_state
+
+_logger = logging.getLogger(__name__)
 
 _LOG_EVERY_S = 10.0
 _SAVE_EVERY_S = 30.0
@@ -209,6 +212,7 @@ def run_stage(
 
     logged = saved = time.perf_counter()
     shown, save_s = at.shown, 0.0
+    _logger.debug("stage %s: from step %d on %s", stage.name, at.step, machine)
     with (
         prefetch_batches(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
         gradient_workers(model, parameters, stage.parts, machine) as gradient,

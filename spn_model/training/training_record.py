@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,6 +23,8 @@ from spn_model.models.pose_model import PoseModel
 from spn_model.onboard.view import View
 from spn_model.training.covariance_scale import LEAST_FRAMES, fit_covariance_scale
 from spn_model.training.training_state import Log, Position, save_state
+
+_logger = logging.getLogger(__name__)
 
 # A later network is kept if its score is at most this factor times the best one: learning rates decrease
 # towards the end, and the validation frames are few and show only one or two places.
@@ -84,10 +87,11 @@ class ValidationFrames:
         """Return the errors of the model's estimates; if `scales`, also rescale its covariances by them."""
         errors, estimates = validate(model, self.frames, self.rows)
         if scales:
-            # With too few poses, the covariances stay as they are.
-            with suppress(GeometryError):
+            try:
                 factor = fit_covariance_scale(estimates, self.frames.poses[self.rows])
                 model.set_covariance_scale(min(max(factor, 1e-6), 1e6))
+            except GeometryError as error:  # too few poses
+                _logger.debug("the covariances stay as they are: %s", error)
         return errors
 
 
