@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow lint docs clean
 
 $(VENV)/installed: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -35,6 +35,7 @@ demo: $(VENV)/installed
 	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
 	$(BIN)/spn-model export --run default --area $(DEMO)/area
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
+	$(BIN)/python tools/run_page.py docs/python.md
 
 test: $(VENV)/readers
 	$(BIN)/python -m pytest -m 'not slow'
@@ -46,6 +47,10 @@ lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The documentation site with the API reference, in build/site; warnings are errors.
+docs: $(VENV)/installed
+	$(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info

@@ -261,7 +261,27 @@ class DatasetGroup:
         return offsets
 
     def image(self, row: int, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the RGB image of a frame, uint8, shape (H, W, 3); write it to `out` if given."""
+        """Read the image of a frame.
+
+        Parameters
+        ----------
+        row : int
+            The frame.
+        out : ndarray, shape (H, W, 3), uint8, optional
+            Array to read into.
+
+        Returns
+        -------
+        ndarray, shape (H, W, 3)
+            uint8 RGB; `out` if given.
+
+        Raises
+        ------
+        InputError
+            If the data set contains no images.
+        FormatError
+            If the image is damaged.
+        """
         images = self._images
         if images is None:
             raise InputError("contains no images, only poses", path=self._path)

@@ -76,6 +76,10 @@ class Camera:
             Horizontal field of view of the undistorted image.
         distortion : tuple of float, optional
             0, 1, 2 or 4 distortion coefficients; their number selects the camera model.
+
+        Returns
+        -------
+        Camera
         """
         f = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
         center = (width / 2, height / 2)
@@ -164,7 +168,17 @@ class Camera:
         ).reshape(-1, 2)
 
     def scaled(self, width: int, height: int) -> Camera:
-        """Return the same lens for an image resized to width x height."""
+        """Return the same lens for resized images.
+
+        Parameters
+        ----------
+        width, height : int
+            New image size in pixels.
+
+        Returns
+        -------
+        Camera
+        """
         sx, sy = width / self.width, height / self.height
         factors = {"f": sx, "fx": sx, "fy": sy, "cx": sx, "cy": sy}
         params = self.params * [factors.get(name, 1.0) for name in MODELS[self.model]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -50,14 +51,24 @@ def camera_from_json(value: dict[str, Any]) -> Camera:
     return camera
 
 
-def read_camera(path: Path) -> Camera:
+def read_camera(path: str | PathLike[str]) -> Camera:
     """Read a camera from a JSON file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        JSON with model, width, height and params, as `spn-data register` writes it.
+
+    Returns
+    -------
+    Camera
 
     Raises
     ------
     InputError
         If the file does not contain a valid camera.
     """
+    path = Path(path)
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise InputError("is too large for a camera file", path=path)

@@ -130,6 +130,10 @@ class Labels:
             Whether these are tracked frames.
         reason, covariance, inliers, coverage, error_px
             As in the attributes of `Labels`.
+
+        Returns
+        -------
+        Labels
         """
         registered = np.isfinite(poses.centers).all(axis=1)
         return cls(
@@ -177,7 +181,7 @@ class Labels:
         return replace(self, poses=poses, covariance=covariance)
 
 
-def sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_sigmas(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviations of position and rotation.
 
     Parameters

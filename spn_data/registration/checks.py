@@ -16,7 +16,7 @@ import numpy as np
 from spn_data.colmap.resection import resect
 from spn_data.geometry.epipolar import essential_matrix, sampson_errors
 from spn_data.geometry.pose import Poses, rotation_errors_deg
-from spn_data.labels.labels import sigmas
+from spn_data.labels.labels import pose_sigmas
 from spn_data.labels.map_points import covered_share
 from spn_data.registration.register_options import CheckOptions, RegisterOptions
 from spn_data.registration.solution import SequenceSolution, UnsolvedSequence, reprojection_errors
@@ -94,7 +94,7 @@ def gather_evidence(
             depth[row] = np.median(np.linalg.norm(away, axis=1))
             rival[row] = _rival_inliers(sequence, solution, row, depth[row], options)
     shown = [_points_of_features(sequence, solution, row) for row in range(n)]
-    sigma, sigma_deg = sigmas(covariances)
+    sigma, sigma_deg = pose_sigmas(covariances)
     keys = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return Evidence(
         direct=direct,

@@ -91,7 +91,12 @@ class FrameErrors:
 class Spread:
     """Median, mean and 95th percentile of errors.
 
-    A frame without a pose counts as an infinite error in median and p95. The mean is over frames with a pose.
+    Attributes
+    ----------
+    median, p95 : float
+        Over all frames; a frame without a pose counts as an infinite error.
+    mean : float
+        Over frames with a pose.
     """
 
     median: float
@@ -101,9 +106,16 @@ class Spread:
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Errors along one axis.
+    """Position errors along one axis of the world.
 
-    Signed errors (estimated minus true) are over frames with a pose, absolute errors over all frames.
+    Attributes
+    ----------
+    axis : str
+        Name of the axis, as in "east".
+    signed_median, signed_mean : float
+        Of estimated minus true, over frames with a pose.
+    absolute_median, absolute_p95 : float
+        Of absolute errors over all frames.
     """
 
     axis: str
@@ -115,7 +127,17 @@ class AxisErrors:
 
 @dataclass(frozen=True)
 class Within:
-    """Share of all frames whose position and rotation errors are both within limits (included)."""
+    """Share of all frames whose position and rotation errors are both within limits.
+
+    Attributes
+    ----------
+    limit : float
+        Largest position error, in the world's unit.
+    limit_deg : float
+        Largest rotation error in degrees.
+    share : float
+        From 0 to 1.
+    """
 
     limit: float
     limit_deg: float

@@ -35,10 +35,17 @@ _FATAL = 4  # log level: errors are raised, and onnxruntime need not print them 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Pose of one image. poses : one pose, NaN if none was found; reason : why not, empty if there is a pose.
+    """Pose of one image, or the reason why there is none.
 
-    covariance : (6, 6) over the centre in the world's unit and a rotation vector v in the camera frame,
-    R_true = exp(v) R.
+    Attributes
+    ----------
+    poses : Poses
+        One pose in the world; NaN if none was found.
+    covariance : ndarray, shape (6, 6)
+        Over the centre in the world's unit and a rotation vector v in the camera frame, in radians:
+        R_true = exp(v) R.
+    reason : str
+        Why there is no pose; empty if there is one.
     """
 
     poses: Poses
@@ -128,10 +135,28 @@ class Localizer:
         return self.decode(self.run(self.view(image, camera, rgb=rgb)))
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
-        """Render an image into the network's own camera, (1, h, w, 3) uint8 RGB.
+        """Render an image into the network's own camera.
 
-        Pixels outside the image are black. Parameters and errors as for `localize`; raises ValueError for
-        another type or shape of image.
+        Parameters
+        ----------
+        image : ndarray, shape (H, W, 3)
+            Image of the flying camera, uint8.
+        camera : Camera
+            Its camera.
+        rgb : bool
+            Whether the image is RGB instead of BGR.
+
+        Returns
+        -------
+        ndarray, shape (1, h, w, 3)
+            uint8 RGB; pixels outside the image are black.
+
+        Raises
+        ------
+        InputError
+            If the image does not have the aspect ratio of the camera.
+        ValueError
+            For another type or shape of image.
         """
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(
@@ -151,7 +176,16 @@ class Localizer:
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
         """Convert outputs of the network to a pose.
 
-        matrix : camera matrix K (3, 3) of the image, if it is not that of the bundle's camera.
+        Parameters
+        ----------
+        outputs : list of ndarray
+            As `run` returns them.
+        matrix : ndarray, shape (3, 3), optional
+            Camera matrix K of the image, if it is not that of the bundle's camera.
+
+        Returns
+        -------
+        Located
         """
         if isinstance(self.bundle.decoding, PoseDecoding):
             return _decode_regression(self.bundle.decoding, *outputs)
@@ -171,10 +205,24 @@ class Localizer:
         return Located(found.poses, found.covariance)
 
     def renderer(self, camera: Camera, width: int, height: int) -> PinholeRenderer:
-        """Return the cached renderer from images of this size into the network's camera.
+        """Return the cached renderer from images of one size into the network's camera.
 
-        Its `valid` mask gives the pixels of the view that the camera sees. Raises InputError as `localize`
-        does.
+        Parameters
+        ----------
+        camera : Camera
+            Camera of the images.
+        width, height : int
+            Size of the images in pixels.
+
+        Returns
+        -------
+        PinholeRenderer
+            Its `valid` mask gives the pixels of the view that the camera sees.
+
+        Raises
+        ------
+        InputError
+            If the images do not have the aspect ratio of the camera.
         """
         key = (camera.model, camera.width, camera.height, camera.params.tobytes(), width, height)
         if key not in self._renderers:
