@@ -137,7 +137,6 @@ def report_data(area: Area) -> ReportData:
         version=versions()["squeezeposenet-toolkit"],
         units="m" if geo is not None else "model",
         stages=stages,
-        frames_record=area.record(FRAMES),
         model_record=area.record(MODEL) if fresh.has(MODEL) else None,
         geo=geo,
         frames=frames,

@@ -336,8 +336,8 @@ class ReportData:
         "m", or "model" if metres, north and up are unknown.
     stages : tuple of StageFacts
         Existing stages in processing order.
-    frames_record, model_record : StageRecord or None
-        Records of the stages with frames and model.
+    model_record : StageRecord or None
+        Record of the stage with the model.
     geo : GeoFit or None
         Georegistration; None if there is none.
     frames : FrameTable
@@ -366,7 +366,6 @@ class ReportData:
     version: str
     units: str
     stages: tuple[StageFacts, ...]
-    frames_record: StageRecord | None
     model_record: StageRecord | None
     geo: GeoFit | None
     frames: FrameTable

@@ -49,8 +49,6 @@ class PhotoMetadata:
         Camera and lens.
     focal_mm, focal_35mm : float
         Focal length and its 35 mm equivalent.
-    calibrated_focal_px : float
-        XMP focal length of the full-size photo.
     local_s, utc_s : float
         Time of exposure in seconds since 1970, on the camera's clock of unknown time zone, and in UTC
         (only if the photo states the zone).
@@ -83,7 +81,6 @@ class PhotoMetadata:
     lens: str = ""
     focal_mm: float = NAN
     focal_35mm: float = NAN
-    calibrated_focal_px: float = NAN
     local_s: float = NAN
     utc_s: float = NAN
     lat_deg: float = NAN
@@ -167,7 +164,6 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         lens=text(exif.get(_LENS_MODEL)),
         focal_mm=positive(exif.get(_FOCAL_MM)),
         focal_35mm=positive(exif.get(_FOCAL_35MM)),
-        calibrated_focal_px=positive(xmp.get(_DJI + "CalibratedFocalLength")),
         local_s=local_s,
         utc_s=utc_s,
         lat_deg=lat,

@@ -130,7 +130,6 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
         stages=tuple(
             StageFacts(r, None, f"spn-data {c}") for r, c in zip(stages, commands, strict=True)
         ),
-        frames_record=stages[0],
         model_record=stages[1],
         geo=geo_fit(cameras),
         frames=frames,
