@@ -178,6 +178,22 @@ def test_a_flight_along_the_facade_stands() -> None:
     assert np.all((found.depth > 8) & (found.depth < 11))
 
 
+@pytest.mark.parametrize(("share_of_limit", "agreement"), [(0.95, 1.0), (1.05, 0.0)])
+def test_matches_agree_up_to_the_limit_of_the_sampson_error(
+    share_of_limit: float, agreement: float
+) -> None:
+    """A match d pixels off the line in one of two images has a Sampson error of d / sqrt(2) pixels."""
+    made = flight(2, noise_px=0.0)
+    off_px = share_of_limit * np.sqrt(2) * OPTIONS.max_error_px
+    shifted = replace(made, pixels=[made.pixels[0], made.pixels[1] + [0.0, off_px]])
+    sequence = shifted.sequence([np.empty((0, 2), np.int64)] * 2)
+    none = np.empty(0, np.int64)
+    posed = np.ones(2, bool)
+    solution = SequenceSolution(posed, made.poses, LENS, *(none,) * 4, np.empty((0, 3)))
+    found = gather_evidence(sequence, solution, np.tile(np.eye(6), (2, 1, 1)), made.pairs, OPTIONS)
+    assert found.agreement.tolist() == [agreement]
+
+
 @pytest.mark.parametrize("columns", [1, -1])
 def test_a_frame_at_the_wrong_window_is_ambiguous(columns: int) -> None:
     """Its own matches agree with a pose one window along the flight, where epipolar lines stay the same."""
