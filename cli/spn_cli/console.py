@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import signal
 import threading
@@ -41,6 +42,8 @@ class Group(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> object:
+        if ctx.params.get("verbose"):
+            ctx.with_resource(_log_on_stderr())
         try:
             with _interruptible():
                 return super().invoke(ctx)
@@ -64,6 +67,31 @@ class Group(click.Group):
             raise click.ClickException(
                 f"{where}{error.strerror}{_KEPT if error.errno in _FULL else ''}"
             ) from error
+
+
+class _EchoHandler(logging.Handler):
+    """Print log messages on standard error, above progress bars."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one message."""
+        click.echo(self.format(record), err=True)
+
+
+@contextmanager
+def _log_on_stderr() -> Iterator[None]:
+    """Print what the libraries log within the block."""
+    handler = _EchoHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    loggers = [logging.getLogger(name) for name in ("spn_data", "spn_model")]
+    for logger in loggers:
+        logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+            logger.setLevel(logging.NOTSET)
 
 
 _stop_wanted = False

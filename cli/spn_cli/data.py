@@ -20,7 +20,7 @@ from spn_cli.split import split
 
 @click.group(cls=Group)
 @click.version_option(package_name="squeezeposenet-toolkit")
-@click.option("-v", "--verbose", is_flag=True, help="Show where an error comes from.")
+@click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
 def main(verbose: bool) -> None:
     """Prepare an area for flight with image-based localization."""
 

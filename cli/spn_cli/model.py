@@ -15,7 +15,7 @@ from spn_cli.weights import weights
 
 @click.group(cls=Group)
 @click.version_option(package_name="squeezeposenet-toolkit")
-@click.option("-v", "--verbose", is_flag=True, help="Show where an error comes from.")
+@click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
 def main(verbose: bool) -> None:
     """Networks that tell a pose from an image, in an area that `spn-data` has prepared."""
 
