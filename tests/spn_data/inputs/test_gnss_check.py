@@ -1,4 +1,4 @@
-"""The check of labels against the flight's own fixes, which they were made without."""
+"""Comparison of labels with the GNSS fixes of their flight, which they do not use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMES = np.arange(N) * 0.5
 
 
 def positions(time_s: np.ndarray) -> np.ndarray:
-    """A winding flight."""
+    """Return the positions (N, 3) of a winding flight."""
     return np.column_stack(
         [12 * np.sin(0.3 * time_s), 9 * np.cos(0.17 * time_s), 8 + 2 * np.sin(0.23 * time_s)]
     )
@@ -55,7 +55,7 @@ def labelled(failed: int = 0) -> Labels:
 def track(
     geo: GeoFit, offset_m: tuple[float, float, float], *, late_s: float = 0.0, kind: str = "dji-srt"
 ) -> Telemetry:
-    """Fixes beside the flight, ten a second, the clock of the telemetry behind by `late_s`."""
+    """Return fixes at 10 Hz with a constant offset from the flight; their clock is `late_s` behind."""
     time_s = np.arange(-20, 10 * N) * 0.1
     rng = np.random.default_rng(4)
     enu = positions(time_s + late_s) + offset_m + rng.normal(0, 0.05, (len(time_s), 3))
@@ -113,6 +113,21 @@ def test_heights_that_count_from_elsewhere_are_not_compared() -> None:
     assert found.scatter_v_m is None
     assert not found.contradicts
     assert "no height to compare" in found.describe()
+
+
+def test_heights_above_take_off_count_from_the_origin() -> None:
+    """Fixes half a metre too low show as -0.5 m, also if the origin is at a height of 115 m."""
+    geo = geo_fit(3)
+    origin = replace(geo.origin, height_reference=HeightReference.TAKEOFF)
+    absolute = track(geo, (0.0, 0.0, -0.5))
+    above = replace(
+        absolute,
+        rel_alt_m=absolute.abs_alt_m - origin.alt_m,
+        abs_alt_m=np.full(len(absolute), np.nan),
+    )
+    found = check(labelled(), above, replace(geo, origin=origin))
+    assert found.offset_u_m == pytest.approx(-0.5, abs=0.05)
+    assert not found.contradicts
 
 
 def test_too_few_labels_or_fixes_are_no_check() -> None:

@@ -1,4 +1,4 @@
-"""Which telemetry a source gets, and what is said where it gets none."""
+"""Notes on data tracks of videos that cannot be read as telemetry."""
 
 from __future__ import annotations
 
