@@ -12,16 +12,16 @@ from spn_cli import console, options
 if TYPE_CHECKING:
     from spn_data.split.audit import AuditFinding
 
-_SHOWN = 5  # lines of evidence a finding
+_SHOWN = 5  # lines of evidence per finding
 
 
 @click.command()
 @options.area
-@click.option("--all", "everything", is_flag=True, help="Show all of the evidence.")
+@click.option("--all", "everything", is_flag=True, help="Show all evidence.")
 def audit(area_folder: Path, everything: bool) -> None:
-    """Check that the split keeps what it promises: no leak, no frame on the wrong side, no damaged file.
+    """Audit the split: no leakage, no frame in the wrong set, no damaged file.
 
-    Changes nothing. Exit code 1 where a check fails.
+    Nothing is changed. The exit code is 1 if a check fails.
 
     \b
     Example:
@@ -36,7 +36,7 @@ def audit(area_folder: Path, everything: bool) -> None:
 
 
 def show_findings(findings: tuple[AuditFinding, ...], *, shown: int | None = _SHOWN) -> None:
-    """One line a check, its evidence below. Ends the program with 1 where a check failed."""
+    """Print the findings with their evidence; raise ClickException (exit code 1) if a check failed."""
     from spn_data.split.audit import AuditVerdict, has_failed
 
     rows = []

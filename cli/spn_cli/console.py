@@ -1,4 +1,4 @@
-"""What the user sees: progress with time left, tables, one line an error."""
+"""Terminal output: progress with remaining time, tables, and errors in one line."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ from rich.text import Text
 from spn_data.errors import SpnError
 from spn_data.work.timing import Progress
 
-# Names of the user's files are shown as they are: brackets in them are no markup, colons no emoji.
+# File names of the user are printed unchanged: brackets in them are not markup, colons not emoji.
 out = Console(highlight=False, markup=False, emoji=False)
 _PLAIN_EVERY_S = 20.0
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DISK = (*_FULL, errno.EIO, errno.EROFS)
-_KEPT = ". What is done is kept: make room, and the same command goes on"
+_KEPT = ". Completed work is kept: free some space and run the same command to resume"
 
 
 class Group(click.Group):
-    """Commands in the order in which they are defined; errors of the user's data are one line, exit 1."""
+    """Group that lists commands in order of definition and reports errors in one line with exit code 1."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands in order of definition."""
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> object:
+        """Run a command; turn errors into click's, and Ctrl-C into exit code 130."""
         if ctx.params.get("verbose"):
             ctx.with_resource(_log_on_stderr())
         try:
@@ -50,18 +52,18 @@ class Group(click.Group):
         except SpnError as error:
             if ctx.params.get("verbose"):
                 raise
-            refused = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
-            raise click.ClickException(f"{error}{_KEPT if refused else ''}") from error
+            is_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
+            raise click.ClickException(f"{error}{_KEPT if is_full else ''}") from error
         except KeyboardInterrupt:
             click.echo(
-                "\nStopped. What is done is kept: the same command goes on from here.", err=True
+                "\nStopped. Completed work is kept: run the same command to resume.", err=True
             )
             ctx.exit(130)
         except OSError as error:
-            # Without a file's name it is our mistake, but where a disk refused what was written.
+            # Without a file name it is a bug, unless the disk refused a write.
             if ctx.params.get("verbose") or (error.filename is None and error.errno not in _DISK):
                 raise
-            # Of a copy to a full disk, the second name is the file that could not be written.
+            # When a copy fills the disk, the second name is the file that could not be written.
             name = error.filename2 if error.errno in _DISK and error.filename2 else error.filename
             where = "" if name is None else f"{os.fsdecode(name)}: "
             raise click.ClickException(
@@ -99,7 +101,7 @@ _stop_wanted = False
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Remember Ctrl-C: raised inside a native library's callback, Python prints and drops it."""
+    """Remember Ctrl-C within the block: Python drops the exception in callbacks of native libraries."""
     global _stop_wanted
     _stop_wanted = False
 
@@ -118,14 +120,14 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _stop_where_wanted() -> None:
+def _raise_if_stopped() -> None:
     if _stop_wanted:
         raise KeyboardInterrupt
 
 
 @contextmanager
 def progress() -> Iterator[Progress]:
-    """A bar for each step with the time left on a terminal, a line now and then elsewhere."""
+    """Show a bar with the remaining time for each step on a terminal, otherwise a line from time to time."""
     if not out.is_terminal:
         yield _PlainProgress()
         return
@@ -141,7 +143,7 @@ def progress() -> Iterator[Progress]:
         tasks: dict[str, object] = {}
 
         def update(step: str, done: int, total: int) -> None:
-            _stop_where_wanted()
+            _raise_if_stopped()
             if step not in tasks:
                 tasks[step] = bars.add_task(step, total=total or None)
             bars.update(tasks[step], completed=done, total=total or None)  # type: ignore[arg-type]
@@ -150,14 +152,14 @@ def progress() -> Iterator[Progress]:
 
 
 class _PlainProgress:
-    """For logs: the start and end of each step, and a line every so often between."""
+    """Progress for logs: a line at the start and end of each step, and every 20 seconds in between."""
 
     def __init__(self) -> None:
         self._step = ""
         self._started = self._last = 0.0
 
     def __call__(self, step: str, done: int, total: int) -> None:
-        _stop_where_wanted()
+        _raise_if_stopped()
         now = time.monotonic()
         if step != self._step:
             self._step, self._started, self._last = step, now, now
@@ -171,7 +173,7 @@ class _PlainProgress:
 
 
 def table(title: str, rows: Sequence[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
-    """Rows of text; the first column is the name of what stands beside it."""
+    """Print a table of texts; the first column is bold."""
     shown = Table(title=Text(title), title_justify="left", show_header=bool(header), box=None)
     width = len(header or rows[0])
     for k in range(width):
@@ -185,11 +187,12 @@ def table(title: str, rows: Sequence[tuple[str, ...]], header: tuple[str, ...] =
 
 
 def note(text: str) -> None:
+    """Print a note."""
     out.print(Text.assemble(("Note:", "yellow"), " ", text))
 
 
 def duration(seconds: float) -> str:
-    """Seconds for people."""
+    """Format seconds as a rounded number of seconds, minutes or hours."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

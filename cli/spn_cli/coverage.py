@@ -23,53 +23,53 @@ _SHOWN_STOPS = 20
     "--waypoints",
     type=click.Path(path_type=Path),
     metavar="FILE.csv",
-    help="Planned waypoints, instead of the evaluation sequences.",
+    help="Table of planned waypoints to check instead of the evaluation sequences.",
 )
 @click.option(
     "--camera",
     "camera_file",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Camera (JSON) of waypoints that name none.  [default: the one that mapped most]",
+    help="Camera (JSON) of waypoints that name none.  [default: that of most mapping frames]",
 )
 @click.option(
     "--fov",
     "fov_deg",
     type=options.Finite(5, 170),
     metavar="DEG",
-    help="Or its horizontal field of view.",
+    help="Horizontal field of view in degrees, instead of --camera.",
 )
 @click.option(
     "--high",
     type=_LIMITS,
     metavar="M DEG",
-    help="High coverage: a mapping frame within this.  [default: 2 15]",
+    help="Limits of high coverage: distance and angle to the nearest mapping frame.  [default: 2 15]",
 )
 @click.option(
     "--medium",
     type=_LIMITS,
     metavar="M DEG",
-    help="Medium coverage: a mapping frame within this.  [default: 5 40]",
+    help="Limits of medium coverage.  [default: 5 40]",
 )
 @click.option(
     "--fly-again",
     type=click.Path(path_type=Path),
     metavar="FILE.csv",
-    help="Write where to fly again to close the gaps.",
+    help="Write places to fly again in order to close the gaps.",
 )
 @click.option(
     "--wanted",
     type=click.Choice(["high", "medium"]),
     default="high",
     show_default=True,
-    help="What the places to fly again should bring every frame to.",
+    help="Coverage that every frame should reach with --fly-again.",
 )
 @click.option(
     "--margin",
     type=options.Finite(0, 1, min_open=True),
     default=0.7,
     show_default=True,
-    help="Share of the limits that they are planned with; the rest is for flying inexactly.",
+    help="Share of the limits used for planning; the rest is a margin for inexact flying.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace the file of --fly-again if it exists.")
 def coverage(
@@ -81,7 +81,7 @@ def coverage(
     overwrite: bool,
     **chosen: Any,
 ) -> None:
-    """How well the mapping flights cover the evaluation flights, or planned waypoints.
+    """Measure how well the mapping flights cover the evaluation flights or planned waypoints.
 
     \b
     Example:
@@ -94,11 +94,9 @@ def coverage(
     from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):
-        raise click.UsageError(
-            "--camera and --fov are of --waypoints: labels have their own camera"
-        )
+        raise click.UsageError("--camera and --fov need --waypoints; labels have their own camera")
     if camera_file is not None and fov_deg is not None:
-        raise click.UsageError("--camera and --fov are two answers to one question: give one")
+        raise click.UsageError("give either --camera or --fov")
     wanted = CoverageStageOptions(
         coverage=_strata(chosen["high"], chosen["medium"]),
         refly=ReflyOptions(wanted=Stratum(chosen["wanted"]), margin=chosen["margin"]),
@@ -117,9 +115,9 @@ def coverage(
     for note in found.notes:
         console.note(note)
     _show_stops(found, chosen["wanted"])
-    console.out.print(f"Frame by frame: {found.folder}.")
+    console.out.print(f"Results of each frame: {found.folder}.")
     if fly_again is not None and found.fly_again is None:
-        console.note(f"{fly_again} is not written: without metres there is no place to fly to.")
+        console.note(f"{fly_again} is not written: waypoints need a georegistered map.")
     elif fly_again is not None:
         write_csv(fly_again, found.stops)
         console.out.print(
@@ -128,7 +126,7 @@ def coverage(
 
 
 def _strata(high: tuple[float, float] | None, medium: tuple[float, float] | None) -> Any:
-    """The given limits; None where none is given. Raises UsageError for limits that don't fit."""
+    """Return the given limits, or None if there are none; raise UsageError if they are inconsistent."""
     from spn_data.coverage.nearest_frame import CoverageOptions
 
     if high is None and medium is None:
@@ -147,14 +145,14 @@ def _strata(high: tuple[float, float] | None, medium: tuple[float, float] | None
 def _show(name: str, coverage: Coverage, found: AreaCoverage) -> None:
     summary = coverage.summary()
     failed, known = summary["failed"], summary["frames"] - summary["failed"]
-    unit = "m" if found.units == "m" else "units of the model"
+    unit = "m" if found.units == "m" else "model units"
     rows = [("frames", f"{summary['frames']}" + (f", {failed} of them failed" if failed else ""))]
     options_, median = found.options, summary["median"]
     if options_ is not None and known:
         limits = {
             "high": f"<= {options_.high_m:g} {unit} and <= {options_.high_deg:g} deg",
             "medium": f"<= {options_.medium_m:g} {unit} and <= {options_.medium_deg:g} deg",
-            "low": "farther",
+            "low": "beyond",
         }
         rows += [
             (f"{stratum} coverage", f"{n} ({n / known:.0%}); {limits[stratum]}")
@@ -171,15 +169,15 @@ def _show(name: str, coverage: Coverage, found: AreaCoverage) -> None:
     if known and heights is not None:
         (low, high), (lowest, highest) = heights["mapping"], heights["here"]
         rows += [
-            ("height above it", f"{median['height']:+.2f} m"),
+            ("height above that frame", f"{median['height']:+.2f} m"),
             ("heights", f"{lowest:.1f} to {highest:.1f} m; mapping {low:.1f} to {high:.1f} m"),
         ]
     if known:
         rows += [
-            ("view that the map has points for", f"{median['view_share']:.0%}"),
+            ("share of the view with map points", f"{median['view_share']:.0%}"),
             (
-                "best answer by looking up a frame",
-                f"off by {median['answer_distance']:.2f} {unit}, {median['answer_angle_deg']:.1f} deg",
+                "best retrieval result",
+                f"error {median['answer_distance']:.2f} {unit}, {median['answer_angle_deg']:.1f} deg",
             ),
         ]
     console.table(f"{name}: coverage (medians over frames with a pose)", rows)

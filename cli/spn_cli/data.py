@@ -22,7 +22,7 @@ from spn_cli.split import split
 @click.version_option(package_name="squeezeposenet-toolkit")
 @click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
 def main(verbose: bool) -> None:
-    """Prepare an area for flight with image-based localization."""
+    """Prepare an area for image-based localization of UAVs."""
 
 
 @main.command()
@@ -30,57 +30,64 @@ def main(verbose: bool) -> None:
     "inputs", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
 @options.area
-@click.option("--add", is_flag=True, help="Extend the area by these sources; what it has is kept.")
+@click.option("--add", is_flag=True, help="Add these sources to the area; its data are kept.")
 @options.overwrite
 @options.fov
 @options.camera
-@click.option("--frames", "target_count", type=click.IntRange(3), help="Frames wanted in all.")
+@click.option(
+    "--frames",
+    "target_count",
+    type=click.IntRange(3),
+    help="Total number of frames to choose.  [default: as many as the spacing yields]",
+)
 @click.option(
     "--spacing",
     "motion_share",
     type=options.Finite(0.005, 1),
     default=0.1,
     show_default=True,
-    help="Motion of the image between chosen frames, as a share of its width.",
+    help="Image motion between chosen frames, as a share of the image width.",
 )
 @click.option(
     "--mask",
     type=click.Path(exists=True),
-    help="Image, white where pixels may be used; or a folder of <sequence>.png.",
+    help="Mask image, white where pixels may be used, or a folder of <sequence>.png.",
 )
 @click.option(
-    "--any-telemetry", is_flag=True, help="Use telemetry whose length does not fit its video."
+    "--any-telemetry",
+    is_flag=True,
+    help="Use telemetry even if its length does not match its video.",
 )
 @click.option(
     "--engine",
     type=click.Choice(["incremental", "global"]),
     default="incremental",
     show_default=True,
-    help="COLMAP's mapper.",
+    help="COLMAP's mapper to use.",
 )
 @click.option(
     "--max-features",
     type=click.IntRange(50, 100_000),
     default=4096,
     show_default=True,
-    help="Features of an image.",
+    help="Maximum number of features per image.",
 )
 @click.option(
     "--max-image-size",
     type=click.IntRange(64),
     default=1600,
     show_default=True,
-    help="Longer side in pixels on which features are found.",
+    help="Longer image side in pixels for feature extraction; larger images are reduced.",
 )
 @options.threads
 @options.cluster
 @options.seed
 @options.georegistration
 def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen: Any) -> None:
-    """Make a georeferenced model from flight video or photos with telemetry.
+    """Reconstruct a georeferenced map from flight videos or photos with telemetry.
 
-    VIDEO is a folder, or a file. An interrupted run goes on where it was; run again with nothing
-    changed, it says so.
+    VIDEO is a file or a folder. The same command resumes an interrupted run; stages that are up to date are
+    not redone.
 
     \b
     Example:
@@ -96,7 +103,7 @@ def reconstruct(inputs: tuple[Path, ...], area_folder: Path, add: bool, **chosen
 @options.overwrite
 @options.georegistration
 def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
-    """Put the area's model into metres again, with other options.
+    """Georegister the area's model again with other options.
 
     \b
     Example:
@@ -129,7 +136,7 @@ main.add_command(report)
 @main.command()
 @options.area
 def status(area_folder: Path) -> None:
-    """What the area holds, what it was made with, and what is stale.
+    """Show the stages and runs of the area, and which of them are stale.
 
     \b
     Example:
@@ -147,11 +154,15 @@ def status(area_folder: Path) -> None:
     type=click.Choice(["standard", "demo"]),
     default="standard",
     show_default=True,
-    help="standard: 1280x720 at 10 fps; demo: the same flights at 960x540 and 5 fps.",
+    help="Size of the videos. standard: 1280x720 at 10 fps; demo: the same flights at 960x540 and 5 fps.",
 )
-@click.option("--seed", default=1, show_default=True, help="Of scene, flights and errors.")
 @click.option(
-    "--only", multiple=True, help="Flight or role (mapping, evaluation) to render; may be repeated."
+    "--seed", default=1, show_default=True, help="Random seed of scene, flights and errors."
+)
+@click.option(
+    "--only",
+    multiple=True,
+    help="Flight or role (mapping, evaluation) to render; may be repeated.  [default: all]",
 )
 @click.option(
     "--path",
@@ -159,20 +170,34 @@ def status(area_folder: Path) -> None:
     type=click.Choice(["courtyard", "nadir", "straight"]),
     default="courtyard",
     show_default=True,
-    help="How the area is flown for mapping.",
-)
-@click.option("--rtk", is_flag=True, help="GNSS of 3 cm without drift or multipath.")
-@click.option("--no-gimbal", is_flag=True, help="Telemetry without gimbal angles.")
-@click.option(
-    "--time-offset", "time_offset_s", default=0.0, help="Seconds by which telemetry is early."
+    help="Paths of the mapping flights.",
 )
 @click.option(
-    "--readout", "readout_s", default=0.0, help="Rolling shutter: seconds from first row to last."
+    "--rtk",
+    is_flag=True,
+    help="Simulate RTK: GNSS with 3 cm white noise, without drift or multipath.",
 )
-@click.option("--area-factor", default=1.0, show_default=True, help="Times the courtyard's area.")
-@click.option("--length-factor", default=1.0, show_default=True, help="Times the flights' length.")
+@click.option("--no-gimbal", is_flag=True, help="Write telemetry without gimbal angles.")
+@click.option(
+    "--time-offset",
+    "time_offset_s",
+    default=0.0,
+    show_default=True,
+    help="Seconds by which telemetry is early.",
+)
+@click.option(
+    "--readout",
+    "readout_s",
+    default=0.0,
+    show_default=True,
+    help="Readout time of the rolling shutter in seconds, from first to last row.",
+)
+@click.option("--area-factor", default=1.0, show_default=True, help="Factor of the ground area.")
+@click.option(
+    "--length-factor", default=1.0, show_default=True, help="Factor of the duration of the flights."
+)
 def simulate(out: Path, preset: str, seed: int, **chosen: Any) -> None:
-    """Render flights over a courtyard, with telemetry and exact truth.
+    """Render simulated flights over a courtyard, with telemetry and exact ground truth.
 
     \b
     Example:

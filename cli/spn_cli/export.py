@@ -1,4 +1,4 @@
-"""`spn-data export`: labels in other programs' formats."""
+"""The command `spn-data export`."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ FORMATS = ("tum", "nerfstudio", "kapture", "geojson", "kml", "colmap-text", "col
     help="Sequence to export; may be repeated.  [default: all]",
 )
 @click.option(
-    "--all-frames", is_flag=True, help="Tracked frames too, in formats that list no images."
+    "--all-frames", is_flag=True, help="Include tracked frames, in formats that list no images."
 )
-@click.option("--no-images", is_flag=True, help="Copy no images beside the poses.")
+@click.option("--no-images", is_flag=True, help="Do not copy the images.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier export in that folder.")
 def export(
     format_name: str,
@@ -41,10 +41,10 @@ def export(
     no_images: bool,
     overwrite: bool,
 ) -> None:
-    """Write the poses of all registered frames for other programs.
+    """Export the poses of all registered frames to formats of other programs.
 
-    FORMAT is tum, nerfstudio, kapture, geojson, kml, colmap-text, colmap, nvm, or all for a folder of
-    each. Mapping and evaluation frames are written; the area is left as it is.
+    FORMAT is tum, nerfstudio, kapture, geojson, kml, colmap-text, colmap or nvm; all writes a folder of each.
+    Mapping and evaluation frames are exported; the area is not changed.
 
     \b
     Example:
@@ -62,8 +62,6 @@ def export(
     console.table("Poses", rows, ("sequence", "frames"))
     console.out.print(f"Written to {target}: {', '.join(done.formats)}.")
     if done.units != "m":
-        console.out.print(
-            "The area has no place in the world: lengths are in units of the model, not metres."
-        )
+        console.out.print("The map is not georegistered: lengths are in model units, not metres.")
     for name, reason in done.left_out.items():
         console.out.print(f"{name} is left out: it {reason}.")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Number of training images that calibrate the 8-bit activations.",
 )
-@options.overwrite
+@click.option("--overwrite", is_flag=True, help="Replace an existing bundle.")
 def export(
     dataset: Path | None,
     area_folder: Path,

@@ -1,4 +1,4 @@
-"""`spn-data import`: a data set from somebody else's lists."""
+"""The command `spn-data import`."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from spn_cli import console
     type=click.IntRange(16, 16_384),
     default=480,
     show_default=True,
-    help="Width in pixels of the images in it.",
+    help="Width of the images in the data set, in pixels.",
 )
 @click.option(
     "--units",
     type=click.Choice(["m", "model"]),
     default="m",
     show_default=True,
-    help="What the positions are in, which the format does not say: metres, or no known unit.",
+    help="Unit of the positions, which the format does not state: metres, or unknown.",
 )
 @click.option(
     "--keep-outliers",
     is_flag=True,
-    help="Keep frames whose position is absurdly far from all others.",
+    help="Keep frames whose position is implausibly far from all others.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace the file where it exists.")
+@click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
 def import_(
     folder: Path, target: Path, width_px: int, units: str, keep_outliers: bool, overwrite: bool
 ) -> None:
-    """Make a data set from a folder in the format of Cambridge Landmarks.
+    """Convert a folder in the format of Cambridge Landmarks to a data set.
 
-    FOLDER holds dataset_train.txt, and as far as they exist dataset_test.txt, dataset_validation.txt, the
-    images that they list, and reconstruction.nvm.
+    FOLDER contains dataset_train.txt and, optionally, dataset_test.txt, dataset_validation.txt, the images
+    that they list, and reconstruction.nvm.
 
     \b
     Example:
@@ -60,4 +60,4 @@ def import_(
         console.note(note)
     frames = ", ".join(f"{name} {count}" for name, count in done.counts.items())
     what = "images" if done.has_images else "poses without images"
-    console.out.print(f"{target}: {what}: {frames}; focal length known of {done.with_focal}.")
+    console.out.print(f"{target}: {what}: {frames}; {done.with_focal} with a known focal length.")

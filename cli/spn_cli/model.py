@@ -17,7 +17,7 @@ from spn_cli.weights import weights
 @click.version_option(package_name="squeezeposenet-toolkit")
 @click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
 def main(verbose: bool) -> None:
-    """Networks that tell a pose from an image, in an area that `spn-data` has prepared."""
+    """Train and use networks that estimate camera poses in an area prepared by `spn-data`."""
 
 
 main.add_command(train)

@@ -22,7 +22,7 @@ area = click.option(
     help="Folder of the area.  [default: the current folder]",
 )
 overwrite = click.option(
-    "--overwrite", is_flag=True, help="Redo what exists but was made with other options or inputs."
+    "--overwrite", is_flag=True, help="Redo a stage whose options or inputs changed."
 )
 seed = click.option(
     "--seed",

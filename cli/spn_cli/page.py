@@ -1,4 +1,4 @@
-"""The area's page, kept up to date by every command that changes what it shows."""
+"""Updates of report.html by commands that change its content."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from spn_cli import console
 from spn_data.area.area import Area
-from spn_data.area.names import FRAMES
+from spn_data.area.names import FRAMES, REPORT
 from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 def refresh(area: Area) -> None:
-    """Write report.html. What a command has made stands, whatever becomes of the page."""
+    """Write report.html; if that fails, only show a note, because the results of the command are complete."""
     from spn_data.pipeline.area_report import write_report
 
     try:
         path, verdict = write_report(area)
     except SpnError as error:
-        console.note(f"report.html could not be written: {error}")
+        console.note(f"{REPORT} could not be written: {error}")
         return
-    tell(path, verdict)
+    show_verdict(path, verdict)
 
 
 def refresh_if_free(area: Area) -> None:
-    """As `refresh`, of an area that may be in use by another command, or hold nothing but networks."""
+    """Write report.html, unless the area has no frames or is in use by another command."""
     if not area.has(FRAMES):
         return
     try:
@@ -35,12 +35,12 @@ def refresh_if_free(area: Area) -> None:
             refresh(area)
     except InUseError:
         console.note(
-            "report.html is as before: the area is in use; spn-data report writes it anew."
+            f"{REPORT} was not updated because the area is in use; run spn-data report later."
         )
 
 
-def tell(path: Path, verdict: AreaVerdict) -> None:
-    """The verdict, and what to do next."""
+def show_verdict(path: Path, verdict: AreaVerdict) -> None:
+    """Print the verdict and the next step."""
     console.out.print(f"{verdict.headline}: see {path}.")
     if step := verdict.next_step:
         console.out.print(

@@ -1,4 +1,4 @@
-"""What `spn-data reconstruct` does."""
+"""Implementation of `spn-data reconstruct`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(
     seed: int,
     **geo: Any,
 ) -> None:
-    """Make or extend the area, telling each stage as it is done."""
+    """Make or extend the map of the area, and show each stage when it is done."""
     given = options.geo_options(**geo)
     wanted = MapOptions(
         frames=FramesOptions(

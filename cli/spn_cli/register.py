@@ -1,23 +1,28 @@
-"""`spn-data register`: labels of evaluation sequences, and of the frames between."""
+"""The command `spn-data register`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from spn_cli import options
 
+if TYPE_CHECKING:
+    from spn_cli.show import Live
+    from spn_data.area.area import Area
+    from spn_data.storage.stage_record import StageRecord
+
 
 @click.command()
 @click.argument("video", required=False, type=click.Path(path_type=Path))
 @options.area
-@click.option("--name", help="Of the sequence.  [default: the video's own]")
+@click.option("--name", help="Name of the sequence.  [default: that of the video]")
 @click.option(
     "--all-frames",
     is_flag=True,
-    help="Label the frames between, too: of this video; without VIDEO, of --name or of all sequences.",
+    help="Also label tracked frames: of VIDEO; without VIDEO, of --name or of all sequences.",
 )
 @click.option(
     "--rate",
@@ -25,43 +30,48 @@ from spn_cli import options
     type=options.Finite(0.01, 1000),
     default=2.0,
     show_default=True,
-    help="Frames taken a second, whatever they show.",
+    help="Frames per second to use, regardless of content.",
 )
 @click.option(
-    "--fov", "fov_deg", type=options.Finite(5, 170), help="Horizontal field of view in degrees."
+    "--fov",
+    "fov_deg",
+    type=options.Finite(5, 170),
+    help="Horizontal field of view in degrees, as initial value.",
 )
 @click.option(
     "--camera",
     "camera_file",
     type=click.Path(exists=True, dir_okay=False),
-    help="Calibrated camera (JSON: model, width, height, params) to start from.",
+    help="Calibrated camera (JSON: model, width, height, params) as initial value.",
 )
-@click.option("--fixed-lens", is_flag=True, help="Keep the lens of --camera as it is.")
+@click.option("--fixed-lens", is_flag=True, help="Keep the intrinsics of --camera fixed.")
 @click.option(
     "--map-frames",
     type=click.IntRange(1, 1000),
     default=12,
     show_default=True,
-    help="Most similar map frames that a frame is matched with.",
+    help="Number of most similar map frames to match each frame with.",
 )
 @click.option(
-    "--any-telemetry", is_flag=True, help="Use telemetry whose length does not fit its video."
+    "--any-telemetry",
+    is_flag=True,
+    help="Use telemetry even if its length does not match its video.",
 )
 @click.option(
     "--video",
     "video_folder",
     type=click.Path(path_type=Path, exists=True),
-    help="Where videos lie now, for --all-frames.  [default: where they were]",
+    help="File or folder with the videos for --all-frames, if moved.  [default: original location]",
 )
 @options.threads
 @options.cluster
 @options.seed
 @options.overwrite
 def register(video: Path | None, area_folder: Path, **chosen: Any) -> None:
-    """Give the frames of another flight poses in the frozen map.
+    """Register the frames of another flight in the frozen map.
 
-    VIDEO is a file, or a folder with one sequence. The map does not change; a frame whose pose cannot be
-    trusted fails with a reason.
+    VIDEO is a file, or a folder with one sequence. The map does not change; a frame whose pose is not
+    reliable fails with a reason.
 
     \b
     Example:
@@ -76,63 +86,37 @@ def run(
     *,
     name: str | None,
     all_frames: bool,
-    rate_hz: float,
-    fov_deg: float | None,
-    camera_file: str | None,
-    fixed_lens: bool,
-    map_frames: int,
-    any_telemetry: bool,
     video_folder: Path | None,
     threads: int | None,
-    cluster: str,
-    seed: int,
     overwrite: bool,
+    **chosen: Any,
 ) -> None:
+    """Register a video, track the frames between registered ones, or both."""
     import os
 
     from spn_cli import page, show
     from spn_data.area.names import EVALUATION, GEO
-    from spn_data.pipeline.evaluation_stage import RegisterStageOptions
-    from spn_data.pipeline.evaluation_stage import register as stage
     from spn_data.pipeline.tracking_stage import sequences_with_video, track_sequence
-    from spn_data.registration.register_options import RegisterOptions
-    from spn_data.work.cluster import dispatch_to
 
     if video is None and not all_frames:
-        raise click.UsageError("name a VIDEO to register, or give --all-frames")
-    if fixed_lens and camera_file is None:
-        raise click.UsageError("--fixed-lens keeps the lens of --camera: name one")
+        raise click.UsageError("give a VIDEO to register, or --all-frames")
+    if chosen["fixed_lens"] and chosen["camera_file"] is None:
+        raise click.UsageError("--fixed-lens needs --camera")
     workers = threads or os.cpu_count() or 1
     area = options.open_area(area_folder)
-    unit = "m" if area.has(GEO) else "units of the model"
     with area.locked():
-        with show.Live(unit) as live:
+        with show.Live("m" if area.has(GEO) else "model units") as live:
             names = [name] if name else None
             before = {s: area.record(s) for s in area.stages()}
             if video is not None:
-                wanted = RegisterStageOptions(
-                    register=RegisterOptions(
-                        rate_hz=rate_hz, map_frames=map_frames, hold_lens=fixed_lens, seed=seed
-                    ),
-                    fov_deg=fov_deg,
-                    camera_file=camera_file,
-                    any_telemetry=any_telemetry,
+                record = _register(
+                    area, video, name, live, workers=workers, overwrite=overwrite, **chosen
                 )
-                with dispatch_to(cluster, workers) as dispatch:
-                    record = stage(
-                        area,
-                        video,
-                        name,
-                        wanted,
-                        live.progress,
-                        dispatch=dispatch,
-                        overwrite=overwrite,
-                    )
                 live.made(record, before)
                 names = [record.stage.removeprefix(f"{EVALUATION}/")]
             if all_frames:
                 for sequence in names or sequences_with_video(area):
-                    between = track_sequence(
+                    tracked = track_sequence(
                         area,
                         sequence,
                         live.progress,
@@ -140,5 +124,41 @@ def run(
                         video=video_folder or video,
                         overwrite=overwrite,
                     )
-                    live.made(between, before)
+                    live.made(tracked, before)
         page.refresh(area)
+
+
+def _register(
+    area: Area,
+    video: Path,
+    name: str | None,
+    live: Live,
+    *,
+    rate_hz: float,
+    fov_deg: float | None,
+    camera_file: str | None,
+    fixed_lens: bool,
+    map_frames: int,
+    any_telemetry: bool,
+    workers: int,
+    cluster: str,
+    seed: int,
+    overwrite: bool,
+) -> StageRecord:
+    from spn_data.pipeline.evaluation_stage import RegisterStageOptions
+    from spn_data.pipeline.evaluation_stage import register as stage
+    from spn_data.registration.register_options import RegisterOptions
+    from spn_data.work.cluster import dispatch_to
+
+    wanted = RegisterStageOptions(
+        register=RegisterOptions(
+            rate_hz=rate_hz, map_frames=map_frames, hold_lens=fixed_lens, seed=seed
+        ),
+        fov_deg=fov_deg,
+        camera_file=camera_file,
+        any_telemetry=any_telemetry,
+    )
+    with dispatch_to(cluster, workers) as dispatch:
+        return stage(
+            area, video, name, wanted, live.progress, dispatch=dispatch, overwrite=overwrite
+        )

@@ -16,17 +16,17 @@ from spn_cli import options, page
     type=click.IntRange(0, 2_000_000),
     default=100_000,
     show_default=True,
-    help="Points of the map that the page holds.",
+    help="Maximum number of map points in the page.",
 )
 @click.option(
     "--max-frames",
     type=click.IntRange(100, 200_000),
     default=30_000,
     show_default=True,
-    help="Frames that the page holds; failed and chosen ones always stay.",
+    help="Maximum number of frames in the page; failed and chosen ones are always kept.",
 )
 def report(area_folder: Path, max_points: int, max_frames: int) -> None:
-    """Write report.html: whether the area is ready to train on, and why.
+    """Write report.html, which shows whether the area is ready for training, and why.
 
     \b
     Example:
@@ -39,4 +39,4 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
         path, verdict = write_report(
             area, ReportOptions(max_points=max_points, max_frames=max_frames)
         )
-    page.tell(path, verdict)
+    page.show_verdict(path, verdict)

@@ -1,4 +1,4 @@
-"""What the stages of an area found, as tables and sentences."""
+"""Results of the stages of an area, as tables and sentences."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ from spn_data.pipeline.frames_stage import Plan
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
+_UNFINISHED = "unfinished; the same command resumes it"
+
 
 class Live:
-    """Shows stages while they are made: progress on a terminal, tables when one is done."""
+    """Display of stages: progress while one is made, its table when it is done."""
 
     def __init__(self, unit: str = "m") -> None:
         self.unit = unit  # of lengths in labels
@@ -48,21 +50,23 @@ class Live:
             self._bars = None
 
     def progress(self, step: str, done: int, total: int) -> None:
+        """Show the progress of a step."""
         if self._bars is None:
             self._bars = console.progress()
             self._progress = self._bars.__enter__()
         self._progress(step, done, total)
 
     def planned(self, found: Plan, model_cost: tuple[float, int]) -> None:
+        """Show the sources, and the expected time and disk space."""
         rows = []
         for source in found.sources:
-            own = "in the photos" if source.kind == "photos" else "none beside it"
-            beside = ", ".join(path.name for path in source.telemetry) or own
+            own = "in the photos" if source.kind == "photos" else "none"
+            telemetry = ", ".join(path.name for path in source.telemetry) or own
             what = (
                 f"{len(source.parts)} photos" if source.kind == "photos" else _files(source.parts)
             )
-            rows.append((source.sequence, what, beside))
-        console.table("Sources", rows, ("sequence", "from", "telemetry"))
+            rows.append((source.sequence, what, telemetry))
+        console.table("Sources", rows, ("sequence", "files", "telemetry"))
         if found.ignored:
             shown = ", ".join(f"{path} ({why})" for path, why in found.ignored[:8])
             more = f" and {len(found.ignored) - 8} more" if len(found.ignored) > 8 else ""
@@ -71,12 +75,13 @@ class Live:
         seconds, disk_bytes = model_cost
         choosing, mapping = console.duration(cost.seconds), console.duration(seconds)
         console.out.print(
-            f"Expected: about {cost.chosen} frames of {cost.candidates} images; {choosing} to "
-            f"choose them and {mapping} for the model; "
+            f"Expected: about {cost.chosen} frames of {cost.candidates} images; {choosing} for "
+            f"frame selection and {mapping} for the model; "
             f"{(cost.disk_bytes + disk_bytes) / 1e6:.0f} MB on disk.\n"
         )
 
     def telemetry(self, sequence: str, summary: TelemetrySummary | None) -> None:
+        """Show the telemetry of a sequence."""
         self._close()
         if summary is None:
             console.note(f"{sequence}: no telemetry.")
@@ -86,7 +91,7 @@ class Live:
             *([f"absolute (reference: {summary.abs_reference})"] if summary.has_abs_alt else []),
         ]
         rate = f"{summary.rate_hz:.3g} fixes/s" if math.isfinite(summary.rate_hz) else "no rate"
-        gaps = f"{len(summary.gaps)} gaps" if summary.gaps else "no gap"
+        gaps = f"{len(summary.gaps)} gaps" if summary.gaps else "no gaps"
         console.out.print(
             f"{sequence}: {summary.kind}, {summary.with_fix} of {summary.records} records with a fix, "
             f"{rate}, {gaps}; heights {' and '.join(heights) or 'unknown'}; "
@@ -96,6 +101,7 @@ class Live:
             console.note(f"{sequence}: {note}")
 
     def stage(self, record: StageRecord) -> None:
+        """Show the table of a finished stage."""
         self._close()
         group = record.stage.partition("/")[0]
         if group == EVALUATION:
@@ -110,10 +116,11 @@ class Live:
             tables[group](record)
 
     def made(self, record: StageRecord, before: Mapping[str, StageRecord]) -> None:
-        """Show a stage, or that it is one of those that stood before."""
+        """Show a stage, or that it is unchanged if `before` contains the same record."""
         (self.unchanged if record == before.get(record.stage) else self.stage)(record)
 
     def unchanged(self, record: StageRecord) -> None:
+        """Show that a stage was up to date."""
         self._close()
         console.out.print(
             f"{record.stage}: unchanged since {record.finished} ({_summary(record)})."
@@ -121,6 +128,7 @@ class Live:
 
 
 def frames(record: StageRecord) -> None:
+    """Print the table of 1-frames."""
     counts = record.counts
     console.table(
         f"{FRAMES}: chosen frames",
@@ -136,13 +144,14 @@ def frames(record: StageRecord) -> None:
 
 
 def model(record: StageRecord) -> None:
+    """Print the table of 2-model."""
     counts = record.counts
     console.table(
         f"{MODEL}: reconstruction",
         [
             ("registered", f"{counts['registered']} of {counts['frames']} frames in one model"),
             ("mean reprojection error", f"{counts['mean_error_px']:.2f} px"),
-            ("points", f"{counts['points']} seen {counts['observations']} times"),
+            ("points", f"{counts['points']} with {counts['observations']} observations"),
             ("pairs", f"{counts['pairs_verified']} verified of {counts['pairs_tried']} tried"),
             *(
                 (f"camera {key}", f"{camera['focal_px']:.1f} px, {camera['fov_deg']:.1f} deg wide")
@@ -155,10 +164,11 @@ def model(record: StageRecord) -> None:
 
 
 def georegistration(record: StageRecord) -> None:
+    """Print the table of 3-geo."""
     c = record.counts
     lat, lon, alt = c["origin"]
     console.table(
-        f"{GEO}: place in the world",
+        f"{GEO}: georegistration",
         [
             ("fixes", f"{c['fixes']} of {c['frames']} frames, {c['outliers']} of them outliers"),
             (
@@ -174,9 +184,9 @@ def georegistration(record: StageRecord) -> None:
             (
                 "uncertainty (1 sigma)",
                 f"{_m(c['sigma_horizontal_m'])} horizontal, {_m(c['sigma_vertical_m'])} vertical, "
-                f"tilt {_of(c['sigma_tilt_deg'], '.2f')} deg, "
-                f"heading {_of(c['sigma_heading_deg'], '.2f')} deg, "
-                f"scale {_of(c['sigma_scale'], '.3%')}",
+                f"tilt {_format(c['sigma_tilt_deg'], '.2f')} deg, "
+                f"heading {_format(c['sigma_heading_deg'], '.2f')} deg, "
+                f"scale {_format(c['sigma_scale'], '.3%')}",
             ),
             ("from", ", ".join(c["observations"])),
             ("origin", f"{lat:.6f}, {lon:.6f}, height {alt:.2f} m ({c['height_reference']})"),
@@ -187,50 +197,51 @@ def georegistration(record: StageRecord) -> None:
 
 
 def _run(area: Area, name: str) -> tuple[str, str, str, str]:
-    """A row of a trained network."""
+    """Return the row of a run in the table of `status`."""
     folder = area.root / RUNS / name
-    judged = (folder / METRICS).is_file()
+    is_evaluated = (folder / METRICS).is_file()
     if name == COMPARED:
-        return f"{RUNS}/{name}", "complete" if judged else "missing", "networks side by side", ""
+        return (
+            f"{RUNS}/{name}",
+            "complete" if is_evaluated else "missing",
+            "several runs side by side",
+            "",
+        )
     if (folder / STATE).is_file() or not (folder / CHECKPOINT).is_file():
-        return f"{RUNS}/{name}", "unfinished: the same command goes on", "", ""
-    holds = "evaluated" if judged else f"not evaluated: spn-model evaluate --run {name}"
+        return f"{RUNS}/{name}", _UNFINISHED, "", ""
+    holds = "evaluated" if is_evaluated else f"not evaluated: spn-model evaluate --run {name}"
     return f"{RUNS}/{name}", "complete", holds, ""
 
 
 def status(area: Area) -> None:
-    """Every stage: made when, of what, stale or not. Raises StageError where no stage was begun."""
+    """Print the state of every stage and run; raise StageError if no stage was begun."""
     if not any(area.has(stage) or area.partial(stage).exists() for stage in STAGES):
         raise StageError(
-            f"{area.root.resolve()} is no area: spn-data reconstruct VIDEO --area ... makes one"
+            f"{area.root.resolve()} is not an area; create one with spn-data reconstruct VIDEO --area AREA"
         )
     rows = []
     for stage in (*STAGES, *(s for s in area.stages() if s not in STAGES)):
         if not area.has(stage):
-            state = (
-                "unfinished: the same command goes on"
-                if area.partial(stage).exists()
-                else "missing"
-            )
+            state = _UNFINISHED if area.partial(stage).exists() else "missing"
             rows.append((stage, state, "", ""))
             continue
         record = area.record(stage)
         reason = area.stale_because(stage)
         state = f"stale: {reason}" if reason else "complete"
         if area.partial(stage).exists():
-            state += "; making it anew is unfinished"
+            state += "; redoing it is unfinished"
         rows.append((stage, state, _summary(record), record.finished))
     rows += [_run(area, name) for name in area.sequences(RUNS)]
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
     if area.has_unfinished_addition():
-        console.note("an addition is unfinished: the same command with --add goes on.")
+        console.note("an addition is unfinished; the same command with --add resumes it.")
     verdict(area)
 
 
 def verdict(area: Area) -> None:
-    """One sentence on how far the poses can be trusted."""
+    """Print how many frames have a pose, and the uncertainty of the georegistration."""
     if not area.has(MODEL):
-        console.out.print("There is no model yet: spn-data reconstruct makes it.")
+        console.out.print("There is no model yet; run spn-data reconstruct.")
         return
     counts = area.record(MODEL).counts
     share = counts["registered"] / counts["frames"]
@@ -238,14 +249,14 @@ def verdict(area: Area) -> None:
     if area.has(GEO) and area.stale_because(GEO) is None:
         c = area.record(GEO).counts
         horizontal = _m(_twice(c["sigma_horizontal_m"]))
-        sentence += f" in {area.folder(GEO)}; the whole model may lie {horizontal} beside"
+        sentence += f" in {area.folder(GEO)}; "
+        sentence += f"uncertainty of the whole model (2 sigma): horizontal {horizontal}"
         if c["height_reference"] == "unknown":
-            sentence += " its true place (2 sigma), and its heights count from an unknown zero."
+            sentence += "; its height reference is unknown."
         else:
-            vertical = _m(_twice(c["sigma_vertical_m"]))
-            sentence += f" and {vertical} above or below its true place (2 sigma)."
+            sentence += f", vertical {_m(_twice(c['sigma_vertical_m']))}."
     else:
-        sentence += f" in {area.folder(MODEL)}, in units of the model: lengths there are no metres."
+        sentence += f" in {area.folder(MODEL)}, in model units, not metres."
     console.out.print(sentence)
 
 
@@ -269,7 +280,7 @@ def _m(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f} m"
 
 
-def _of(value: float | None, form: str) -> str:
+def _format(value: float | None, form: str) -> str:
     return "unknown" if value is None else format(value, form)
 
 

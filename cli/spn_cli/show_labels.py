@@ -1,4 +1,4 @@
-"""What registering a sequence found, as tables."""
+"""Results of registration and tracking, as tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spn_data.storage.stage_record import StageRecord
 
 
 def evaluation(record: StageRecord, unit: str) -> None:
-    """unit : of lengths, "m" or "units of the model"."""
+    """Print the table of an evaluation sequence; `unit` is "m" or "model units"."""
     c = record.counts
     console.table(
         f"{record.stage}: poses in the frozen map",
@@ -20,11 +20,11 @@ def evaluation(record: StageRecord, unit: str) -> None:
             ("lens", f"{c['focal_px']:.1f} px, {c['fov_deg']:.1f} deg wide"),
             *(
                 [
-                    ("map points a frame", f"{c['inliers']:.0f} (median)"),
+                    ("map points per frame", f"{c['inliers']:.0f} (median)"),
                     ("residual", f"{c['error_px']:.2f} px (median of RMS)"),
                     (
                         "uncertainty (1 sigma)",
-                        f"{_length(c['sigma'], unit)}, {c['sigma_deg']:.3f} deg to the map (median)",
+                        f"{_length(c['sigma'], unit)}, {c['sigma_deg']:.3f} deg relative to the map (median)",
                     ),
                 ]
                 if c["registered"]
@@ -37,12 +37,13 @@ def evaluation(record: StageRecord, unit: str) -> None:
 
 
 def tracked(record: StageRecord) -> None:
+    """Print the table of the tracked frames of a sequence."""
     c = record.counts
     console.table(
-        f"{record.stage}: frames between",
+        f"{record.stage}: tracked frames",
         [
             ("registered", f"{_share(c['registered'], c['frames'])} frames"),
-            ("with those chosen", f"{_share(c['registered_of_all'], c['of_all'])} video frames"),
+            ("with chosen frames", f"{_share(c['registered_of_all'], c['of_all'])} video frames"),
             *((f"failed: {reason}", f"{n} frames") for reason, n in c["failed"].items()),
             time_row(record),
         ],
@@ -51,7 +52,7 @@ def tracked(record: StageRecord) -> None:
 
 
 def summary(record: StageRecord) -> str:
-    """What a stage holds, in a few words."""
+    """Return the content of a stage in a few words."""
     c = record.counts
     group = record.stage.partition("/")[0]
     if group in (EVALUATION, TRACKED):
@@ -61,11 +62,13 @@ def summary(record: StageRecord) -> str:
 
 
 def notes(record: StageRecord) -> None:
+    """Print the notes of a stage."""
     for note in record.notes:
         console.note(note)
 
 
 def time_row(record: StageRecord) -> tuple[str, str]:
+    """Return the row with the time that a stage took."""
     steps = ", ".join(
         f"{name} {console.duration(s)}" for name, s in record.seconds.items() if s >= 1
     )

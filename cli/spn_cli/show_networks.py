@@ -1,4 +1,4 @@
-"""What networks were found to be worth, as tables."""
+"""Results of an evaluation, as tables."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLA
 from spn_model.evaluation.evaluate import EvaluatedGroup, NetworkComparison
 from spn_model.evaluation.metrics import Evaluation, Summary
 
-# Where many columns leave little room for names; the table of errors has them in full.
+# Short names for tables with many columns; the table of errors has the full ones.
 _SHORT = {MEAN: "mean pose", VLAD: "VLAD", GEM: "GeM", ORACLE: "oracle"}
 _WHAT = {
     Role.TEST: "test frames",
-    Role.VALIDATION: "validation frames, of the mapping flights",
+    Role.VALIDATION: "validation frames of the mapping flights",
     Role.TRAIN: "training images",
 }
 
 
 def comparison(found: NetworkComparison) -> None:
-    """Tables of each group, then what the networks cost, and notes."""
+    """Print the tables of each group, the cost of the networks, and notes."""
     unit = "m" if found.units == "m" else "units"
     for group in found.groups:
         _errors(group, unit)
@@ -38,10 +38,12 @@ def comparison(found: NetworkComparison) -> None:
         for name, cost in found.costs.items()
     ]
     console.table(
-        "Time an image, from pixels to pose", rows, ("network", "wall", "CPU", "on", "of")
+        "Time per image, from pixels to pose",
+        rows,
+        ("network", "wall", "CPU", "device", "measured on"),
     )
     if found.units != "m":
-        console.note("lengths are in units of the model, not metres.")
+        console.note("lengths are in model units, not metres.")
     for note in found.notes:
         console.note(note)
 
@@ -76,12 +78,13 @@ def _errors(group: EvaluatedGroup, unit: str) -> None:
     )
     if published:
         console.out.print(
-            "* in another court, with other cameras; whether means or medians is not said.\n"
+            "* on another courtyard, with other cameras; the paper does not state whether these are means or "
+            "medians.\n"
         )
 
 
 def _shares(group: EvaluatedGroup, unit: str) -> None:
-    """Shares within limits, signed errors by axis, and the fit of covariances."""
+    """Print shares within limits, signed errors by axis, and the fit of covariances."""
     within = group.evaluations[0].summary.within
     rows = [
         (
@@ -100,13 +103,14 @@ def _shares(group: EvaluatedGroup, unit: str) -> None:
     )
     console.table(
         f"{group.frames.group}: share within {unit}/deg, median signed errors ({unit}), fit of covariances "
-        "(1 is right)",
+        "(1 is ideal)",
         rows,
         header,
     )
 
 
 def _strata(group: EvaluatedGroup, unit: str) -> None:
+    """Print medians by coverage."""
     first = group.evaluations[0]
     if len(first.strata) < 2:
         return

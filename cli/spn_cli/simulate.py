@@ -1,4 +1,4 @@
-"""What `spn-data simulate` does."""
+"""Implementation of `spn-data simulate`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run(
     area_factor: float,
     length_factor: float,
 ) -> None:
-    """Render into a new folder and say what lies where."""
+    """Render into a new folder and print where the results are."""
     base = named(preset, seed=seed)
     options = replace(
         base,
@@ -42,5 +42,5 @@ def run(
     with console.progress() as progress:
         simulate(out, options, lambda done, total: progress("rendering", done, total))
     lens = options.mapping_lens.fov_deg
-    console.out.print(f"{out}: videos in mapping/ and evaluation/, exact truth in truth/.")
+    console.out.print(f"{out}: videos in mapping/ and evaluation/, exact ground truth in truth/.")
     console.out.print(f"Next: spn-data reconstruct {out / 'mapping'} --area AREA --fov {lens:g}")

@@ -27,21 +27,21 @@ _METRES = options.Finite(0, 100_000)
     type=click.Choice(["time", "space", "height"]),
     default="time",
     show_default=True,
-    help="How validation is held out of the mapping flights: blocks in time, a region, or a band of heights.",
+    help="How validation frames are held out: blocks in time, a region, or a band of heights.",
 )
 @click.option(
     "--validation-share",
     type=_SHARE,
     default=0.11,
     show_default=True,
-    help="Share of the mapping frames that validate.",
+    help="Share of the mapping frames used for validation.",
 )
 @click.option(
     "--test-share",
     type=_SHARE,
     default=0.15,
     show_default=True,
-    help="Share that tests, where there is no evaluation sequence.",
+    help="Share of the mapping frames used as test set if there is no evaluation sequence.",
 )
 @click.option(
     "--gap",
@@ -49,7 +49,7 @@ _METRES = options.Finite(0, 100_000)
     type=_SECONDS,
     default=2.0,
     show_default=True,
-    help="Seconds between a held-out frame and the nearest training frame of its sequence.",
+    help="Minimum time in seconds between a held-out frame and the training frames of its sequence.",
 )
 @click.option(
     "--block",
@@ -57,7 +57,7 @@ _METRES = options.Finite(0, 100_000)
     type=options.Finite(0, 3600, min_open=True),
     default=5.0,
     show_default=True,
-    help="Seconds of a validation block, about (time).",
+    help="Approximate length of a validation block in seconds (time).",
 )
 @click.option(
     "--cell",
@@ -65,7 +65,7 @@ _METRES = options.Finite(0, 100_000)
     type=options.Finite(0, 100_000, min_open=True),
     default=4.0,
     show_default=True,
-    help="Metres of a cell's edge, of which regions are made (space).",
+    help="Edge length in metres of the cells that make up regions (space).",
 )
 @click.option(
     "--guard-distance",
@@ -73,7 +73,7 @@ _METRES = options.Finite(0, 100_000)
     type=_METRES,
     default=3.0,
     show_default=True,
-    help="Metres in plan view from validation to training (space).",
+    help="Horizontal distance in metres between validation and training (space).",
 )
 @click.option(
     "--guard-height",
@@ -81,46 +81,46 @@ _METRES = options.Finite(0, 100_000)
     type=_METRES,
     default=1.0,
     show_default=True,
-    help="Metres in height from validation to training (height).",
+    help="Height difference in metres between validation and training (height).",
 )
 @click.option(
     "--no-tracked",
     "--no-dense",
     "no_tracked",
     is_flag=True,
-    help="Leave out video frames that were tracked between mapped ones.",
+    help="Leave out tracked frames.",
 )
 @click.option(
     "--size",
     "width_px",
     type=click.IntRange(32, 16_384),
     metavar="WIDTH",
-    help="Width in pixels of images in dataset.h5.  [default: 480; with --native the lens's own]",
+    help="Image width in dataset.h5 in pixels.  [default: 480; with --native that of the lens]",
 )
 @click.option(
     "--native",
     is_flag=True,
-    help="Undistort each lens into its own view, not all into the one that they share.",
+    help="Undistort each lens into its own pinhole view instead of rendering all into a common one.",
 )
 @click.option(
     "--cambridge",
     type=click.Choice(["chosen", "all", "none"]),
     default="chosen",
     show_default=True,
-    help="Frames in the folder cambridge/, whose images are of full size.",
+    help="Frames in the folder cambridge/, which has images of full size; all includes tracked frames.",
 )
 @click.option(
     "--video",
     "video_folder",
     type=click.Path(exists=True, path_type=Path),
-    help="Where the videos lie, of which tracked frames are read.  [default: where they were]",
+    help="File or folder with the videos, from which tracked frames are read.  [default: original location]",
 )
 @options.seed
 def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chosen: Any) -> None:
-    """Divide frames into training, validation and test, and write dataset.h5.
+    """Split frames into training, validation and test sets, and write dataset.h5.
 
-    Each evaluation sequence is a test set of its own name. Without one, a block of a mapping flight is
-    held out, and everything says that such a test is optimistic.
+    Each evaluation sequence becomes a test set of that name. Without one, a block of a mapping flight is held
+    out; such a test is optimistic, which all results state.
 
     \b
     Example:
@@ -169,15 +169,15 @@ def _show(record: StageRecord) -> None:
     counts = record.counts
     sizes = ", ".join(f"{width}x{height}" for width, height in counts["image_px"])
     console.table(
-        f"{record.stage}: what networks train on",
+        f"{record.stage}: data set",
         [
             *((name, f"{n} frames") for name, n in counts["groups"].items()),
-            ("left out", f"{counts['left_out']} frames (guards, or no pose)"),
+            ("left out", f"{counts['left_out']} frames (guard zones, or no pose)"),
             ("images", f"{sizes} pixels"),
             ("points for training", str(counts["training_points"])),
             show_labels.time_row(record),
         ],
     )
     for note in record.notes:
-        if not note.startswith("audit:"):  # told with the other findings
+        if not note.startswith("audit:"):  # printed with the other findings
             console.note(note)

@@ -53,7 +53,9 @@ from spn_cli import console, options
 )
 @options.device
 @options.threads
-@options.overwrite
+@click.option(
+    "--overwrite", is_flag=True, help="Train again if options, recipe or data set changed."
+)
 def train(
     dataset: Path | None,
     area_folder: Path,

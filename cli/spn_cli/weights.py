@@ -1,4 +1,4 @@
-"""`spn-model weights`: published weights, listed and fetched."""
+"""The command `spn-model weights`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spn_cli import console
 @click.group(invoke_without_command=True)
 @click.pass_context
 def weights(context: click.Context) -> None:
-    """List published weights of networks, and whether they are on this machine.
+    """List published network weights and whether they are on this machine.
 
     \b
     Example:
@@ -26,15 +26,15 @@ def weights(context: click.Context) -> None:
         size = f"{entry.size_bytes / 1e6:.1f} MB"
         rows.append((entry.name, entry.holds, state(entry), entry.origin, size, entry.sha256[:8]))
     console.table("Weights", rows, ("name", "holds", "here", "from", "size", "SHA-256"))
-    console.out.print(f"Fetched files are kept in {cache_folder()}.")
+    console.out.print(f"Downloaded files are stored in {cache_folder()}.")
     if any("damaged" in row for row in rows):
-        console.note("a damaged file is not used: spn-model weights fetch NAME replaces it.")
+        console.note("damaged files are not used; spn-model weights fetch NAME replaces them.")
 
 
 @weights.command()
 @click.argument("name")
 def fetch(name: str) -> None:
-    """Download weights by their name in the list, checked against their hash.
+    """Download weights by name and verify their SHA-256 hash.
 
     \b
     Example:

@@ -280,7 +280,7 @@ def test_garbage_lines_are_passed_over_and_no_fix_at_all_leaves_the_model_withou
     told = " ".join(result.stdout.split())
     assert "records left out: 1, the first at line 19" in told
     assert "0 of 16 records with a fix" in told
-    assert "in units of the model: lengths there are no metres" in told
+    assert "in model units, not metres" in told
     assert not Area(tmp_path / "area").has("3-geo")
 
 
@@ -297,7 +297,7 @@ def test_a_copy_that_fills_the_disk_names_the_file_that_was_not_written() -> Non
 
     result = CliRunner().invoke(program, ["copy"])
     assert result.exit_code == 1
-    assert "to.jpg: No space left on device. What is done is kept" in result.stderr
+    assert "to.jpg: No space left on device. Completed work is kept" in result.stderr
 
 
 def test_a_disk_that_may_not_be_written_to_is_not_said_to_be_full() -> None:
@@ -312,4 +312,4 @@ def test_a_disk_that_may_not_be_written_to_is_not_said_to_be_full() -> None:
     result = CliRunner().invoke(program, ["write"])
     assert result.exit_code == 1
     assert "area cannot be written to" in result.stderr
-    assert "make room" not in result.stderr
+    assert "free some space" not in result.stderr

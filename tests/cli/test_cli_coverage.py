@@ -201,7 +201,7 @@ def test_without_metres_there_are_units_of_the_model(area):
     """Without 3-geo, lengths are no metres: no strata, no heights, no places to fly to, and it says so."""
     shutil.rmtree(area / GEO)
     shown = run("--area", area, "--fly-again", area / "again.csv")
-    assert "units of the model" in shown
+    assert "model units" in shown
     assert "high coverage" not in shown
     assert "is not written" in shown
     assert not (area / "again.csv").exists()
@@ -209,14 +209,17 @@ def test_without_metres_there_are_units_of_the_model(area):
     assert (found["units"], found["options"], found["fly_again"]) == ("model", None, None)
     assert found["sequences"]["near"]["heights"] is None
     shown = run("--area", area, "--high", "1", "15")
-    assert "units of the model and <= 15 deg" in shown
+    assert "model units and <= 15 deg" in shown
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--fov", "60"), "--camera and --fov are of --waypoints"),
-        (("--waypoints", "plan.csv", "--fov", "60", "--camera", "c.json"), "give one"),
+        (("--fov", "60"), "--camera and --fov need --waypoints"),
+        (
+            ("--waypoints", "plan.csv", "--fov", "60", "--camera", "c.json"),
+            "give either --camera or --fov",
+        ),
         (("--high", "6", "15"), "within those of medium"),
         (("--high", "nan", "15"), "is not a finite number"),
     ],

@@ -187,7 +187,7 @@ def test_a_kill_while_adding_leaves_the_old_area_whole(area: Path, flight2: Path
 def test_status_of_no_area_is_an_error(tmp_path: Path) -> None:
     result = run("status", "--area", tmp_path / "none")
     assert result.exit_code == 1
-    assert "none is no area: spn-data reconstruct VIDEO --area ... makes one" in result.stderr
+    assert "none is not an area; create one with spn-data reconstruct VIDEO --area" in result.stderr
     assert not (tmp_path / "none").exists()
 
 
@@ -199,7 +199,7 @@ def test_status_shows_what_is_complete_unfinished_missing_and_stale(area: Path) 
     (area / GEO).rename(area / f".{GEO}.partial")
     partial = run("status", "--area", area).stdout
     assert "unfinished" in partial
-    assert "in units of the model: lengths there are no metres" in " ".join(partial.split())
+    assert "in model units, not metres" in " ".join(partial.split())
     (area / f".{GEO}.partial").rename(area / GEO)
     stage = area / FRAMES / "stage.json"
     stage.write_text(stage.read_text().replace('"candidates": 18', '"candidates": 19'))

@@ -69,7 +69,7 @@ def test_ctrl_c_in_each_step_ends_at_once_and_the_next_run_goes_on(
         assert time.monotonic() - stopped < 5
         assert interruption.outliving(family, 3.0) == []
         lines = run.output.splitlines()
-        assert lines[-1] == "Stopped. What is done is kept: the same command goes on from here."
+        assert lines[-1] == "Stopped. Completed work is kept: run the same command to resume."
         assert "Traceback" not in run.output
         outputs.append(run.output)
     run = start()

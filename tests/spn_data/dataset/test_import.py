@@ -274,7 +274,7 @@ def test_the_command_tells_what_it_did(scene, tmp_path):
     words = ["import", str(scene), "--to", str(target), "--size", "80"]
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 0, done.output
-    assert "train 4, test 2; focal length known of 6" in " ".join(done.output.split())
+    assert "train 4, test 2; 6 with a known focal length" in " ".join(done.output.split())
     assert "unknown origin and up direction" in " ".join(done.output.split())
     again = CliRunner().invoke(main, words)
     assert again.exit_code == 1

@@ -450,7 +450,7 @@ def test_without_a_place_everything_says_that_it_is_no_metres(
     done = run("all", tmp_path / "out", area_without_place, "--no-images")
     assert done.exit_code == 0, done.output
     told = " ".join(done.output.split())
-    assert "lengths are in units of the model, not metres" in told
+    assert "lengths are in model units, not metres" in told
     assert "geojson is left out: it needs a georegistered map" in told
     out = tmp_path / "out"
     written = {path.name for path in out.iterdir() if path.is_dir()}

@@ -277,7 +277,7 @@ def test_several_sequences_are_registered_one_at_a_time(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "name a VIDEO to register, or give --all-frames"),
+        ([], "give a VIDEO to register, or --all-frames"),
         (["--fixed-lens", "--all-frames"], "--fixed-lens keeps the lens of --camera: name one"),
     ],
 )

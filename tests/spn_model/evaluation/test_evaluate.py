@@ -405,7 +405,7 @@ def test_several_runs_stand_in_one_table(tmp_path):
         assert (area / "runs" / folder / "figures" / "training.svg").exists() != both
     assert load(area / "runs" / "first" / "checkpoint.safetensors").facts["images_shown"] == 40
     shown = CliRunner().invoke(data_main, ["status", "--area", str(area)])
-    assert "is no area" in shown.output  # a folder with nothing but networks
+    assert "is not an area" in shown.output  # a folder with nothing but networks
 
 
 def test_facts_of_a_run_are_documented(tmp_path):
