@@ -101,6 +101,32 @@ def test_covariance_is_that_of_the_errors():
     assert 4.6 < np.mean(squares) < 7.4
 
 
+def test_cells_above_the_largest_scale_are_left_out():
+    """Scales are compared with the limit themselves, at 0.99 and 1.01 times a limit of 0.2 m."""
+    log_scale = np.full(GRID[::-1], np.log(0.99 * 0.2))
+    log_scale[:20] = np.log(1.01 * 0.2)
+    options = DecodingOptions(cells=log_scale.size, largest_scale=0.2)
+    assert decoded(scene(2), log_scale, options).used == log_scale[20:].size
+
+
+def test_covariance_accounts_for_the_slope_of_the_influence_function():
+    """Residuals of u widths scale the covariance by u^2 / slope^2, slope = (1 - u^2) / (1 + u^2)."""
+    turn = np.random.default_rng(80).uniform(0, 2 * np.pi, GRID[::-1])
+    across = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)]) / 328
+    xyz = scene(8)
+    in_camera = np.einsum("ij,jhw->ihw", TRUE.rotations[0], xyz - TRUE.centers[0][:, None, None])
+    options = replace(STILL, cells=turn.size)
+    variance, expected = [], []
+    for width in (0.1, 0.5):
+        # Standard deviations are `floor_px` = 1, and widths three times that.
+        moved = across * in_camera[2] * 3 * width
+        moved = np.einsum("ij,jhw->ihw", TRUE.rotations[0].T, moved)
+        covariance = decoded(xyz + moved, np.full(turn.shape, -12.0), options).covariance
+        variance.append(np.trace(covariance[:3, :3]))
+        expected.append((width * (1 + width**2) / (1 - width**2)) ** 2)
+    assert variance[1] / variance[0] == pytest.approx(expected[1] / expected[0], rel=0.05)
+
+
 def test_covariance_knows_which_way_is_weak():
     """Before a flat wall a slide hides behind a turn: camera moved right, points turned right."""
     x, y = np.meshgrid(np.arange(GRID[0]) * 8 + 7.5, np.arange(GRID[1]) * 8 + 7.5)
