@@ -168,6 +168,17 @@ def test_distance_by_telemetry_adds_frames_where_the_image_stands_still() -> Non
     np.testing.assert_array_equal(unknown.chosen, none.chosen)
 
 
+def test_motions_are_chained_in_order_of_time() -> None:
+    """Two shifts of 0.2, the second during a turn of the camera by 90 degrees, add up to 0.4 of the width."""
+    frames = measured(np.array([0, 0.2, 0, 0, 0]))
+    frames.motion[2] = [[0, -1, 0], [1, 0, 0]]
+    frames.motion[3, 1, 2] = 0.2
+    frames.motion[4] = [[0, 1, 0], [-1, 0, 0]]
+    choice = choose(frames, replace(DEFAULT, min_spacing_s=0.35))
+    assert np.flatnonzero(choice.chosen).tolist() == [0, 4]
+    assert choice.motion_px[4] == pytest.approx(0.4 * WIDTH)
+
+
 def test_a_break_of_the_image_gives_a_frame_after_it() -> None:
     """After a cut the motion is unknown, so the next frame is due at once and has no motion."""
     data = measured(np.zeros(60))
