@@ -160,6 +160,7 @@ def test_csv_of_airdata(tmp_path):
         ("Time", ("1714564800000000", "1714564800500000"), 0.5, UTC_S, False),
         ("timestamp_ms", ("1714564800000", "1714564800500"), 0.5, UTC_S, False),
         ("time_ms", ("1000", "1500"), 1.5, NAN, False),
+        ("time(us)", ("1000000", "1500000"), 1.5, NAN, False),
         ("t", ("1", "1.5"), 1.5, NAN, False),
     ],
 )
