@@ -136,6 +136,21 @@ def test_uncertainty_grows_away_from_the_middle():
     assert there == pytest.approx(np.diag([0.04 + 1.0, 0.04 + 0.01, 0.09]))
 
 
+def test_uncertainty_of_points_follows_shifts_turns_and_scale():
+    """The covariance at a point is that of its displacement by each of the seven parameters."""
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(7, 7))
+    middle, point = np.array([5.0, -3.0, 2.0]), np.array([[20.0, 30.0, -40.0]])
+    found = Uncertainty.from_covariance(root @ root.T, middle).point_covariance(point)
+    moved = []
+    for k in range(7):
+        shift, turn, scale = np.split(1e-6 * np.eye(7)[k], [3, 6])
+        lever = np.exp(scale) * rotations_from_vectors(turn) @ (point[0] - middle)
+        moved.append((middle + shift + lever - point[0]) / 1e-6)
+    by_parameter = np.column_stack(moved)
+    np.testing.assert_allclose(found[0], by_parameter @ root @ root.T @ by_parameter.T, rtol=1e-4)
+
+
 def test_errors_against_the_truth_come_apart():
     """A metre, 2 degrees of tilt, -3 of heading and 1 % of scale are each found."""
     points = np.random.default_rng(4).uniform(-10, 10, (50, 3))
