@@ -278,7 +278,7 @@ def test_several_sequences_are_registered_one_at_a_time(
     ("arguments", "message"),
     [
         ([], "give a VIDEO to register, or --all-frames"),
-        (["--fixed-lens", "--all-frames"], "--fixed-lens keeps the lens of --camera: name one"),
+        (["--fixed-lens", "--all-frames"], "--fixed-lens needs --camera"),
     ],
 )
 def test_half_a_command_is_a_usage_error(bare: Path, arguments: list[str], message: str) -> None:
