@@ -576,7 +576,7 @@ def test_the_list_shows_what_is_here_and_what_is_not(cache):
     assert "damaged" not in shown.output
     cache.mkdir(parents=True)
     by_name("vgg16").path.write_bytes(b"")
-    assert "a damaged file is not used" in invoke().output
+    assert "damaged files are not used" in invoke().output
 
 
 def test_fetching_what_is_shipped_tells_where_it_lies():
