@@ -14,7 +14,7 @@ from spn_data.coverage.nearest_frame import (
     height_outside_range,
     nearest_frames,
 )
-from spn_data.coverage.refly import ReflyOptions, plan_reflight
+from spn_data.coverage.refly import ReflyOptions, _costs, plan_reflight
 from spn_data.coverage.sequence_table import (
     COLUMNS,
     MappingFrames,
@@ -27,7 +27,8 @@ from spn_data.coverage.view_share import SeenMap, ViewShareOptions, view_shares
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.simulate import preset, simulate_paths
 
 CAMERA = Camera.from_horizontal_fov(1600, 900, 90.0)
@@ -328,6 +329,11 @@ class TestReflightPlan:
         queries = looking(*[(x, 0, 3) for x in (0.0, -1.3, 1.3, -0.9, 0.9, -2.5, 2.5)])
         found = plan_reflight(queries, np.full(7, "low"))
         assert sorted(found.poses.centers[:, 0].tolist()) == [-1.3, 1.3]
+
+    def test_turning_costs_by_degrees_per_metre(self):
+        """Three metres and 20 degrees cost 5 m at 10 degrees per metre."""
+        there = looking((3, 0, 0, 20, 0, 0))
+        assert _costs(looking((0, 0, 0)), there, 10.0)[0, 0] == pytest.approx(5.0)
 
     def test_what_is_covered_needs_no_stop(self):
         """Frames of the wanted stratum are not served; none left gives no stop."""
