@@ -24,7 +24,8 @@ import numpy as np
 
 from spn_data.area.names import FRAMES_TABLE
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
 from spn_data.georegistration import (
     GeoFit,
     GeoregisterOptions,

@@ -21,7 +21,8 @@ from rich.table import Table
 from truth import error_figures, read_arguments, true_poses
 
 from spn_data.area.area import Area
-from spn_data.geometry.pose import Similarity, pose_errors, rotation_vectors
+from spn_data.geometry.pose import Similarity, pose_errors
+from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
 from spn_data.simulate.truth import read_truth

@@ -1,6 +1,6 @@
 """Preparation of an area for visual localization: from flight video to a georeferenced map and labels.
 
-`open_area` and `open_samples` read what the command `spn-data` wrote. They are loaded when first used, because
+`open_area` and `open_samples` read what the command `spn-data` wrote. They are loaded when first used:
 on-board code imports this package without the libraries that they need.
 """
 

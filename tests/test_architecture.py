@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,15 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 NAMES = [path.relative_to(ROOT).as_posix() for path in MODULES]
 
 
+@cache
+def _tree(path: Path) -> ast.Module:
+    """Syntax tree of a module."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def _imports(path: Path) -> Iterator[str]:
     """Full names of all that a module imports, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -207,7 +214,7 @@ def test_no_function_is_long():
     found = [
         f"{name}:{node.lineno} {node.name}"
         for name, path in zip(NAMES, MODULES, strict=True)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(_tree(path))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and _code_lines(node) > 80
     ]
     assert found == []
@@ -217,7 +224,7 @@ def test_no_two_public_classes_share_a_name():
     """A class has one name, and the name one class."""
     seen: dict[str, str] = {}
     for name, path in zip(NAMES, MODULES, strict=True):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in _tree(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 assert node.name not in seen, f"{name} and {seen[node.name]}: {node.name}"
                 seen[node.name] = name
@@ -229,7 +236,7 @@ def test_the_library_never_prints():
         f"{name}:{node.lineno}"
         for name, path in zip(NAMES, MODULES, strict=True)
         if not name.startswith("cli/")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(_tree(path))
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id in ("print", "input", "exit", "breakpoint")

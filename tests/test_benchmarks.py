@@ -18,7 +18,8 @@ from spn_data.area.area import Area
 from spn_data.area.names import FRAMES
 from spn_data.capture.selection import SelectionOptions
 from spn_data.colmap.model import Scene
-from spn_data.geometry.pose import Poses, Similarity, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.pipeline.frames_stage import FramesOptions, choose_frames, plan
 from spn_data.simulate import preset, simulate
 

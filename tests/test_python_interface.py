@@ -1,4 +1,4 @@
-"""The Python interface: every code block of docs/python.md runs, names are documented, workers get their data."""
+"""The Python interface: what it reads is right, its names are documented, workers get their data."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.coverage.nearest_frame import CoverageOptions, Stratum, distances_and_angles
-from spn_data.geometry.pose import (
-    Poses,
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import (
     angles_from_rotations,
     rotation_errors_deg,
     rotations_from_angles,

@@ -11,7 +11,8 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.telemetry.textfile import csv_rows, read_text
 
 MAX_WAYPOINTS = 100_000

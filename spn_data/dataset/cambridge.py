@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 from spn_data.storage.files import write_atomically
 
 TRAIN_LIST, VALIDATION_LIST, TEST_LIST = (

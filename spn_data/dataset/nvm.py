@@ -19,7 +19,8 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.grouping import rank_within_group
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 from spn_data.storage.files import atomic_writer
 
 MAX_IMAGES = 1_000_000

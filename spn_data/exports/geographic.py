@@ -8,7 +8,7 @@ import numpy as np
 
 from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.geometry.pose import angles_from_rotations
+from spn_data.geometry.rotations import angles_from_rotations
 
 
 @dataclass(frozen=True, eq=False)

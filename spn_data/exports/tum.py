@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.exports.exported_frames import ExportedFrames, timestamps_us
-from spn_data.geometry.pose import Poses, conjugate_quats, scalar_last
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import conjugate_quats, scalar_last
 from spn_data.storage.files import write_atomically
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import cauchy_weights, pose_jacobians, projection_jacobians
-from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
+from spn_data.geometry.pose import Poses, to_camera
+from spn_data.geometry.rotations import rotations_from_vectors
 
 _MAX_STEPS = 20
 _CONVERGED_PX = 1e-3  # mean change of the projections

@@ -9,7 +9,7 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import rotations_from_angles
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.georegistration.georegister_options import (
     RTK_SIGMA_M,
     GeoregisterOptions,

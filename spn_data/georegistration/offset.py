@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_angles
 from spn_data.georegistration.fit import covariance_of
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import (

@@ -7,7 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from spn_data.geometry.pose import Similarity, quats_from_rotations, rotations_from_vectors
+from spn_data.geometry.pose import Similarity
+from spn_data.geometry.rotations import quats_from_rotations, rotations_from_vectors
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import Chains, LinearSystem, NoiseLevels
 from spn_data.georegistration.observe import Fixes

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Similarity, rotations_from_vectors
+from spn_data.geometry.pose import Similarity
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.observe import Fixes
 

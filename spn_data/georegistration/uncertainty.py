@@ -8,7 +8,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Similarity, rotation_vectors
+from spn_data.geometry.pose import Similarity
+from spn_data.geometry.rotations import rotation_vectors
 from spn_data.georegistration.fit import Estimate, covariance_of
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import apply_inverse_covariance, solve

@@ -17,7 +17,8 @@ import numpy as np
 
 from spn_data.capture.frames import Frames, check_name
 from spn_data.errors import InputError
-from spn_data.geometry.pose import Poses, Similarity, canonical_quats
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import canonical_quats
 from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000

@@ -20,7 +20,8 @@ from spn_data.geometry.least_squares import (
     projection_jacobians,
     rows_to_sparse,
 )
-from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
+from spn_data.geometry.pose import Poses, to_camera
+from spn_data.geometry.rotations import rotations_from_vectors
 
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost

@@ -15,7 +15,8 @@ import numpy as np
 
 from spn_data.colmap.resection import resect
 from spn_data.geometry.epipolar import essential_matrix, sampson_errors
-from spn_data.geometry.pose import Poses, rotation_errors_deg
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotation_errors_deg
 from spn_data.labels.labels import pose_sigmas
 from spn_data.labels.map_points import covered_share
 from spn_data.registration.register_options import CheckOptions, RegisterOptions

@@ -9,7 +9,8 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.simulate.gnss import gnss_errors
 from spn_data.simulate.paths import Motion, courtyard_loop, nadir_lines, straight_line
 from spn_data.simulate.presets import MappingPaths, SimulateOptions

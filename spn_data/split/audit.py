@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial import cKDTree
 
-from spn_data.geometry.pose import rotation_errors_deg
+from spn_data.geometry.rotations import rotation_errors_deg
 from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.split.groups import (
     OPTIMISTIC,

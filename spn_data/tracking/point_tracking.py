@@ -12,8 +12,9 @@ import numpy as np
 
 from spn_data.geometry.camera import Camera, colmap_pixels, opencv_pixels
 from spn_data.geometry.grouping import rank_within_group
-from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
 from spn_data.labels.map_points import covered_share
 from spn_data.tracking.tracked_frames import (
     Anchor,

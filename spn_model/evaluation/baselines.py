@@ -9,7 +9,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 from spn_data.matching.features import FeatureOptions, extract
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_model.evaluation.metrics import DEG_PER_M, Estimates, Evaluation, nearest_rows

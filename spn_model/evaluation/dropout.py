@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from spn_data.geometry.pose import Poses, rotation_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotation_vectors
 from spn_model.evaluation.baselines import mean_pose
 from spn_model.models.pose_model import PoseEstimates, PoseModel
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from spn_data.coverage.nearest_frame import CoverageOptions, nearest_frames
 from spn_data.dataset.hdf5_schema import DatasetInfo
-from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotation_vectors
 from spn_model.evaluation.calibration import Calibration, calibrate, nees, sigmas
 
 ENU = ("east", "north", "up")

@@ -14,7 +14,7 @@ from spn_model.models.pose_model import PoseEstimates, PoseModel
 _BATCH = 8  # batch size of `estimate`
 
 
-class PosedImages(Protocol):
+class ValidationImages(Protocol):
     """Images with poses: a group of a data set, or rendered views.
 
     Attributes
@@ -87,7 +87,7 @@ def spread_rows(count: int, limit: int) -> np.ndarray:
 
 
 def validate(
-    model: PoseModel, frames: PosedImages, rows: np.ndarray
+    model: PoseModel, frames: ValidationImages, rows: np.ndarray
 ) -> tuple[ValidationErrors, PoseEstimates]:
     """Estimate the poses of some rows and compare them with the true poses.
 
@@ -95,7 +95,7 @@ def validate(
     ----------
     model : PoseModel
         Pose model; its network is left in eval mode.
-    frames : PosedImages
+    frames : ValidationImages
         Images with true poses.
     rows : ndarray of int
         Rows of `frames` to use.

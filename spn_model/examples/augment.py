@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.camera import COLMAP_FROM_OPENCV, OPENCV_FROM_COLMAP
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.camera import opencv_pixels
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.examples.point_targets import Surface, cell_centers
 
 _NEAREST = 0.5  # near clipping depth, in metres

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 
 _ONE_PLACE = 1e-6  # spread, in the world's unit, below which all poses count as one place
 

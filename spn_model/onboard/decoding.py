@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, rotations_from_vectors, to_camera
+from spn_data.geometry.pose import Poses, to_camera
+from spn_data.geometry.rotations import rotations_from_vectors
 
 # Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
 # few pixels still converges.

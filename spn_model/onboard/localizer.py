@@ -12,8 +12,9 @@ import onnxruntime
 
 from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
+from spn_data.geometry.rotations import canonical_quats
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,

@@ -16,7 +16,8 @@ import numpy as np
 from spn_data.errors import StageError
 from spn_data.exports.tum import tum_text
 from spn_data.geometry.geodesy import GeoOrigin
-from spn_data.geometry.pose import Poses, angles_from_rotations, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import angles_from_rotations, canonical_quats
 from spn_data.storage.files import write_csv
 from spn_model.models.pose_model import PoseEstimates
 from spn_model.prediction.flights import FlightFrame

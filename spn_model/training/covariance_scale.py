@@ -6,7 +6,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, rotation_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotation_vectors
 from spn_model.evaluation.calibration import DOF, nees
 from spn_model.models.pose_model import PoseEstimates
 

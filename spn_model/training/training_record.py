@@ -16,7 +16,12 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import GeometryError
-from spn_model.evaluation.validation import PosedImages, ValidationErrors, spread_rows, validate
+from spn_model.evaluation.validation import (
+    ValidationErrors,
+    ValidationImages,
+    spread_rows,
+    validate,
+)
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import checkpoint
 from spn_model.models.pose_model import PoseModel
@@ -79,7 +84,7 @@ class ValidationFrames:
     """Frames on which a model is evaluated during training: rows of a named group, or views without one."""
 
     event: str
-    frames: PosedImages
+    frames: ValidationImages
     rows: np.ndarray
     group: str = ""
 

@@ -21,7 +21,8 @@ from spn_data.coverage.sequence_table import COLUMNS
 from spn_data.coverage.waypoints import WaypointFrame, read_waypoints
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.geometry.pose import Poses, angles_from_rotations
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import angles_from_rotations
 from spn_data.inputs.area_labels import (
     LabelledArea,
     read_labelled_area,

@@ -10,7 +10,8 @@ import numpy as np
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 
 CAMERA = Camera("SIMPLE_PINHOLE", 320, 180, np.array([230.0, 160.0, 90.0]))
 SIZE_M = np.array([20.0, 16.0, 9.0])  # the hall extends from 0 to here

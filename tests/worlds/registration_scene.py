@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.registration.solution import UnsolvedSequence
 from spn_data.registration.tracks import find_tracks
 

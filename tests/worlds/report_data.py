@@ -7,7 +7,8 @@ import base64
 import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import Uncertainty

@@ -7,7 +7,8 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import scene_of
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, Similarity, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotations_from_vectors
 from tests.worlds.native_world import native_model
 
 PER_LINE, STEP_M, APART_M, HEIGHT_M = 40, 7.5, 14.0, 45.0

@@ -9,7 +9,8 @@ import numpy as np
 
 from spn_data.capture.frames import Frames, FrameStatus
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.labels.labels import LabelObservations, Labels, LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.simulate.video_out import write_video

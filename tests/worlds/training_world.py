@@ -17,7 +17,8 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models import registry
 from spn_model.models.checkpoint import load

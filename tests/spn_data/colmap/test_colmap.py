@@ -22,7 +22,8 @@ from spn_data.colmap.model import (
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.errors import FormatError, StageError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.matching.features import Features
 
 

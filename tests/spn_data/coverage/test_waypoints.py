@@ -10,7 +10,7 @@ import pytest
 from spn_data.coverage.waypoints import WaypointFrame, read_waypoints, waypoint_columns
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import angles_from_rotations
+from spn_data.geometry.rotations import angles_from_rotations
 from spn_data.storage.files import write_csv
 
 LAT, LON = 49.0153, 8.4250

@@ -14,7 +14,8 @@ from spn_data.dataset.cambridge import (
     write_cambridge,
 )
 from spn_data.errors import InputError
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 
 HEADER = "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n\n"
 ROW = "seq1/frame00001.png 1.000000 2.000000 3.000000 1.000000 0.000000 0.000000 0.000000\n"

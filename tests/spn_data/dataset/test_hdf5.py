@@ -20,7 +20,7 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import canonical_quats
+from spn_data.geometry.rotations import canonical_quats
 
 ROOT = Path(__file__).resolve().parents[3]
 CAMERA = Camera("SIMPLE_PINHOLE", 48, 27, np.array([40.0, 24.0, 13.5]))

@@ -19,7 +19,8 @@ from spn_data.dataset.nvm import build_nvm_model, write_nvm
 from spn_data.dataset.nvm_frames import camera_from_visualsfm
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.pipeline.import_cambridge import LISTS, Imported, ImportOptions, import_cambridge
 
 OUTLIER = "seq5/frame00297.png"

@@ -10,7 +10,8 @@ import pytest
 from spn_data.dataset.nvm import NvmModel, build_nvm_model, offsets_from_center, read_nvm, write_nvm
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, canonical_quats
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats
 
 TEXT = """NVM_V3
 

@@ -8,12 +8,10 @@ import pycolmap
 import pytest
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import (
-    Poses,
-    Similarity,
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
+from spn_data.geometry.rotations import (
     angles_from_rotations,
     canonical_quats,
-    pose_errors,
     quats_from_rotations,
     rotation_errors_deg,
     rotation_vectors,

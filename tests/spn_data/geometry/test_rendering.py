@@ -8,13 +8,13 @@ import pytest
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import rotations_from_angles
 from spn_data.geometry.rendering import (
     PinholeRenderer,
     RenderingOptions,
     canonical_camera,
     undistorted_camera,
 )
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.simulate.render import SceneRenderer as Simulator
 from spn_data.simulate.scene import SceneOptions, build_scene, paint_all
 

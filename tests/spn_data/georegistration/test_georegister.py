@@ -10,7 +10,8 @@ import pytest
 
 from spn_data.errors import FormatError, GeometryError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.georegistration import (
     GeoErrors,
     GeoFit,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spn_data.geometry.pose import Similarity, rotations_from_angles, rotations_from_vectors
+from spn_data.geometry.pose import Similarity
+from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration import georegistration_errors
 from spn_data.georegistration.cross_validation import time_blocks
 from spn_data.georegistration.gravity import robust_direction, up_from_level_cameras

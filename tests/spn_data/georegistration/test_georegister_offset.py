@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.geometry.pose import Poses, Similarity, rotations_from_angles, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration import TimeOffset, estimate_time_offset
 from spn_data.simulate.flight import FlightPath, simulate_paths, simulate_telemetry
 from spn_data.simulate.presets import preset

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.geodesy import GeoOrigin
-from spn_data.geometry.pose import rotations_from_angles, rotations_from_vectors
+from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.observe import Fixes
 from spn_data.georegistration.problem import SHARED, FitState, Kind, Problem

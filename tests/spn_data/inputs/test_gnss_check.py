@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.geodesy import HeightReference
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
 from spn_data.labels.labels import Labels, LabelStatus

@@ -12,7 +12,8 @@ import pytest
 from spn_data.area.names import MODEL
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.errors import FormatError, InputError
-from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_angles
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.labels.labels import (
     LabelObservations,
     Labels,

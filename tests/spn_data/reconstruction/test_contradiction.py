@@ -12,7 +12,8 @@ from spn_data.colmap import pycolmap
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene, scene_of
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.reconstruction.contradiction import contradictions, focal_changes
 from spn_data.reconstruction.correspondences import FramesToMap
 

@@ -14,7 +14,8 @@ from spn_data.colmap import pycolmap
 from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import projection_jacobians
-from spn_data.geometry.pose import Poses, Similarity, pose_errors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, Similarity, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.reconstruction.frame_jitter import most_likely_scatter
 from spn_data.reconstruction.shutter import (
     ShutterDiagnosis,

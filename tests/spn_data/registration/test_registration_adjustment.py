@@ -10,7 +10,8 @@ from scipy.optimize import minimize
 
 from spn_data.geometry.camera import MODELS, Camera
 from spn_data.geometry.least_squares import POSE
-from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

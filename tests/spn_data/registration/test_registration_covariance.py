@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, Similarity, rotation_vectors, rotations_from_angles
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_angles
 from spn_data.registration.adjustment import (
     SequenceObservations,
     SequenceState,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from spn_data.errors import InputError
-from spn_data.geometry.pose import Poses, angles_from_rotations, rotation_errors_deg
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import angles_from_rotations, rotation_errors_deg
 from spn_data.simulate import (
     FlightPath,
     GnssOptions,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import rotations_from_angles
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.simulate import preset, simulate_paths
 from spn_data.simulate.faces import Face, Texture, mirror_face
 from spn_data.simulate.flight import exposure_poses

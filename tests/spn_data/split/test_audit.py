@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.labels.labels import LabelObservations, Labels, LabelStatus
 from spn_data.split import audit, audit_files
 from spn_data.split.audit import AuditFinding, AuditVerdict, MapHashes

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from spn_data.errors import FormatError, GeometryError, StageError
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.labels.labels import Labels
 from spn_data.split.groups import LEFT_OUT, TEST, TRAIN, VALIDATION, Policy, Split, SplitOptions
 from spn_data.split.holdout import make_split

@@ -16,9 +16,8 @@ from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.least_squares import POSE
-from spn_data.geometry.pose import (
-    Poses,
-    Similarity,
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import (
     rotation_vectors,
     rotations_from_angles,
     rotations_from_vectors,

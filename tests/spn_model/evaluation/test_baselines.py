@@ -10,7 +10,8 @@ import pytest
 
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, pose_errors, quats_from_rotations, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import quats_from_rotations, rotations_from_vectors
 from spn_model.evaluation.baselines import (
     PAPER_TABLE_1,
     GemOptions,

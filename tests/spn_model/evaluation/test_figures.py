@@ -9,7 +9,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.evaluation import figures, svg
 from spn_model.evaluation.metrics import Estimates, evaluate, evaluation_frames
 from spn_model.evaluation.trajectory_view import view_matrix

@@ -15,7 +15,8 @@ from scipy.special import chdtri
 
 from spn_data.dataset.hdf5_schema import DatasetInfo
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.evaluation.calibration import calibrate, is_covariance, nees, sigmas
 from spn_model.evaluation.metrics import (
     ENU,

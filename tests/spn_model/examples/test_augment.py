@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.examples.augment import (
     PhotometricOptions,
     WarpOptions,

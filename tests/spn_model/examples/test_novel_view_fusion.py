@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_model.examples.ground import fit_level_ground
 from spn_model.examples.novel_view_fusion import fused_view
 from spn_model.examples.novel_views import NovelViewOptions, overhead_pose

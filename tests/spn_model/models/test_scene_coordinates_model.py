@@ -13,7 +13,8 @@ import torch
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, pose_errors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.pose_model import PoseEstimates
 from spn_model.models.scene_coordinates import SceneCoordinatesModel

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, canonical_quats, rotations_from_vectors
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import canonical_quats, rotations_from_vectors
 from spn_model.networks.pose_loss import (
     LearnedWeighting,
     beta_weighted_loss,

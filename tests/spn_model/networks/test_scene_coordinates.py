@@ -10,7 +10,8 @@ from torch.nn import functional
 
 from spn_data.dataset.hdf5_reader import FramePoints
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, rotations_from_angles
+from spn_data.geometry.pose import Poses
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_model.examples.augment import WarpOptions, random_warp
 from spn_model.examples.novel_views import NovelViewOptions, nearby_pose, warp_to_pose
 from spn_model.examples.point_targets import (

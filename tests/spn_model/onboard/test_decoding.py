@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from spn_data.errors import GeometryError
-from spn_data.geometry.pose import Poses, pose_errors, rotation_vectors, rotations_from_vectors
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
 from spn_model.onboard.decoding import DecodingOptions, decode
 
 MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])

@@ -22,7 +22,8 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
-from spn_data.geometry.pose import Poses, pose_errors, rotations_from_angles
+from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.json_files import write_json
