@@ -34,7 +34,7 @@ SCRATCH: dict[str, tuple[str, ...]] = {
     EVALUATION: (".analysis", ".matches"),
 }
 
-# Beside the stages: files that each run replaces.
+# Next to the stages: files that each run replaces.
 COVERAGE, PLANNED_COVERAGE = "coverage", "coverage-waypoints"
 REPORT = "report.html"
 

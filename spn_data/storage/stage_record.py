@@ -79,8 +79,9 @@ def read_record(path: Path) -> StageRecord:
     table = read_json(path)
     del table["version"]
     try:
-        return StageRecord(**{**table, "notes": tuple(table["notes"])})
-    except (TypeError, KeyError) as error:
+        stage = current_stage(table["stage"])
+        return StageRecord(**{**table, "stage": stage, "notes": tuple(table["notes"])})
+    except (TypeError, KeyError, AttributeError) as error:
         raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
 
 

@@ -23,7 +23,7 @@ _TEXT_COLUMNS = ("method", "group", "name", "stratum")
 
 @dataclass(frozen=True, eq=False)
 class RunResults:
-    """Metrics of a trained network and of the baselines that it was evaluated beside.
+    """Metrics of a trained network and of the baselines evaluated with it.
 
     Attributes
     ----------

@@ -184,3 +184,56 @@ def test_what_was_planted_fails_the_audit(
     result = run("audit", "--area", area)
     assert result.exit_code == 1, result.output
     assert result.stderr == f"Error: the audit failed: {check}\n"
+
+
+def as_version_0_1_left_it(area: Path) -> None:
+    """Rename and remove what a later version names otherwise or writes in addition."""
+    (area / "4-tracked").rename(area / "4-dense")
+    for name in ("poses.csv", "observations.npz"):
+        (area / MODEL / name).unlink()
+
+    def old_names(value: dict[str, Any]) -> None:
+        for record in (value, value.get("made_of", {})):
+            if "upstream" in record:
+                found = {
+                    k.replace("4-tracked", "4-dense"): v for k, v in record["upstream"].items()
+                }
+                record["upstream"] = found
+        if "stage" in value:
+            value["stage"] = value["stage"].replace("4-tracked", "4-dense")
+        options = value.get("options", {})
+        options = options.get("split", options)
+        if "tracked" in options:
+            options["dense"] = options.pop("tracked")
+
+    for path in (*area.glob("*/stage.json"), *area.glob("*/*/stage.json")):
+        rewrite(path, old_names)
+    rewrite(area / SPLIT / "split.json", old_names)
+
+
+def test_an_area_of_version_0_1_is_read_and_left_as_it_is(area: Path) -> None:
+    """With 4-dense and without stored mapping labels, commands see the same frames and redo nothing."""
+    before = read_labelled_area(Area(area))
+    as_version_0_1_left_it(area)
+    assert read_json(area / SPLIT / "stage.json")["upstream"].keys() >= {"4-dense/medium"}
+    after = read_labelled_area(Area(area))
+    assert after.mapping.names.tolist() == before.mapping.names.tolist()
+    posed = after.mapping.registered
+    np.testing.assert_allclose(
+        after.mapping.poses.centers[posed], before.mapping.poses.centers[posed], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        after.mapping.covariance[posed], before.mapping.covariance[posed], rtol=1e-5, atol=1e-12
+    )
+    assert after.evaluation["medium"].tracked.sum() == before.evaluation["medium"].tracked.sum()
+    status = run("status", "--area", area)
+    assert status.exit_code == 0, status.output
+    assert "4-tracked/medium" in status.output
+    assert "stale" not in status.output
+    again = run("split", "--area", area)
+    assert again.exit_code == 0, again.output
+    assert "unchanged" in again.output
+    for command in ("coverage", "audit", "report"):
+        result = run(command, "--area", area)
+        assert result.exit_code == 0, result.output
+    assert not (area / "4-tracked").exists()
