@@ -55,8 +55,8 @@ class _Run:
 
     def named(self, name: str) -> _Run:
         """Return a run whose steps carry a name, so that a second round is not mistaken for the first."""
-        told = self.progress
-        return replace(self, progress=lambda step, *counts: told(f"{step} ({name})", *counts))
+        report = self.progress
+        return replace(self, progress=lambda step, *counts: report(f"{step} ({name})", *counts))
 
 
 @dataclass(frozen=True)
@@ -170,15 +170,15 @@ def reconstruct(
     StageError
         If fewer than three images, or less than the share `options.usable_share` of them, are registered.
     """
-    story: list[str] = []
+    notes: list[str] = []
     with dispatch_to(options.cluster, options.threads) as dispatch:
         run = _Run(frames, work, options, dispatch, progress, stopwatch)
-        best = _best_attempt(run, story)
+        best = _best_attempt(run, notes)
     if best is None or best.registered < max(3, options.usable_share * len(frames.names)):
         raise StageError(
-            failure_message(work, len(frames.names), 0 if best is None else best.registered, story)
+            failure_message(work, len(frames.names), 0 if best is None else best.registered, notes)
         )
-    refined = _refine(run, best.model, story)
+    refined = _refine(run, best.model, notes)
     scene, observations, points = read_map(refined)
     with MapDatabase.open(work / best.database) as database:
         registrations = diagnose(database, frames, scene, observations)
@@ -189,7 +189,7 @@ def reconstruct(
         work / best.database,
         registrations,
         best.submodels,
-        tuple(story),
+        tuple(notes),
         tried,
         verified,
         scene,
@@ -198,12 +198,12 @@ def reconstruct(
     )
 
 
-def _best_attempt(run: _Run, story: list[str]) -> _Candidate | None:
+def _best_attempt(run: _Run, notes: list[str]) -> _Candidate | None:
     """Return the first attempt that is good enough, otherwise the best of all."""
     options = run.options
     best: _Candidate | None = None
     for attempt in attempts(options):
-        found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, story)
+        found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, notes)
         if found is None:
             continue
         if best is None or found.rank > best.rank:
@@ -213,8 +213,8 @@ def _best_attempt(run: _Run, story: list[str]) -> _Candidate | None:
     return best
 
 
-def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
-    """Run an attempt and the second chances of its missing frames; append what happened to the story."""
+def _try(run: _Run, attempt: Attempt, notes: list[str]) -> _Candidate | None:
+    """Run an attempt and the second chances of its missing frames; append what happened to the notes."""
     frames, work, stopwatch = run.frames, run.work, run.stopwatch
     n = len(frames.names)
     with MapDatabase.open(work / attempt.database) as database:
@@ -230,10 +230,10 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
         _match(run, database, pairs)
     models = _map(run, attempt)
     submodels = tuple(count_registered(model) for model in models)
-    story.append(attempt_note(attempt, submodels, n))
+    notes.append(attempt_note(attempt, submodels, n))
     if not models:
         return None
-    model, kept = _settled(run, attempt, models[0], story), attempt.database
+    model, kept = _settled(run, attempt, models[0], notes), attempt.database
     registered = count_registered(model)
     if registered > 2:
         with stopwatch.step("pairs"):
@@ -241,21 +241,21 @@ def _try(run: _Run, attempt: Attempt, story: list[str]) -> _Candidate | None:
         for chance in chances(attempt):
             if not 0 < n - registered <= chance.most_missing * n:
                 break
-            told: list[str] = []
+            messages: list[str] = []
             grown = _grow(run.named(chance.name), attempt, chance, wider, model)
-            grown = _without_misplaced(run, chance.database, grown, told)
+            grown = _without_misplaced(run, chance.database, grown, messages)
             gained = count_registered(grown) - registered
             if gained > 0:
-                story += [*told, f"{chance.what} registered {gained} more"]
+                notes += [*messages, f"{chance.what} registered {gained} more"]
                 registered, model, kept = registered + gained, grown, chance.database
     scene = read_scene(model)
     with MapDatabase.open(work / kept) as database:
         wrong = contradictions(database, scene)
     drifted = focal_changes(scene, frames, _DRIFTED)
     if wrong:
-        story.append(contradiction_note(wrong))
+        notes.append(contradiction_note(wrong))
     if drifted:
-        story.append(drift_note(drifted))
+        notes.append(drift_note(drifted))
     return _Candidate(not (wrong or drifted), registered, model, kept, submodels)
 
 
@@ -319,7 +319,7 @@ def _map(
     return models
 
 
-def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path:
+def _settled(run: _Run, attempt: Attempt, model: Path, notes: list[str]) -> Path:
     """Return the model with the points of all matches and without misplaced frames.
 
     It is computed only once: later chances add matches to the database, and an interrupted run that
@@ -327,15 +327,15 @@ def _settled(run: _Run, attempt: Attempt, model: Path, story: list[str]) -> Path
     """
     done = run.work / f"mapping-{attempt.name}" / "settled.json"
     if not done.exists():
-        told: list[str] = []
+        messages: list[str] = []
         if attempt.thinned:
             model = _with_all_points(run, attempt, model)
-        model = _without_misplaced(run, attempt.database, model, told)
+        model = _without_misplaced(run, attempt.database, model, messages)
         write_atomically(
-            done, json.dumps({"model": str(model.relative_to(run.work)), "told": told})
+            done, json.dumps({"model": str(model.relative_to(run.work)), "told": messages})
         )
     found = json.loads(done.read_text())
-    story += found["told"]
+    notes += found["told"]
     return run.work / found["model"]
 
 
@@ -365,7 +365,7 @@ def _grow(
     return max([model, *models], key=count_registered)
 
 
-def _without_misplaced(run: _Run, database: str, model: Path, story: list[str]) -> Path:
+def _without_misplaced(run: _Run, database: str, model: Path, notes: list[str]) -> Path:
     with run.stopwatch.step("mapping"):
         with MapDatabase.open(run.work / database) as opened:
             matches = opened.verified_pairs()
@@ -373,11 +373,11 @@ def _without_misplaced(run: _Run, database: str, model: Path, story: list[str]) 
         wrong = drop_misplaced(model, target, matches)
     if not wrong:
         return model
-    story.append(misplaced_note(wrong))
+    notes.append(misplaced_note(wrong))
     return target
 
 
-def _refine(run: _Run, model: Path, story: list[str]) -> Path:
+def _refine(run: _Run, model: Path, notes: list[str]) -> Path:
     target, frames, options = run.work / "refined", run.frames, run.options
     run.progress("refinement", 0, 1)
     known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
@@ -394,5 +394,5 @@ def _refine(run: _Run, model: Path, story: list[str]) -> Path:
         )
     run.progress("refinement", 1, 1)
     if done["bend_m"] > 0:
-        story.append(bend_note(done["bend_m"]))
+        notes.append(bend_note(done["bend_m"]))
     return target
