@@ -1,4 +1,4 @@
-"""Discovery of sequences in a folder: videos, photos and their telemetry files. Decodes nothing."""
+"""Discovery of sequences in a folder: videos, photos and their telemetry files. Decodes no pixels."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from spn_data.capture.photo_order import photos_in_order
 from spn_data.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ class Source:
     kind : SourceKind
         Video or photos.
     parts : tuple of Path
-        Video files in order of time, or photos in order of their names.
+        Video files in order of time, or photos in order of their EXIF times, otherwise of their names (2
+        before 10).
     telemetry : tuple of Path
         Telemetry files of the same name in the same folder.
     """
@@ -242,7 +244,7 @@ def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:
     folders: dict[Path, list[Path]] = {}
     for photo in photos:
         folders.setdefault(photo.parent, []).append(photo)
-    return {place: tuple(sorted(found)) for place, found in sorted(folders.items())}
+    return {place: photos_in_order(found) for place, found in sorted(folders.items())}
 
 
 def _same_name(part: Path, telemetry: list[Path]) -> list[Path]:
