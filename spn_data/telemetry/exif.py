@@ -16,8 +16,8 @@ from PIL import Image
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import NAN_SIGMA, Sigma, sigma_from_dop
-from spn_data.telemetry.photo_time import exposure_times, natural_order
 from spn_data.telemetry.photo_tags import NAN, exif_tags, number, positive, text, xmp_properties
+from spn_data.telemetry.photo_time import exposure_times, natural_order
 from spn_data.telemetry.placeholders import without_placeholders
 from spn_data.telemetry.track import Telemetry
 
