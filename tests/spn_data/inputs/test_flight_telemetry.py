@@ -101,7 +101,7 @@ def test_a_log_is_put_on_the_clock_of_its_photos(tmp_path: Path) -> None:
 def test_a_clock_without_zone_is_not_taken_as_utc(tmp_path: Path) -> None:
     """Photos at 12:00 on a clock without zone are not at 12:00 UTC of a log from 08:00 to 14:00."""
     write_photos(tmp_path, zone=None)
-    (tmp_path / "log.gpx").write_text(gpx(datetime(2026, 5, 1, 8), 360, 60))
+    (tmp_path / "log.gpx").write_text(gpx(datetime(2026, 5, 1, 8), 360, 10))
     with pytest.raises(
         InputError, match=r"log.gpx: cannot be paired with the photos.* zones fit, from"
     ) as error:
