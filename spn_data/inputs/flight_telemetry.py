@@ -28,7 +28,8 @@ def check_telemetry(source: Source, *, time_offset_s: float | None = None) -> No
     """
     if source.kind is SourceKind.PHOTOS:
         return
-    durations_s = [probe(part).duration_s for part in source.parts]
+    infos = [probe(part) for part in source.parts]
+    durations_s = [info.duration_s for info in infos]
     if not np.isfinite(durations_s).all() or not source.telemetry:
         return
     starts_s = [0.0, *np.cumsum(durations_s)[:-1].tolist()]
@@ -36,7 +37,8 @@ def check_telemetry(source: Source, *, time_offset_s: float | None = None) -> No
         source, starts_s, durations_s, accept=False, offset_s=time_offset_s, embedded=False
     )
     if track is not None:
-        time_s = np.linspace(0.0, sum(durations_s), 200)
+        frames = sum(info.frame_count for info in infos)
+        time_s = np.linspace(0.0, sum(durations_s), max(frames, 2), endpoint=False)
         check_overlap(track, _video_clock(time_s, None, False, time_offset_s), _names(source))
 
 

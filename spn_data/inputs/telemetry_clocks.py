@@ -143,17 +143,18 @@ def check_overlap(track: Telemetry, clock: ImageClock, name: str) -> Telemetry:
     fixed_s = shifted.time_s[shifted.has_fix]
     begin_s, end_s = clock.span_s
     where = (
-        f"{count} of {total} images get a fix: its fixes last from {_clock(fixed_s[0])} to "
+        f"its fixes last from {_clock(fixed_s[0])} to "
         f"{_clock(fixed_s[-1])} on the clock of {clock.what}, which lasts from {_clock(begin_s)} to "
         f"{_clock(end_s)}"
     )
     if count > _FEW * total:
-        return _noted(track, where)
+        return _noted(track, f"{count} of {total} images get a fix: {where}")
     why = _explained(shifted, clock)
     if clock.accept:
-        return _noted(track, f"{where}{why}")
+        return _noted(track, f"{count} of {total} images get a fix: {where}{why}")
     raise InputError(
-        f"{where}{why}; remove the file, give --time-offset, or use --any-telemetry to go on",
+        f"{count} of {total} images get a fix: {where}{why}; remove the file, give --time-offset, or use "
+        "--any-telemetry to go on",
         path=name,
     )
 

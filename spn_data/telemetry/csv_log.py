@@ -54,37 +54,11 @@ def read_csv_log(path: Path | str) -> Telemetry:
     columns, notes = _choose_columns(header, header_line, body, path)
     columns, unit_notes = with_consistent_units(columns, body)
     notes += unit_notes
-    records: list[dict[str, float]] = []
-    damaged: list[tuple[int, str]] = []
-    unread: dict[str, list[str]] = {}
-    zoneless = False
-    references: set[str] = set()
-    for line, row in body:
-        try:
-            record, without_zone, faults = _parse_row(row, columns, len(header))
-        except ValueError as error:
-            damaged.append((line, str(error)))
-            continue
-        for name, fault in faults.items():
-            unread.setdefault(columns[name].header, []).append(f"line {line}: {fault}")
-        records.append(record)
-        zoneless |= without_zone
-        if "alt_reference" in columns:
-            references.add(row[columns["alt_reference"].index].lower())
-    total = len(records) + len(damaged)
-    if total == 0:
-        raise InputError("has a header but no rows", path=path, line=header_line)
-    if len(damaged) > MAX_DAMAGED_FRACTION * total:
-        line, why = damaged[0]
-        raise InputError(f"{why}; {len(damaged)} of {total} rows are damaged", path=path, line=line)
-    notes += [
-        f"values left out in column {name}: {len(lines)}, the first at {lines[0]}"
-        for name, lines in unread.items()
-    ]
+    records, zoneless, references, row_notes = _read_rows(
+        body, columns, len(header), path, header_line
+    )
+    notes += row_notes
     table = _Table(records)
-    if damaged:
-        line, why = damaged[0]
-        notes.append(f"rows left out: {len(damaged)}, the first at line {line}: {why}")
     clock = "time" if table.known("time") >= table.known("utc") else "utc"
     timed = np.isfinite(table[clock])
     if not timed.all():
@@ -98,7 +72,7 @@ def read_csv_log(path: Path | str) -> Telemetry:
             "its times are dates, counted from the first: the time offset to the video must be given, "
             "taken from the video's creation time, or estimated"
         )
-    elif columns["time"].unit.startswith("milli") or "fly" in columns["time"].header.lower():
+    elif _is_flight_time(columns.get("time")):
         notes.append(
             "its times count from the start of the flight, not of the video: the time offset "
             "must be given or estimated"
@@ -128,6 +102,50 @@ def read_csv_log(path: Path | str) -> Telemetry:
         notes=tuple(notes),
     ).select(index)
     return without_placeholders(track)
+
+
+def _read_rows(
+    body: list[tuple[int, list[str]]],
+    columns: dict[str, CsvColumn],
+    width: int,
+    path: Path | str,
+    header_line: int,
+) -> tuple[list[dict[str, float]], bool, set[str], list[str]]:
+    """Return the records, whether a date has no zone, the height references, and what was left out.
+
+    Raises InputError if there are no rows, or too many are damaged.
+    """
+    records: list[dict[str, float]] = []
+    damaged: list[tuple[int, str]] = []
+    unread: dict[str, list[str]] = {}
+    zoneless = False
+    references: set[str] = set()
+    for line, row in body:
+        try:
+            record, without_zone, faults = _parse_row(row, columns, width)
+        except ValueError as error:
+            damaged.append((line, str(error)))
+            continue
+        for name, fault in faults.items():
+            unread.setdefault(columns[name].header, []).append(f"line {line}: {fault}")
+        records.append(record)
+        zoneless |= without_zone
+        if "alt_reference" in columns:
+            references.add(row[columns["alt_reference"].index].lower())
+    total = len(records) + len(damaged)
+    if total == 0:
+        raise InputError("has a header but no rows", path=path, line=header_line)
+    if len(damaged) > MAX_DAMAGED_FRACTION * total:
+        line, why = damaged[0]
+        raise InputError(f"{why}; {len(damaged)} of {total} rows are damaged", path=path, line=line)
+    notes = [
+        f"values left out in column {name}: {len(lines)}, the first at {lines[0]}"
+        for name, lines in unread.items()
+    ]
+    if damaged:
+        line, why = damaged[0]
+        notes.append(f"rows left out: {len(damaged)}, the first at line {line}: {why}")
+    return records, zoneless, references, notes
 
 
 class _Table:
@@ -201,6 +219,13 @@ def _check_steps(
             path=path,
             line=line,
         )
+
+
+def _is_flight_time(column: CsvColumn | None) -> bool:
+    """Return whether a column counts from the start of the flight, as those of flight records do."""
+    return column is not None and (
+        column.unit.startswith("milli") or "fly" in column.header.lower()
+    )
 
 
 def _are_equal(one: np.ndarray, other: np.ndarray) -> bool:

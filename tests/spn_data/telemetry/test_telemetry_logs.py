@@ -163,6 +163,7 @@ def test_csv_of_airdata(tmp_path):
         ("time_ms", ("1000", "1500"), 1.5, NAN, False),
         ("time(us)", ("1000000", "1500000"), 1.5, NAN, False),
         ("t", ("1", "1.5"), 1.5, NAN, False),
+        ("timestamp_us", ("1000000", "1500000"), 1.5, NAN, False),
     ],
 )
 def test_csv_clocks(tmp_path, header, cells, time_s, utc_s, is_local):
