@@ -24,7 +24,8 @@ _logger = logging.getLogger(__name__)
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
 PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff"])
-TELEMETRY_SUFFIXES = frozenset([".srt", ".gpx", ".csv"])
+SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
+TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv"}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
 # Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
@@ -138,7 +139,7 @@ def discover(
         # Telemetry of a photo folder has the folder's name, or is the only file of its kind in it.
         here = [t for t in by_kind["telemetry"] if t.parent == place]
         used = {t for s in sources for t in s.telemetry}
-        free = [t for t in here if t not in used and t.suffix.lower() != ".srt"]
+        free = [t for t in here if t not in used and t.suffix.lower() not in SUBTITLE_SUFFIXES]
         named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
         telemetry = named or (tuple(free) if len(free) == 1 else ())
         sources.append(Source(name, SourceKind.PHOTOS, photos, telemetry))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from spn_data.capture.candidates import Candidates
-from spn_data.capture.sources import Source, SourceKind
+from spn_data.capture.sources import SUBTITLE_SUFFIXES, Source, SourceKind
 from spn_data.capture.video import VideoInfo, probe
 from spn_data.errors import InputError
 from spn_data.inputs.telemetry_clocks import ImageClock, check_overlap, on_image_clock
@@ -105,12 +105,14 @@ def _video_telemetry(
     for part, start_s, duration_s in zip(source.parts, starts_s, durations_s, strict=True):
         files = [t for t in source.telemetry if t.stem.lower() == part.stem.lower()]
         # Prefer the subtitle file: it is on the clock of the video, a log is not.
-        files.sort(key=lambda t: t.suffix.lower() != ".srt")
+        files.sort(
+            key=lambda t: (t.suffix.lower() not in SUBTITLE_SUFFIXES, t.suffix.lower() != ".srt")
+        )
         info = probe(part)
         track = None
         if files:
             track = read_telemetry(files[0])
-            if files[0].suffix.lower() != ".srt":
+            if files[0].suffix.lower() not in SUBTITLE_SUFFIXES:
                 time_s = np.array([0.0, duration_s])
                 clock = _video_clock(time_s, info, accept, offset_s)
                 track = _on_video_clock(track, clock, files[0].name)

@@ -367,7 +367,7 @@ def test_the_reader_is_chosen_by_name_and_content(tmp_path):
     [
         (
             "a.kml",
-            r"a.kml: .kml is not a telemetry format; supported are DJI subtitles \(.srt\), GPX",
+            r"a.kml: .kml is not a telemetry format; supported are subtitles of drones \(.srt, .ass\), GPX",
         ),
         ("a", "a: a file without a suffix is not a telemetry format"),
         ("a.csv", "a.csv: cannot be read: No such file"),

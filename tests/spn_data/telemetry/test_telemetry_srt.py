@@ -8,6 +8,7 @@ import pytest
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.dji_srt import parse_dji_srt, read_dji_srt
+from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.track import summarize
 
 NAN = np.nan
@@ -387,3 +388,22 @@ def test_the_wrong_side_of_the_earth(shared_cases):
     assert set(west.rel_alt_m.tolist()) == {20.0}
     rtk = read_dji_srt(shared_cases / "input" / "13-rtk-third-is-a-height" / "DJI_0001.srt")
     np.testing.assert_allclose(rtk.lat_lon_deg[0], (48.2654, 11.6712))
+
+
+def test_autel_writes_ass_beside_a_video(tmp_path):
+    """Dialogue lines of an .ass file are records on the video's clock; one without a time is left out."""
+    line = (
+        "Dialogue: 0,{},0:00:02.00,Default,,0,0,0,,GPS(W: -20.5, N: 48.25, -37)\\NReH:20 ISO:100\n"
+    )
+    head = "[Script Info]\n[V4+ Styles]\nFormat: Name\n[Events]\n"
+    head += "Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text\n"
+    path = tmp_path / "MAX_0001.ass"
+    path.write_text(head + line.format("0:00:00.50") + line.format("x") + line.format("0:01:01.00"))
+    t = read_telemetry(path)
+    assert t.time_s.tolist() == [0.5, 61.0]
+    np.testing.assert_allclose(t.lat_lon_deg, [(48.25, -20.5)] * 2)
+    assert t.rel_alt_m.tolist() == [20.0, 20.0]
+    assert any("records left out: 1, the first at line 7" in note for note in t.notes)
+    path.write_text(head)
+    with pytest.raises(InputError, match=r"MAX_0001.ass"):
+        read_telemetry(path)
