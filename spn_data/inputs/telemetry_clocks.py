@@ -183,7 +183,8 @@ def _explained(track: Telemetry, clock: ImageClock) -> str:
         )
     if fits:
         return f"{text}; shifts by {len(fits)} time zones fit: one of the clocks may be local time"
-    if _covered(track, clock.span_s, length_s) >= _COVERED_SHARE:
+    is_video = clock.what == "the video"
+    if is_video and _covered(track, clock.span_s, length_s) >= _COVERED_SHARE:
         return (
             f"{text}; if the camera writes the end of the recording as its creation time, give "
             f"--time-offset {before + length_s:.0f}"

@@ -208,3 +208,15 @@ def test_inputs_whose_clocks_differ(shared_cases: Path) -> None:
         check_telemetry(source)
     track = read_telemetry(cases / "04-gpx-every-5s" / "karma.gpx")
     assert track.at(np.array([10.0, 12.5])).has_fix.all()
+
+
+def test_ass_subtitles_beside_a_video_are_on_its_clock(tmp_path: Path) -> None:
+    """An .ass file of the video's name is its telemetry, as an .srt is."""
+    write_video(tmp_path / "MAX_0001.mp4", "2026-05-01T10:00:01Z")
+    line = (
+        "Dialogue: 0,0:00:0{}.00,0:00:09.00,Default,,0,0,0,,GPS(W: -20.5, N: 48.25, 1)\\NReH:20\n"
+    )
+    (tmp_path / "MAX_0001.ass").write_text("[Events]\n" + "".join(line.format(k) for k in range(6)))
+    track = telemetry_in(tmp_path)
+    assert track.time_s.tolist() == [0, 1, 2, 3, 4, 5]
+    assert track.has_fix.all()
