@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED_CASES = SHARED_DATA.parent / "cases"
 
 
 @pytest.fixture(scope="session")
@@ -17,6 +18,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real drone data is not at {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """Folder of inputs that went wrong once, which lies beside a checkout and is not part of the project."""
+    if not SHARED_CASES.is_dir():
+        pytest.skip(f"the inputs that went wrong once are not at {SHARED_CASES}")
+    return SHARED_CASES
 
 
 @pytest.fixture(scope="module")

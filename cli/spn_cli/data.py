@@ -56,7 +56,7 @@ def main(verbose: bool) -> None:
 @click.option(
     "--any-telemetry",
     is_flag=True,
-    help="Use telemetry even if its length does not match its video.",
+    help="Use telemetry even if its length, time or time zone does not match its images.",
 )
 @click.option(
     "--engine",

@@ -143,7 +143,7 @@ _GEOREGISTRATION = (
     click.option(
         "--time-offset",
         "time_offset_s",
-        type=PerSequence(-3600, 3600),
+        type=PerSequence(-4e8, 4e8),
         multiple=True,
         help="Seconds to add to telemetry times.  [default: estimated]",
     ),

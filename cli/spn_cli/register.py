@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 @click.option(
     "--any-telemetry",
     is_flag=True,
-    help="Use telemetry even if its length does not match its video.",
+    help="Use telemetry even if its length, time or time zone does not match its images.",
 )
 @click.option(
     "--video",

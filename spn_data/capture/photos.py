@@ -17,6 +17,7 @@ from spn_data.errors import InputError
 from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
 MAX_PHOTO_PIXELS = 500_000_000
+_MIN_RANGE_16 = 64 * 256  # of 16-bit values: a quarter of the grey levels
 _MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
 _FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG includes MPO
 _ORIENTATION = 0x0112
@@ -116,9 +117,11 @@ def decode_photo(path: Path) -> np.ndarray:
     Raises
     ------
     InputError
-        If the photo is damaged, too large or of a pixel format without a known range.
+        If the photo is damaged, too large or of a pixel format without a known range, or uses so few of
+        its 16 bits that hardly any grey levels would be left.
     """
     with _open_image(path) as image:
+        _check_deep_colour(image, path)
         rgb = _to_8_bits(_upright(image), path).convert("RGB")
         return np.ascontiguousarray(np.asarray(rgb)[:, :, ::-1])
 
@@ -126,6 +129,7 @@ def decode_photo(path: Path) -> np.ndarray:
 def decode_photo_gray(path: Path, *, max_width: int) -> np.ndarray:
     """Decode an upright grey image (h, w) uint8 at most `max_width` wide; JPEGs are decoded reduced."""
     with _open_image(path) as image:
+        _check_deep_colour(image, path)
         image.draft("L", (max_width, max_width * image.height // max(image.width, 1)))
         gray = np.asarray(_to_8_bits(_upright(image), path).convert("L"))
     scale = max_width / gray.shape[1]
@@ -157,7 +161,7 @@ def load_mask(path: Path, width: int, height: int) -> np.ndarray:
         If the mask cannot be read, has another aspect ratio or is all black.
     """
     with _open_image(path) as image:
-        mask = np.asarray(_to_8_bits(image, path).convert("L"))
+        mask = np.asarray(_to_8_bits(image, path, mask=True).convert("L"))
     if mask.shape != (height, width):
         found = f"{mask.shape[1]}x{mask.shape[0]}"
         if abs(mask.shape[1] * height / (mask.shape[0] * width) - 1) > _MAX_ASPECT_ERROR:
@@ -216,15 +220,39 @@ def _damage_reason(error: Exception) -> str:
     return "it is truncated" if "truncated" in str(error) else "it is damaged or not an image"
 
 
-def _to_8_bits(image: Image.Image, path: Path) -> Image.Image:
-    """Scale 16-bit modes to 8 bits; refuse modes without a known range."""
+def _to_8_bits(image: Image.Image, path: Path, *, mask: bool = False) -> Image.Image:
+    """Scale 16-bit modes to 8 bits; refuse modes without a known range, and photos that use few values."""
     if image.mode.startswith("I;16"):
-        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        values = np.asarray(image)
+        if not mask:
+            _check_range(values, path)
+        return Image.fromarray((values >> 8).astype(np.uint8))
     if image.mode in ("I", "F"):
         raise InputError(
             f"pixel format {image.mode!r} (thermal?) has no known value range", path=path
         )
     return image
+
+
+def _check_deep_colour(image: Image.Image, path: Path) -> None:
+    """Refuse colour photos of 16 bits that use few values; Pillow drops their lower bytes on loading."""
+    modes = [str(argument) for tile in getattr(image, "tile", ()) for argument in tile[3:]]
+    if image.mode in ("RGB", "RGBA") and any(";16" in mode for mode in modes):
+        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if values is not None and values.dtype == np.uint16:
+            _check_range(values[..., :3], path)
+
+
+def _check_range(values: np.ndarray, path: Path) -> None:
+    """Raise InputError if 16-bit values would keep too few grey levels in 8 bits."""
+    low, high = (float(v) for v in np.percentile(values[::4, ::4], (0.1, 99.9)))
+    if 0 < high - low < _MIN_RANGE_16:
+        raise InputError(
+            f"uses only values {low:.0f} to {high:.0f} of 16 bits, of which {(high - low) / 256:.0f} of 256 "
+            "grey levels would be left (12 or 14 bits, thermal?): convert all photos of the camera to 8 bits "
+            f"with the same range, for example gdal_translate -ot Byte -scale {low:.0f} {high:.0f} 0 255",
+            path=path,
+        )
 
 
 def _upright_size(photo: PhotoMetadata | None) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Discovery of sequences in a folder: videos, photos and their telemetry files. Decodes nothing."""
+"""Discovery of sequences in a folder: videos, photos and their telemetry files. Decodes no pixels."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from spn_data.capture.photo_order import photos_in_order
 from spn_data.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +24,8 @@ _logger = logging.getLogger(__name__)
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
 PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff"])
-TELEMETRY_SUFFIXES = frozenset([".srt", ".gpx", ".csv"])
+SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
+TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv"}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
 # Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
@@ -59,7 +61,8 @@ class Source:
     kind : SourceKind
         Video or photos.
     parts : tuple of Path
-        Video files in order of time, or photos in order of their names.
+        Video files in order of time, or photos in order of their EXIF times, otherwise of their names (2
+        before 10).
     telemetry : tuple of Path
         Telemetry files of the same name in the same folder.
     """
@@ -136,7 +139,7 @@ def discover(
         # Telemetry of a photo folder has the folder's name, or is the only file of its kind in it.
         here = [t for t in by_kind["telemetry"] if t.parent == place]
         used = {t for s in sources for t in s.telemetry}
-        free = [t for t in here if t not in used and t.suffix.lower() != ".srt"]
+        free = [t for t in here if t not in used and t.suffix.lower() not in SUBTITLE_SUFFIXES]
         named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
         telemetry = named or (tuple(free) if len(free) == 1 else ())
         sources.append(Source(name, SourceKind.PHOTOS, photos, telemetry))
@@ -242,7 +245,7 @@ def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:
     folders: dict[Path, list[Path]] = {}
     for photo in photos:
         folders.setdefault(photo.parent, []).append(photo)
-    return {place: tuple(sorted(found)) for place, found in sorted(folders.items())}
+    return {place: photos_in_order(found) for place, found in sorted(folders.items())}
 
 
 def _same_name(part: Path, telemetry: list[Path]) -> list[Path]:

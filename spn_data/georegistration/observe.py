@@ -71,7 +71,7 @@ def align_telemetry(
     sequence: Sequence[str],
     time_s: np.ndarray,
     *,
-    max_gap_s: float = 2.5,
+    max_gap_s: float | None = None,
 ) -> Telemetry:
     """Interpolate each flight's telemetry at the times of its frames.
 
@@ -83,8 +83,9 @@ def align_telemetry(
         Flight of each of the N frames.
     time_s : ndarray, shape (N,)
         Time of each frame within its flight, in seconds.
-    max_gap_s : float
-        Longest gap between records, in seconds, that is interpolated across.
+    max_gap_s : float, optional
+        Longest gap between records, in seconds, that is interpolated across, by default
+        `Telemetry.max_gap_s` of each flight.
 
     Returns
     -------
@@ -104,7 +105,9 @@ def align_telemetry(
         for column in columns:
             values[column][mask] = getattr(part, column)
         sigma = values["sigma_m"][mask]
-        values["sigma_m"][mask] = np.where(np.isfinite(sigma), sigma, default_sigma_m(part.kind))
+        more_m = telemetry[name].interpolation_sigma_m(time_s[mask])[:, None]
+        default_m = np.hypot(default_sigma_m(part.kind), more_m)
+        values["sigma_m"][mask] = np.where(np.isfinite(sigma), sigma, default_m)
     kinds = {telemetry[name].kind for name in used}
     references = {
         telemetry[name].abs_reference

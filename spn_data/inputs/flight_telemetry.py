@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from spn_data.capture.candidates import Candidates
-from spn_data.capture.sources import Source, SourceKind
+from spn_data.capture.sources import SUBTITLE_SUFFIXES, Source, SourceKind
 from spn_data.capture.video import VideoInfo, probe
 from spn_data.errors import InputError
+from spn_data.inputs.telemetry_clocks import ImageClock, check_overlap, on_image_clock
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
@@ -19,23 +21,33 @@ _LENGTH_TOLERANCE_S = 5.0
 _LENGTH_TOLERANCE = 0.1
 
 
-def check_telemetry(source: Source) -> None:
-    """Raise InputError if a subtitle file does not match its video in duration.
+def check_telemetry(source: Source, *, time_offset_s: float | None = None) -> None:
+    """Raise InputError if a telemetry file does not fit its video in duration or time.
 
     This is checked before hours are spent on the video.
     """
     if source.kind is SourceKind.PHOTOS:
         return
-    for part in source.parts:
-        for path in source.telemetry:
-            if path.stem.lower() == part.stem.lower() and path.suffix.lower() == ".srt":
-                duration_s = probe(part).duration_s
-                if np.isfinite(duration_s):
-                    _check_length(read_telemetry(path), duration_s, path.name)
+    infos = [probe(part) for part in source.parts]
+    durations_s = [info.duration_s for info in infos]
+    if not np.isfinite(durations_s).all() or not source.telemetry:
+        return
+    starts_s = [0.0, *np.cumsum(durations_s)[:-1].tolist()]
+    track = _video_telemetry(
+        source, starts_s, durations_s, accept=False, offset_s=time_offset_s, embedded=False
+    )
+    if track is not None:
+        frames = sum(info.frame_count for info in infos)
+        time_s = np.linspace(0.0, sum(durations_s), max(frames, 2), endpoint=False)
+        check_overlap(track, _video_clock(time_s, None, False, time_offset_s), _names(source))
 
 
 def source_telemetry(
-    source: Source, candidates: Candidates, *, any_telemetry: bool = False
+    source: Source,
+    candidates: Candidates,
+    *,
+    any_telemetry: bool = False,
+    time_offset_s: float | None = None,
 ) -> Telemetry | None:
     """Read the telemetry of a source.
 
@@ -45,7 +57,9 @@ def source_telemetry(
     candidates : Candidates
         Measured frames of the source.
     any_telemetry : bool
-        Whether to accept a subtitle file whose duration does not match the video.
+        Whether to accept telemetry that does not fit the images in duration, time or time zone.
+    time_offset_s : float or None
+        Time offset given by the user; it counts in the comparison, but is not applied.
 
     Returns
     -------
@@ -56,32 +70,72 @@ def source_telemetry(
     Raises
     ------
     InputError
-        If a telemetry file cannot be read, or its duration does not match the video.
+        If a telemetry file cannot be read, or does not fit the images.
     """
     if source.kind is SourceKind.PHOTOS:
-        return _photo_telemetry(source, candidates)
+        return _photo_telemetry(source, candidates, any_telemetry, time_offset_s)
+    measured = candidates.measured
+    ends_s = [measured.time_s[measured.source_idx == k] for k in range(len(source.parts))]
+    durations_s = [float(t[-1] - t[0]) if len(t) else 0.0 for t in ends_s]
+    track = _video_telemetry(
+        source,
+        candidates.part_start_s,
+        durations_s,
+        accept=any_telemetry,
+        offset_s=time_offset_s,
+        embedded=True,
+    )
+    if track is None:
+        return None
+    clock = _video_clock(measured.time_s, None, any_telemetry, time_offset_s)
+    return check_overlap(track, clock, _names(source))
+
+
+def _video_telemetry(
+    source: Source,
+    starts_s: Sequence[float],
+    durations_s: Sequence[float],
+    *,
+    accept: bool,
+    offset_s: float | None,
+    embedded: bool,
+) -> Telemetry | None:
+    """Return the telemetry of all parts of a video on its clock, from files and, if asked, its own tracks."""
     parts = []
-    for index, (part, start_s) in enumerate(
-        zip(source.parts, candidates.part_start_s, strict=True)
-    ):
+    for part, start_s, duration_s in zip(source.parts, starts_s, durations_s, strict=True):
         files = [t for t in source.telemetry if t.stem.lower() == part.stem.lower()]
-        if len(files) > 1:
-            # Prefer the subtitle file: it is on the clock of the video, a log is not.
-            files.sort(key=lambda t: t.suffix.lower() != ".srt")
+        # Prefer the subtitle file: it is on the clock of the video, a log is not.
+        files.sort(
+            key=lambda t: (t.suffix.lower() not in SUBTITLE_SUFFIXES, t.suffix.lower() != ".srt")
+        )
         info = probe(part)
         track = None
         if files:
             track = read_telemetry(files[0])
-            if files[0].suffix.lower() != ".srt":
-                track = _on_video_clock(track, info)
-            elif not any_telemetry:
-                times = candidates.measured.time_s[candidates.measured.source_idx == index]
-                _check_length(track, float(times[-1] - times[0]), files[0].name)
-        elif info.has_subtitles:
+            if files[0].suffix.lower() not in SUBTITLE_SUFFIXES:
+                time_s = np.array([0.0, duration_s])
+                clock = _video_clock(time_s, info, accept, offset_s)
+                track = _on_video_clock(track, clock, files[0].name)
+            elif not accept:
+                _check_length(track, duration_s, files[0].name)
+        elif info.has_subtitles and embedded:
             track = read_subtitles(part)
         if track is not None:
             parts.append(track.shifted(start_s))
     return Telemetry.concatenate(parts) if parts else None
+
+
+def _video_clock(
+    time_s: np.ndarray, info: VideoInfo | None, accept: bool, offset_s: float | None
+) -> ImageClock:
+    created = None if info is None else info.created_utc
+    zero_utc_s = float("nan") if created is None else created.timestamp()
+    return ImageClock(time_s, zero_utc_s, False, "the video", accept, offset_s)
+
+
+def _names(source: Source) -> str:
+    """Name the telemetry of a source in messages."""
+    return ", ".join(path.name for path in source.telemetry) or source.parts[0].name
 
 
 def _check_length(track: Telemetry, video_s: float, name: str) -> None:
@@ -94,30 +148,57 @@ def _check_length(track: Telemetry, video_s: float, name: str) -> None:
         )
 
 
-def _on_video_clock(track: Telemetry, info: VideoInfo) -> Telemetry:
+def _on_video_clock(track: Telemetry, clock: ImageClock, name: str) -> Telemetry:
     """Return a log on the clock of the video, by its creation time if both have absolute times."""
-    if info.created_utc is None or not np.isfinite(track.utc_s).any():
+    if not np.isfinite(clock.zero_utc_s) or not np.isfinite(track.utc_s).any():
         note = (
             "no common clock with the video; the log is assumed to start at the first video frame"
         )
         return replace(track, notes=(*track.notes, note))
-    note = "synchronised with the video by the creation time of the video"
-    moved = replace(track, time_s=track.utc_s - info.created_utc.timestamp())
-    return replace(moved.select(np.isfinite(moved.time_s)), notes=(*track.notes, note))
+    note = (
+        "synchronised with the video by the creation time of the video, which some cameras write in local "
+        "time or at the end of the recording"
+    )
+    return on_image_clock(replace(track, notes=(*track.notes, note)), clock, name)
 
 
-def _photo_telemetry(source: Source, candidates: Candidates) -> Telemetry | None:
+def _photo_telemetry(
+    source: Source, candidates: Candidates, accept: bool, offset_s: float | None
+) -> Telemetry | None:
     own = candidates.photo_telemetry
     if own is not None and own.has_fix.any():
         return own
     for path in source.telemetry:
         log = read_telemetry(path)
-        if own is None or not np.isfinite(log.utc_s).any() or not np.isfinite(own.utc_s).any():
-            continue
-        zero_s = float(own.utc_s[np.isfinite(own.utc_s)][0] - own.time_s[np.isfinite(own.utc_s)][0])
-        moved = replace(log, time_s=log.utc_s - zero_s)
-        return moved.select(np.isfinite(moved.time_s))
+        if own is None or not _are_dated(own) or not np.isfinite(log.utc_s).any():
+            if accept:
+                continue
+            what = (
+                "it has no dates" if own is not None and _are_dated(own) else "they have no times"
+            )
+            raise InputError(
+                f"cannot be paired with the photos, as {what}; remove it, or use --any-telemetry to go on "
+                "without it",
+                path=path.name,
+            )
+        known = np.isfinite(own.utc_s)
+        clock = ImageClock(
+            own.time_s[known],
+            float(own.utc_s[known][0] - own.time_s[known][0]),
+            own.utc_is_local,
+            "the photos",
+            accept,
+            offset_s,
+        )
+        return check_overlap(on_image_clock(log, clock, path.name), clock, path.name)
     return own if own is not None and np.isfinite(own.gimbal_deg).any() else None
+
+
+def _are_dated(photos: Telemetry) -> bool:
+    """Return whether the times of photos are those of their clock, not only their numbers."""
+    known = np.isfinite(photos.utc_s)
+    zero_s = photos.utc_s[known] - photos.time_s[known]
+    return bool(known.any() and np.allclose(zero_s, zero_s[0], rtol=0, atol=1e-3))
 
 
 def unread_tracks(source: Source) -> list[str]:

@@ -171,6 +171,7 @@ def choose_frames(
     *,
     extend: Area | None = None,
     overwrite: bool = False,
+    time_offset_s: Mapping[str, float] | None = None,
     on_telemetry: Callable[[str, TelemetrySummary | None], None] = lambda *_: None,
 ) -> StageRecord:
     """Select frames of the sources and write them as images.
@@ -185,6 +186,8 @@ def choose_frames(
         Area whose frames are kept and come first.
     overwrite : bool
         Whether frames of other sources or options may be replaced.
+    time_offset_s : mapping of str to float, optional
+        Added to the times of the telemetry, by sequence ("*" for all). The stored tracks are without it.
     on_telemetry : callable
         Called with the name of each sequence and the summary of its telemetry, as soon as it is read.
 
@@ -203,7 +206,8 @@ def choose_frames(
     inputs = fingerprints(found.sources, masks)
     if extend is not None:
         inputs = {**extend.record(FRAMES).inputs, **inputs}
-    _check_sources(found.sources, masks, options)
+    offsets_s = {s.sequence: _offset(time_offset_s, s.sequence) for s in found.sources}
+    _check_sources(found.sources, masks, options, offsets_s)
     # Masks and cameras are identified by their content, not by their path.
     given = {name: read_camera(Path(path)) for name, path in options.camera_files.items()}
     made_with = asdict(replace(options, mask=None, camera_files={}))
@@ -220,13 +224,18 @@ def choose_frames(
     if extend is not None:
         parts, cameras = _reuse_frames(extend, work.path)
     candidates, tracks, notes = _measure(
-        found, work.path / ".analysis", options, progress, stopwatch, on_telemetry
+        found, work.path / ".analysis", options, progress, stopwatch, on_telemetry, offsets_s
     )
-    choices = _choose(candidates, tracks, options.selection)
+    shifted = [
+        _shifted(track, s, offsets_s) for track, s in zip(tracks, found.sources, strict=True)
+    ]
+    choices = _choose(candidates, shifted, options.selection)
     done_before = 0
     total = sum(int(choice.chosen.sum()) for choice in choices)
-    for one, track, choice in zip(candidates, tracks, choices, strict=True):
-        frames = _frames_with_telemetry(one, track, choice, work.path / TELEMETRY)
+    for one, track, stored, choice in zip(candidates, shifted, tracks, choices, strict=True):
+        frames = _frames_with_telemetry(one, track, choice)
+        if stored is not None:
+            write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", stored)
         cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
             write_mask(masks[one.source.sequence], frames, work.path / MASKS)
@@ -253,12 +262,15 @@ def choose_frames(
 
 
 def _check_sources(
-    sources: tuple[Source, ...], masks: Mapping[str, Path], options: FramesOptions
+    sources: tuple[Source, ...],
+    masks: Mapping[str, Path],
+    options: FramesOptions,
+    offsets_s: Mapping[str, float | None],
 ) -> None:
     """Raise InputError if telemetry or masks do not fit, before hours are spent on the videos."""
     for source in sources:
         if not options.any_telemetry:
-            check_telemetry(source)
+            check_telemetry(source, time_offset_s=offsets_s[source.sequence])
         if source.sequence in masks:
             check_mask(masks[source.sequence], source)
 
@@ -270,6 +282,7 @@ def _measure(
     progress: Progress,
     stopwatch: Stopwatch,
     on_telemetry: Callable[[str, TelemetrySummary | None], None],
+    offsets_s: Mapping[str, float | None],
 ) -> tuple[list[Candidates], list[Telemetry | None], list[str]]:
     """Measure the candidate frames of each source and read its telemetry; return both with notes."""
     candidates: list[Candidates] = []
@@ -278,7 +291,10 @@ def _measure(
     for source in found.sources:
         with stopwatch.step("analysis"):
             measured = _analyse(source, cache, found.cost, progress)
-        track = source_telemetry(source, measured, any_telemetry=options.any_telemetry)
+        offset_s = offsets_s[source.sequence]
+        track = source_telemetry(
+            source, measured, any_telemetry=options.any_telemetry, time_offset_s=offset_s
+        )
         check_usable(measured.measured, options.selection, source.parts[0].name)
         on_telemetry(source.sequence, None if track is None else summarize(track))
         notes += measured.notes
@@ -289,16 +305,28 @@ def _measure(
     return candidates, tracks, notes
 
 
+def _offset(time_offset_s: Mapping[str, float] | None, sequence: str) -> float | None:
+    """Return the time offset that the user gave for a sequence, or for all."""
+    given = time_offset_s or {}
+    return given.get(sequence, given.get("*"))
+
+
+def _shifted(
+    track: Telemetry | None, source: Source, offsets_s: Mapping[str, float | None]
+) -> Telemetry | None:
+    """Return telemetry with the user's time offset; the tags of a photo are its own and have none."""
+    if track is None or track.kind == "exif":
+        return track
+    return track.shifted(offsets_s[source.sequence] or 0.0)
+
+
 def _frames_with_telemetry(
-    candidates: Candidates, track: Telemetry | None, choice: FrameChoice, folder: Path
+    candidates: Candidates, track: Telemetry | None, choice: FrameChoice
 ) -> Frames:
-    """Build the frame table of a source; write its telemetry to a folder."""
+    """Build the frame table of a source."""
     zoom = None if track is None else track.at(candidates.measured.time_s).zoom
     frames = build_frames(candidates, choice, focal=zoom)
-    if track is None:
-        return frames
-    write_track(folder / f"{candidates.source.sequence}.csv", track)
-    return frames.with_telemetry(track.at(frames.time_s))
+    return frames if track is None else frames.with_telemetry(track.at(frames.time_s))
 
 
 def _counts(frames: Frames) -> dict[str, int]:

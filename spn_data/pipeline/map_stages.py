@@ -163,6 +163,7 @@ def _stages(
         watcher.progress,
         extend=extended,
         overwrite=overwrite,
+        time_offset_s=_geo_options(area, options).time_offset_s,
         on_telemetry=watcher.telemetry,
     )
     # Paths are relative to the folder that the area will finally have.

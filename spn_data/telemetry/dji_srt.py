@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.telemetry.placeholders import without_placeholders
+from spn_data.telemetry.srt_positions import positions
 from spn_data.telemetry.srt_record import NAN, SrtRecord, parse_record
 from spn_data.telemetry.textfile import MAX_RECORDS, read_text
 from spn_data.telemetry.track import Telemetry, coordinate_step_m
@@ -67,7 +69,7 @@ def telemetry_from_records(
         )
     records, notes = _with_times(records, source)
     records, time_notes = _in_order(records, skipped, place)
-    lat_lon, position_notes = _positions(records, place)
+    lat_lon, position_notes = positions(records, place)
     time = np.array([r.time_s for r in records])
     utc = np.array([r.utc_s for r in records])
     abs_alt = np.array([r.abs_alt_m for r in records])
@@ -82,7 +84,7 @@ def telemetry_from_records(
     if skipped:
         line, why = min(skipped)
         notes.append(f"records left out: {len(skipped)}, the first at {place} {line}: {why}")
-    return Telemetry.from_columns(
+    track = Telemetry.from_columns(
         time,
         lat_lon_deg=lat_lon,
         rel_alt_m=np.array([r.rel_alt_m for r in records]),
@@ -95,6 +97,7 @@ def telemetry_from_records(
         source=source,
         notes=tuple(notes),
     )
+    return without_placeholders(track)
 
 
 def _records(text: str) -> Iterator[tuple[int, float, str]]:
@@ -176,36 +179,6 @@ def _increasing(times: Sequence[float]) -> tuple[list[bool], int | None]:
         keep.append(bool(time_s > last and not leap))
         last = time_s if keep[-1] else last
     return keep, None
-
-
-def _positions(records: list[SrtRecord], place: str) -> tuple[np.ndarray, list[str]]:
-    """Return (N, 2) latitude and longitude, NaN without a fix, and notes on how their order was decided."""
-    pairs = [p for r in records for p in (r.pair, r.home_pair) if p is not None]
-    # Latitudes are at most 90 degrees, so one larger value decides the order for the whole file.
-    votes = sum(abs(a) > 90 for a, _ in pairs) - sum(abs(b) > 90 for _, b in pairs)
-    height_third = any(r.height_third for r in records)
-    lon_first = votes > 0 if votes else not height_third
-    notes = []
-    if votes == 0 and any(r.pair is not None for r in records):
-        order = "longitude, latitude" if lon_first else "latitude, longitude"
-        third = "satellites" if lon_first else "a height"
-        notes.append(
-            f"GPS(a, b, c) could be in either order; it is read as {order}, the order of drones whose "
-            f"third value is {third}"
-        )
-    lat_lon = np.full((len(records), 2), np.nan)
-    impossible: list[str] = []
-    for i, record in enumerate(records):
-        lat, lon = record.lat_lon_deg or (NAN, NAN)
-        if record.pair is not None:
-            lat, lon = record.pair[::-1] if lon_first else record.pair
-        if abs(lat) > 90 or abs(lon) > 180:
-            impossible.append(f"{lat}, {lon} at {place} {record.line}")
-        elif lat != 0 or lon != 0:  # DJI writes 0, 0 if there is no fix
-            lat_lon[i] = (lat, lon) if np.isfinite(lat + lon) else NAN
-    if impossible:
-        notes.append(f"positions not on Earth: {len(impossible)}, the first is {impossible[0]}")
-    return lat_lon, notes
 
 
 def _rate_notes(time_s: np.ndarray, lat_lon: np.ndarray, utc_s: np.ndarray) -> list[str]:

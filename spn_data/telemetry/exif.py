@@ -7,7 +7,6 @@ import struct
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,13 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import NAN_SIGMA, Sigma, sigma_from_dop
 from spn_data.telemetry.photo_tags import NAN, exif_tags, number, positive, text, xmp_properties
+from spn_data.telemetry.photo_time import exposure_times, natural_order
+from spn_data.telemetry.placeholders import without_placeholders
 from spn_data.telemetry.track import Telemetry
 
 MAX_PHOTO_BYTES = 1_000_000_000
 
-_MAKE, _MODEL, _ORIENTATION, _DATE_TIME = 271, 272, 274, 306
-_DATE_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL, _SUB_SEC_ORIGINAL = 36867, 36881, 37521
+_MAKE, _MODEL, _ORIENTATION = 271, 272, 274
 _FOCAL_MM, _FOCAL_35MM, _LENS_MODEL = 37386, 41989, 42036
 _GPS_LAT, _GPS_LON, _GPS_ALT_REF, _GPS_ALT = 2, 4, 5, 6
 _GPS_MEASURE_MODE, _GPS_DOP, _GPS_H_ERROR = 10, 11, 31
@@ -54,6 +54,8 @@ class PhotoMetadata:
         (only if the photo states the zone).
     lat_deg, lon_deg : float
         WGS84 position.
+    position_without_letters : bool
+        Whether the EXIF has a position that does not say N or S, E or W, and nothing else states one.
     altitude_m : float
         EXIF altitude, or XMP's AbsoluteAltitude.
     altitude_reference : HeightReference
@@ -85,6 +87,7 @@ class PhotoMetadata:
     utc_s: float = NAN
     lat_deg: float = NAN
     lon_deg: float = NAN
+    position_without_letters: bool = False
     altitude_m: float = NAN
     altitude_reference: HeightReference = HeightReference.UNKNOWN
     altitude_type: str = ""
@@ -149,7 +152,9 @@ def read_photo(path: Path | str) -> PhotoMetadata:
     if damage:
         notes.append(f"damaged EXIF: {damage[0]}")
     orientation = number(main.get(_ORIENTATION))
-    local_s, utc_s = _times(main, exif, xmp)
+    local_s, utc_s = exposure_times(
+        main, exif, gps, utc_at_exposure=xmp.get(_DJI + "UTCAtExposure", "")
+    )
     lat, lon = _position(gps, xmp, notes)
     altitude, reference = _altitude(gps, xmp)
     gimbal = [number(xmp.get(_DJI + f"Gimbal{axis}Degree")) for axis in ("Yaw", "Pitch", "Roll")]
@@ -168,6 +173,7 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         utc_s=utc_s,
         lat_deg=lat,
         lon_deg=lon,
+        position_without_letters=math.isnan(lat) and _lacks_letters(gps),
         altitude_m=altitude,
         altitude_reference=reference,
         altitude_type=text(xmp.get(_DJI + "AltitudeType")),
@@ -209,6 +215,13 @@ def telemetry_from_photos(
         raise ValueError(f"{len(names)} names for {len(photos)} photos")
     damaged = [(name, p.notes[0]) for name, p in zip(names, photos, strict=True) if p.notes]
     notes = []
+    unsigned = [n for n, p in zip(names, photos, strict=True) if p.position_without_letters]
+    if unsigned:
+        notes.append(
+            f"photos whose position does not say N or S, E or W, and is left out: {len(unsigned)}, the first "
+            f"is {unsigned[0]}; write the letters, for example with exiftool -GPSLatitudeRef=N "
+            "-GPSLongitudeRef=E"
+        )
     if damaged:
         notes.append(
             f"photos with damaged metadata: {len(damaged)}, the first is {': '.join(damaged[0])}"
@@ -239,12 +252,16 @@ def telemetry_from_photos(
             f"the EXIF altitude goes down to {np.nanmin(altitude):.1f} m, below sea level: "
             "trust only its differences, if at all"
         )
+    ordered = sorted(names, key=natural_order)
+    if list(names) != ordered:
+        first = next(n for n, m in zip(names, ordered, strict=True) if n != m)
+        notes.append(f"photos are in the order of their times, not of their names, from {first} on")
     kinds = sorted({p.altitude_type for p in photos if p.altitude_type})
     if kinds and reference is HeightReference.UNKNOWN:
         notes.append(
             f"the altitudes are of type {', '.join(kinds)} (DJI), which states no height reference"
         )
-    return Telemetry.from_columns(
+    track = Telemetry.from_columns(
         time_s,
         lat_lon_deg=np.array([(p.lat_deg, p.lon_deg) for p in photos]).reshape(-1, 2),
         rel_alt_m=np.array([p.relative_altitude_m for p in photos]),
@@ -258,46 +275,14 @@ def telemetry_from_photos(
         source=source,
         notes=tuple(notes),
     )
-
-
-def _times(
-    main: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str]
-) -> tuple[float, float]:
-    """Return (local_s, utc_s), seconds since 1970."""
-    taken = text(exif.get(_DATE_TIME_ORIGINAL)) or text(main.get(_DATE_TIME))
-    local_s = _seconds(taken, "%Y:%m:%d %H:%M:%S")
-    fraction = text(exif.get(_SUB_SEC_ORIGINAL))
-    if fraction.isdecimal():
-        local_s += int(fraction) / 10 ** len(fraction)
-    offset = text(exif.get(_OFFSET_TIME_ORIGINAL))
-    utc_s = NAN
-    try:
-        zone = datetime.strptime(offset, "%z").utcoffset() if offset else None
-    except ValueError:
-        zone = None
-    if zone is not None:
-        utc_s = local_s - zone / timedelta(seconds=1)
-    exposure = xmp.get(_DJI + "UTCAtExposure", "")
-    if exposure:
-        whole, _, part = exposure.replace("T", " ").partition(".")
-        exposure_s = _seconds(whole, "%Y-%m-%d %H:%M:%S")
-        digits = part.rstrip("Z")
-        utc_s = exposure_s + (int(digits) / 10 ** len(digits) if digits.isdecimal() else 0.0)
-    return local_s, utc_s
-
-
-def _seconds(stamp: str, layout: str) -> float:
-    try:
-        return datetime.strptime(stamp, layout).replace(tzinfo=UTC).timestamp()
-    except ValueError:  # a camera whose clock was never set writes "0000:00:00 00:00:00"
-        return NAN
+    return without_placeholders(track)
 
 
 def _position(
     gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
 ) -> tuple[float, float]:
     """Return (latitude, longitude) from EXIF, which post-processing rewrites, or from XMP; NaN if unknown."""
-    lat, lon = _degrees(gps, _GPS_LAT, "S"), _degrees(gps, _GPS_LON, "W")
+    lat, lon = _degrees(gps, _GPS_LAT, "N", "S"), _degrees(gps, _GPS_LON, "E", "W")
     if math.isnan(lat + lon):
         lat = number(xmp.get(_DJI + "GpsLatitude"))
         lon = number(xmp.get(_DJI + "GpsLongitude", xmp.get(_DJI + "GpsLongtitude")))
@@ -310,17 +295,25 @@ def _position(
     return lat, lon
 
 
-def _degrees(gps: Mapping[int, Any], tag: int, negative: str) -> float:
+def _lacks_letters(gps: Mapping[int, Any]) -> bool:
+    """Return whether there are three numbers for latitude and longitude, but not the letters of both."""
+    numbers = (gps.get(_GPS_LAT), gps.get(_GPS_LON))
+    letters = (text(gps.get(_GPS_LAT - 1)).upper(), text(gps.get(_GPS_LON - 1)).upper())
+    full = all(isinstance(n, tuple) and len(n) == 3 and any(map(number, n)) for n in numbers)
+    return full and not (letters[0] in ("N", "S") and letters[1] in ("E", "W"))
+
+
+def _degrees(gps: Mapping[int, Any], tag: int, plus: str, minus: str) -> float:
     """Return signed degrees from (degrees, minutes, seconds) and the letter in the tag before it."""
     parts = gps.get(tag)
     letter = text(gps.get(tag - 1)).upper()
-    if not isinstance(parts, tuple) or len(parts) != 3 or letter not in ("N", "S", "E", "W"):
+    if not isinstance(parts, tuple) or len(parts) != 3 or letter not in (plus, minus):
         return NAN
     degrees, minutes, seconds = (number(part) for part in parts)
     if not (0 <= minutes <= 60 and 0 <= seconds <= 60):
         return NAN
     size = degrees + minutes / 60 + seconds / 3600
-    return -size if letter == negative else size
+    return -size if letter == minus else size
 
 
 def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float, HeightReference]:

@@ -5,18 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from spn_data.errors import InputError
+from spn_data.telemetry.ass_file import read_ass
 from spn_data.telemetry.csv_log import read_csv_log
 from spn_data.telemetry.dji_srt import read_dji_srt
 from spn_data.telemetry.gpx import read_gpx
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
 
-TELEMETRY_SUFFIXES = (".srt", ".gpx", ".csv", ".tsv", ".txt")
+TELEMETRY_SUFFIXES = (".srt", ".ass", ".gpx", ".csv", ".tsv", ".txt")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".m4v", ".ts", ".avi")
 
 
 def read_telemetry(path: Path | str) -> Telemetry:
-    """Read telemetry from a DJI .srt, a .gpx, a .csv (.tsv, .txt) or the subtitle track of a video.
+    """Read telemetry from an .srt, .ass, .gpx, .csv (.tsv, .txt) or the subtitle track of a video.
 
     Parameters
     ----------
@@ -43,12 +44,14 @@ def read_telemetry(path: Path | str) -> Telemetry:
     if suffix not in TELEMETRY_SUFFIXES:
         raise InputError(
             f"{suffix or 'a file without a suffix'} is not a telemetry format; supported are "
-            "DJI subtitles (.srt), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
+            "subtitles of drones (.srt, .ass), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
             f"videos with a subtitle track ({', '.join(VIDEO_SUFFIXES)})",
             path=path,
         )
     if suffix == ".gpx":
         return read_gpx(path)
+    if suffix == ".ass":
+        return read_ass(path)
     # Subtitles and GPX are often saved as .txt, and logs from the web with a wrong suffix.
     start = _head(path)
     if start.startswith("<") and "<gpx" in start:

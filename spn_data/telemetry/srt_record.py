@@ -21,6 +21,8 @@ _FIELD = re.compile(
 # Focal length in a model-specific unit, and digital zoom: only their changes are meaningful.
 _ZOOM = re.compile(r"(?<![\w.])(focal_len|dzoom_ratio|dzoom)\s*[:(]\s*([\d.]+)", re.IGNORECASE)
 _HEIGHT = re.compile(r"(?<![\w.])H\s?[ =:]\s?([-+]?[\d.]+)\s?m(?![\w/])")
+_RELATIVE_HEIGHT = re.compile(r"(?<![\w.])ReH\s?[ =:(]\s?([^\s,;()<>\]]+)")  # Autel
+_DISTANCE = re.compile(r"(?<![\w.])D\s?[ =:]\s?([\d.]+)\s?m(?![\w/])")  # from HOME
 _POSITION = re.compile(r"(?<![\w.])(GPS|RTK|HOME)\s*\(([^()]{0,120})\)", re.IGNORECASE)
 _GIMBAL = re.compile(r"(?<![\w.])G\.PRY\s*\(([^()]{0,120})\)", re.IGNORECASE)
 # U+FFFD is a degree sign that was not written as UTF-8.
@@ -40,6 +42,8 @@ class SrtRecord:
     lat_lon_deg: tuple[float, float] | None  # if keys or letters name them
     pair: tuple[float, float] | None  # of GPS(a, b, c); only the whole file decides the order
     home_pair: tuple[float, float] | None  # of HOME(a, b), in the same order
+    home_m: float  # horizontal distance from HOME, as the drone states it
+    is_rtk: bool  # the position is RTK(a, b, c)
     height_third: bool  # GPS(a, b, 0.0M): c is a height, not a number of satellites
     rel_alt_m: float
     abs_alt_m: float
@@ -59,8 +63,10 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
     calls = {name.upper(): arguments for name, arguments in reversed(_POSITION.findall(text))}
     fix = calls.get("RTK", calls.get("GPS"))
     height = _HEIGHT.search(text)
+    relative = _RELATIVE_HEIGHT.search(text)
+    distance = _DISTANCE.search(text)
     gimbal = _GIMBAL.search(text)
-    if not (values or fix or height or gimbal):
+    if not (values or fix or height or relative or gimbal):
         return None
     zooms = _ZOOM.findall(text)
     lat_lon, pair, height_third = None, None, False
@@ -70,8 +76,10 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
         lat_lon, pair = _coordinates("GPS", fix)
         # Satellite counts are integers; a third value with a unit or decimals is a height.
         height_third = bool(re.search(r",[^,]*,[^,]*(?:\.\d|[mM]\s*$)", fix))
-    home_pair = _coordinates("HOME", calls["HOME"])[1] if "HOME" in calls else None
+    home_pair = _home(calls)
     rel_alt = values.get("rel_alt", values.get("barometer", NAN))
+    if relative and math.isnan(rel_alt):
+        rel_alt = _number(relative[1], "ReH")
     if height and math.isnan(rel_alt):
         rel_alt = _number(height[1], "H")
     angles = (values.get("gb_yaw", NAN), values.get("gb_pitch", NAN), values.get("gb_roll", NAN))
@@ -88,6 +96,8 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
         lat_lon_deg=lat_lon,
         pair=pair,
         home_pair=home_pair,
+        home_m=_number(distance[1], "D") if distance else NAN,
+        is_rtk="RTK" in calls,
         height_third=height_third,
         rel_alt_m=rel_alt,
         abs_alt_m=values.get("abs_alt", values.get("altitude", NAN)),
@@ -95,6 +105,14 @@ def parse_record(line: int, time_s: float, body: str) -> SrtRecord | None:
         gimbal_deg=(angles[0] % 360.0, angles[1], angles[2]),
         zoom=math.prod(_number(m[1], m[0]) for m in zooms) if zooms else NAN,
     )
+
+
+def _home(calls: dict[str, str]) -> tuple[float, float] | None:
+    """Return the two numbers of HOME; None if letters name them, or it is damaged: no position needs it."""
+    try:
+        return _coordinates("HOME", calls["HOME"])[1]
+    except (KeyError, ValueError):
+        return None
 
 
 def _coordinates(
@@ -107,8 +125,16 @@ def _coordinates(
     letters = [_LETTER.fullmatch(token) for token in tokens[:2]]
     if letters[0] and letters[1]:  # "E: 120.0, N: 20.0"
         values = {m[1].upper(): _number(m[2], name) for m in letters if m}
-        latitude = values["N"] if "N" in values else -values.get("S", NAN)
-        longitude = values["E"] if "E" in values else -values.get("W", NAN)
+        if len(values.keys() & {"N", "S"}) != 1 or len(values.keys() & {"E", "W"}) != 1:
+            raise ValueError(f"{name}({arguments}) is not one latitude and one longitude")
+        for letter, value in values.items():
+            if letter in "NE" and value < 0:
+                raise ValueError(
+                    f"{name}({arguments}): the letter {letter} and the minus sign contradict each other"
+                )
+        # With S and W some drones write the minus as well: letter and sign say the same.
+        latitude = values["N"] if "N" in values else -abs(values["S"])
+        longitude = values["E"] if "E" in values else -abs(values["W"])
         return (latitude, longitude), None
     pair = (_number(tokens[0], name), _number(tokens[1], name))
     if abs(pair[0]) > 180 or abs(pair[1]) > 180:

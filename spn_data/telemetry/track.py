@@ -10,6 +10,10 @@ import numpy as np
 
 from spn_data.geometry.geodesy import METRES_PER_DEGREE, HeightReference
 
+_SHORTEST_GAP_S, _LONGEST_GAP_S = 2.5, 30.0
+_USUAL_STEPS = 2.5  # a gap is longer than this many usual intervals
+_ACCELERATION_M_S2 = 0.5  # of a drone on average (1 sigma) between two fixes
+
 
 @dataclass(frozen=True, eq=False)
 class Telemetry:
@@ -137,14 +141,45 @@ class Telemetry:
         """Return the same records with `offset_s` added to their times."""
         return replace(self, time_s=self.time_s + offset_s)
 
-    def at(self, time_s: np.ndarray, *, max_gap_s: float = 2.5) -> Telemetry:
+    @property
+    def max_gap_s(self) -> float:
+        """Longest interval between fixes that is no gap: 2.5 usual ones, from 2.5 s to 30 s.
+
+        Within it, positions are interpolated. Between photos, which have a fix each or none, there is no
+        upper limit.
+        """
+        steps_s = np.diff(self.time_s[self.has_fix])
+        usual_s = _USUAL_STEPS * float(np.median(steps_s)) if len(steps_s) else 0.0
+        if self.kind != "exif":
+            usual_s = min(usual_s, _LONGEST_GAP_S)
+        return max(_SHORTEST_GAP_S, usual_s)
+
+    def interpolation_sigma_m(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the standard deviation (M,) of positions interpolated at times (M,), besides the fixes' own.
+
+        In an interval of T seconds with an unknown constant acceleration a, a straight line is off by up to
+        a t (T - t) / 2. It is zero in intervals of up to 2.5 s, where the error of the fixes prevails.
+        """
+        time_s = np.asarray(time_s, dtype=np.float64)
+        fixed_s = self.time_s[self.has_fix]
+        if len(fixed_s) < 2:
+            return np.zeros(len(time_s))
+        right = np.clip(np.searchsorted(fixed_s, time_s), 1, len(fixed_s) - 1)
+        before_s = np.clip(time_s - fixed_s[right - 1], 0.0, None)
+        after_s = np.clip(fixed_s[right] - time_s, 0.0, None)
+        wide = fixed_s[right] - fixed_s[right - 1] > _SHORTEST_GAP_S
+        return np.where(wide, 0.5 * _ACCELERATION_M_S2 * before_s * after_s, 0.0)
+
+    def at(self, time_s: np.ndarray, *, max_gap_s: float | None = None) -> Telemetry:
         """Interpolate to times (M,): linearly in position, along the shorter arc in angle.
 
         Each column is interpolated between its own neighbouring known values. It is NaN if these are further
-        apart than `max_gap_s`, or if the time is outside them by more than half the median interval. A source
-        with one record per second, whose value holds for the whole second, is thus used at its time stamp.
+        apart than `max_gap_s` (default `Telemetry.max_gap_s`), or if the time is outside them by more than
+        half the median interval. A source with one record per second, whose value holds for the whole second,
+        is thus used at its time stamp. A stated sigma grows by `interpolation_sigma_m`.
         """
         time_s = np.asarray(time_s, dtype=np.float64)
+        max_gap_s = self.max_gap_s if max_gap_s is None else max_gap_s
         tables: dict[str, Any] = {
             name: _interpolate(self.time_s, getattr(self, name), time_s, max_gap_s)
             for name in _COLUMNS
@@ -157,6 +192,8 @@ class Telemetry:
         lat_lon[:, 1:] = _unwrapped(lat_lon[:, 1:])
         lat_lon = _interpolate(self.time_s, lat_lon, time_s, max_gap_s)
         lat_lon[:, 1] = _signed(lat_lon[:, 1])
+        more_m = self.interpolation_sigma_m(time_s)[:, None]
+        tables["sigma_m"] = np.hypot(tables["sigma_m"], more_m)
         return replace(self, time_s=time_s, gimbal_deg=gimbal, lat_lon_deg=lat_lon, **tables)
 
 
@@ -274,15 +311,13 @@ class TelemetrySummary:
     notes: tuple[str, ...]
 
 
-def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySummary:
+def summarize(telemetry: Telemetry) -> TelemetrySummary:
     """Summarize counts, rate and gaps of a source.
 
     Parameters
     ----------
     telemetry : Telemetry
-        The source.
-    max_gap_s : float
-        A gap is longer than this and than 2.5 median intervals, as photos are seconds apart.
+        The source. A gap is longer than its `max_gap_s`: there is no position in it.
 
     Returns
     -------
@@ -294,10 +329,9 @@ def summarize(telemetry: Telemetry, *, max_gap_s: float = 2.5) -> TelemetrySumma
     rate = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else float("nan")
     # The first and last records bound the gaps before the first fix and after the last.
     bounded_s = np.concatenate([telemetry.time_s[:1], fixed_s, telemetry.time_s[-1:]])
-    usual_s = 2.5 * float(np.median(steps)) if len(steps) else 0.0
     gaps = tuple(
         (float(bounded_s[i]), float(bounded_s[i + 1]))
-        for i in np.flatnonzero(np.diff(bounded_s) > max(max_gap_s, usual_s))
+        for i in np.flatnonzero(np.diff(bounded_s) > telemetry.max_gap_s)
     )
     duration = float(telemetry.time_s[-1] - telemetry.time_s[0]) if len(telemetry) else 0.0
     return TelemetrySummary(

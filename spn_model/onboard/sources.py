@@ -12,6 +12,10 @@ import numpy as np
 from spn_data.errors import InputError
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_DEEP = (".png", ".tif", ".tiff")
+_MIN_RANGE_16 = (
+    64 * 256
+)  # of 16-bit values: a quarter of the grey levels, as in `spn_data.capture.photos`
 _MAX_IMAGE_BYTES = 500_000_000
 
 
@@ -57,7 +61,23 @@ def read_image(path: Path) -> np.ndarray:
         raise InputError(f"cannot be read as an image ({error.err})", path=path) from error
     if image is None:
         raise InputError("cannot be read as an image", path=path)
+    if path.suffix.lower() in _DEEP:
+        _check_depth(path)
     return image
+
+
+def _check_depth(path: Path) -> None:
+    """Refuse 16-bit images of which few grey levels are left: the network has seen none like them."""
+    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+    if values is None or values.dtype != np.uint16:
+        return
+    low, high = np.percentile(values[::4, ::4], (0.1, 99.9))
+    if 0 < high - low < _MIN_RANGE_16:
+        raise InputError(
+            f"uses only values {low:.0f} to {high:.0f} of 16 bits: convert all images of the camera to 8 "
+            "bits with the same range",
+            path=path,
+        )
 
 
 def _check_file(path: Path) -> None:

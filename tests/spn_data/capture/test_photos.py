@@ -6,6 +6,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -88,6 +89,28 @@ def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
         decode_photo(tmp_path / "thermal.tif")
 
 
+def few_values(path: Path, *, channels: int = 1, high: int = 4095) -> Path:
+    """Write a 16-bit image that uses the values from 0 to `high`."""
+    values = np.linspace(0, high, 64 * 48 * channels).astype(np.uint16)
+    shape = (48, 64, channels) if channels > 1 else (48, 64)
+    assert cv2.imwrite(str(path), values.reshape(shape))
+    return path
+
+
+@pytest.mark.parametrize("name", ["band.png", "band.tif"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_few_of_16_bits_are_refused(tmp_path: Path, name: str, channels: int) -> None:
+    """12 bits in 16 would be few grey levels: the message gives the range used, for photos and previews."""
+    path = few_values(tmp_path / name, channels=channels)
+    for decoder in (decode_photo, lambda p: decode_photo_gray(p, max_width=100)):
+        with pytest.raises(
+            InputError, match=r"uses only values \d+ to 3\d\d\d of 16 bits, of which 15"
+        ):
+            decoder(path)
+    whole = few_values(tmp_path / f"whole-{name}", channels=channels, high=65535)
+    assert decode_photo(whole).max() == 255
+
+
 def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
     """A PNG whose header claims 40,000 x 40,000 pixels is refused."""
     path = tmp_path / "bomb.png"
@@ -137,3 +160,11 @@ def test_a_black_mask_is_refused(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((90, 160), np.uint8)).save(tmp_path / "mask.png")
     with pytest.raises(InputError, match="entirely black; usable pixels must be white"):
         load_mask(tmp_path / "mask.png", 160, 90)
+
+
+def test_thermal_and_12_bit_photos_are_refused(shared_cases: Path) -> None:
+    """Photos of which 3 to 16 grey levels would be left are refused with the range that they use."""
+    folder = shared_cases / "input" / "12-sixteen-bits-few-used"
+    for name in ("gray12in16.png", "thermal14.tif"):
+        with pytest.raises(InputError, match=r"uses only values"):
+            decode_photo(folder / name)

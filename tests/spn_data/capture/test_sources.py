@@ -10,6 +10,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
@@ -202,3 +203,22 @@ def test_the_real_data_is_found(shared_data: Path) -> None:
     [photos] = discover(shared_data / "photos-two-passes").sources
     assert (photos.kind, len(photos.parts)) == (SourceKind.PHOTOS, 172)
     assert names_of(photos) == sorted(names_of(photos))
+
+
+def test_photos_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    """Stills without times are counted 1, 2, ..., 10, and a copy follows its original."""
+    for name in ("frame10.png", "frame2.png", "frame1 (1).png", "frame1.png"):
+        Image.new("L", (8, 8)).save(tmp_path / name)
+    (source,) = discover(tmp_path).sources
+    assert names_of(source) == ["frame1.png", "frame1 (1).png", "frame2.png", "frame10.png"]
+
+
+def test_photos_are_in_the_order_of_their_times(tmp_path: Path) -> None:
+    """EXIF times come before names: counters of cameras start again."""
+    for second, name in enumerate(("DJI_0999.jpg", "DJI_0001.jpg", "DJI_0002.jpg")):
+        exif = Image.Exif()
+        exif[306] = f"2026:05:01 12:00:0{second}"
+        Image.new("L", (8, 8)).save(tmp_path / name, exif=exif)
+    (tmp_path / "DJI_0003.jpg").write_bytes(b"no photo")
+    (source,) = discover(tmp_path).sources
+    assert names_of(source) == ["DJI_0999.jpg", "DJI_0001.jpg", "DJI_0002.jpg", "DJI_0003.jpg"]

@@ -7,7 +7,7 @@ import pytest
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
-from spn_data.georegistration.observe import observe
+from spn_data.georegistration.observe import align_telemetry, observe
 from spn_data.telemetry.track import Telemetry
 
 ORIGIN = GeoOrigin(49.0, 8.4, 100.0, HeightReference.AMSL)
@@ -41,3 +41,11 @@ def test_absolute_heights_count_from_a_kept_origin() -> None:
     """Fixes at 122 m and 132 m lie 22 m and 32 m above an origin kept at 100 m."""
     options = GeoregisterOptions(origin=ORIGIN, heights=Heights.ABSOLUTE)
     assert up_m(options) == pytest.approx([22.0, 32.0], abs=1e-6)
+
+
+def test_a_default_sigma_grows_between_distant_fixes() -> None:
+    """Frames between fixes 5 s apart are less certain than those at a fix, if the source states nothing."""
+    time_s = np.arange(0.0, 21.0, 5.0)
+    flight = Telemetry.from_columns(time_s, lat_lon_deg=np.full((5, 2), 45.0), kind="gpx")
+    rows = align_telemetry({"a": flight}, ["a"] * 2, np.array([5.0, 7.5]))
+    np.testing.assert_allclose(rows.sigma_m[:, 0], [2.0, np.hypot(2.0, 1.5625)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import av
@@ -145,7 +146,7 @@ def test_csv_of_airdata(tmp_path):
     np.testing.assert_allclose(t.gimbal_deg[:, 1], [-90, -89, -88])
     np.testing.assert_allclose(t.utc_s, [UTC_S, UTC_S, UTC_S + 1])
     assert not t.utc_is_local
-    assert any("not of the video (Airdata)" in note for note in t.notes)
+    assert any("not of the video" in note for note in t.notes)
     assert any("isVideo column: 1, starting at 0.1 s" in note for note in t.notes)
 
 
@@ -162,6 +163,7 @@ def test_csv_of_airdata(tmp_path):
         ("time_ms", ("1000", "1500"), 1.5, NAN, False),
         ("time(us)", ("1000000", "1500000"), 1.5, NAN, False),
         ("t", ("1", "1.5"), 1.5, NAN, False),
+        ("timestamp_us", ("1000000", "1500000"), 1.5, NAN, False),
     ],
 )
 def test_csv_clocks(tmp_path, header, cells, time_s, utc_s, is_local):
@@ -365,7 +367,7 @@ def test_the_reader_is_chosen_by_name_and_content(tmp_path):
     [
         (
             "a.kml",
-            r"a.kml: .kml is not a telemetry format; supported are DJI subtitles \(.srt\), GPX",
+            r"a.kml: .kml is not a telemetry format; supported are subtitles of drones \(.srt, .ass\), GPX",
         ),
         ("a", "a: a file without a suffix is not a telemetry format"),
         ("a.csv", "a.csv: cannot be read: No such file"),
@@ -381,3 +383,114 @@ def test_a_video_without_track_is_refused(tmp_path):
     """A video given as telemetry but without a subtitle track is refused."""
     with pytest.raises(InputError, match="has no subtitle track"):
         read_telemetry(video(tmp_path / "a.mp4", [], None))
+
+
+PX4 = "timestamp,time_utc_usec,latitude_deg,longitude_deg,altitude_msl_m,eph,epv\n"
+
+
+def test_csv_of_px4(tmp_path):
+    """UTC comes from its own column, not from the microseconds since the start."""
+    rows = [
+        f"{112574307 + k},{1714564800000000 + k},48.2654,11.6712,500.0,0.9,1.4" for k in (0, 200000)
+    ]
+    t = read_csv_log(write(tmp_path, PX4 + "\n".join(rows)))
+    np.testing.assert_allclose(t.utc_s, [UTC_S, UTC_S + 0.2])
+    assert t.abs_reference is HeightReference.AMSL
+    np.testing.assert_allclose(t.abs_alt_m, 500.0)
+    np.testing.assert_allclose(t.sigma_m[0], (0.9, 0.9, 1.4))
+
+
+@pytest.mark.parametrize("start", [112574307, 1_200_000_000])  # 112 s, and 20 min after the start
+@pytest.mark.parametrize("name", ["timestamp", "time"])
+def test_microseconds_since_the_start_are_no_dates(tmp_path, start, name):
+    """Steps of 200,000 are no seconds, however large the numbers are; named with their unit they are read."""
+    text = f"{name},lat,lon\n" + "".join(f"{start + 200000 * k},48.2,11.6\n" for k in range(5))
+    with pytest.raises(InputError, match=r"time_us"):
+        read_csv_log(write(tmp_path, text))
+    t = read_csv_log(write(tmp_path, text.replace(name, "time_us", 1)))
+    assert t.time_s[-1] - t.time_s[0] == pytest.approx(0.8)
+    assert np.isnan(t.utc_s).all()
+
+
+def test_csv_in_integers(tmp_path):
+    """Integers of 1e-7 degrees are recognised, with heights in millimetres beside them."""
+    t = read_csv_log(
+        write(
+            tmp_path,
+            "time_s,lat,lon,alt\n0,482654000,116712000,66814\n1,482654100,116712000,66692\n",
+        )
+    )
+    np.testing.assert_allclose(t.lat_lon_deg[0], (48.2654, 11.6712))
+    np.testing.assert_allclose(t.abs_alt_m, [66.814, 66.692])
+    assert any("read as 1e-7 degrees" in note for note in t.notes)
+
+
+def test_of_equal_columns_the_one_that_parses_counts(tmp_path):
+    """A flight record's time as text before its time in seconds, and a flag in words, are no damage."""
+    text = (
+        "sep=,\nCUSTOM.updateTime [local],OSD.flyTime,OSD.flyTime [s],OSD.latitude,OSD.longitude,"
+        "OSD.height [ft],GIMBAL.pitch,GIMBAL.yaw,GIMBAL.yaw [360],CAMERA.isVideo\n"
+        "7:05:08.00 PM,0m 0.0s,0.0,48.2,11.6,65.6168,-60.0,-178.0,182.0,\n"
+        "7:05:08.10 PM,0m 0.1s,0.1,48.2,11.6,65.6168,-60.0,-178.0,182.0,True\n"
+    )
+    t = read_csv_log(write(tmp_path, text))
+    np.testing.assert_allclose(t.time_s, [0.0, 0.1])
+    np.testing.assert_allclose(t.rel_alt_m, 20.0, atol=1e-4)
+    np.testing.assert_allclose(t.gimbal_deg[0, :2], (182.0, -60.0))
+    assert any("isVideo column: 1, starting at 0.1 s" in note for note in t.notes)
+    assert any(
+        "updateTime [local] is left out: " in note and "(line 3)" in note for note in t.notes
+    )
+
+
+def test_an_optional_column_never_kills_a_log(tmp_path):
+    """A column of words is left out with a note, and so is a single damaged value."""
+    rows = [f"{k},48.2,11.6,broken,{'x' if k == 7 else k}.5" for k in range(10)]
+    t = read_csv_log(write(tmp_path, "time_s,lat,lon,hdop,rel_alt\n" + "\n".join(rows)))
+    assert len(t) == 10
+    assert np.flatnonzero(np.isnan(t.rel_alt_m)).tolist() == [7]
+    assert any(
+        "column hdop is left out: hdop is 'broken', not a number (line 2)" in n for n in t.notes
+    )
+    assert any("column rel_alt: 1, the first at line 9: rel_alt is 'x.5'" in n for n in t.notes)
+
+
+@pytest.mark.parametrize(
+    ("pitch", "pitch_deg"),
+    [(("-600", "-590"), -60.0), (("-60", "-59"), NAN), (("-60.5", "-59.0"), -60.5)],
+)
+def test_csv_of_litchi(tmp_path, pitch, pitch_deg):
+    """Tenths of degrees are recognised by their size, and integers that could be either are left out."""
+    text = "latitude,longitude,altitude(m),ascent(m),time(millisecond),isTakingVideo,gimbalPitch\n"
+    text += "".join(f"48.2,11.6,{20 + k}.0,{20 + k}.0,{100 * k},1,{pitch[k]}\n" for k in range(2))
+    t = read_csv_log(write(tmp_path, text))
+    np.testing.assert_allclose(t.gimbal_deg[0, 1], pitch_deg, equal_nan=True)
+    assert t.rel_alt_m.tolist() == [20.0, 21.0]
+    assert np.isnan(t.abs_alt_m).all()  # Litchi's altitude is above take-off as well
+    assert any("could be degrees or tenths" in note for note in t.notes) == math.isnan(pitch_deg)
+
+
+def test_csv_of_flytrex(tmp_path):
+    """Ascent is the height above take-off, altitude another one."""
+    text = "latitude,longitude,altitude(feet),ascent(feet),time(millisecond),datetime(utc)\n"
+    text += "48.2,11.6,1640.42,65.617,334100.0,2016-07-23 22:50:10.000000\n"
+    t = read_csv_log(write(tmp_path, text))
+    np.testing.assert_allclose((t.rel_alt_m[0], t.abs_alt_m[0]), (20.0, 500.0), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "duration_s"),
+    [
+        ("07-px4-csv/flight.csv", 13.8),
+        ("07-px4-csv/real_sample_log_small.csv", 6.2),
+        ("08-flightreader-csv/flight.csv", 13.9),
+        ("08-flightreader-csv/txtlog.csv", 13.9),
+        ("09-flytrex-litchi-csv/flytrex.csv", 13.8),
+        ("09-flytrex-litchi-csv/litchi.csv", 13.9),
+    ],
+)
+def test_logs_of_other_programs(shared_cases, name, duration_s):
+    """Exports of other programs that once failed or were misread are read in place and duration."""
+    t = read_csv_log(shared_cases / "input" / name)
+    assert t.time_s[-1] - t.time_s[0] == pytest.approx(duration_s, abs=0.01)
+    np.testing.assert_allclose(t.lat_lon_deg[0], (48.2654, 11.6712), atol=1e-6)

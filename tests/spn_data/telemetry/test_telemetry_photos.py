@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -262,3 +263,56 @@ def test_a_large_photo_is_not_decoded(tmp_path):
     Image.new("1", (12_000, 10_000)).save(buffer, "PNG")
     (tmp_path / "a.png").write_bytes(buffer.getvalue()[:2000])
     assert read_photo(tmp_path / "a.png").width == 12_000
+
+
+def test_a_position_without_letters_is_said(tmp_path):
+    """Latitude and longitude without N/S and E/W are no position, and the note says what to write."""
+    unsigned = {k: v for k, v in GPS.items() if k % 2 == 0 or k > 4}
+    photo = read_photo(jpeg(tmp_path / "a.jpg", gps=unsigned))
+    assert np.isnan([photo.lat_deg, photo.lon_deg]).all()
+    note = telemetry_from_photos([photo]).notes[0]
+    assert note.startswith("photos whose position does not say N or S, E or W, and is left out: 1")
+    assert "exiftool -GPSLatitudeRef=N" in note
+    signed = telemetry_from_photos([read_photo(jpeg(tmp_path / "b.jpg", gps=GPS))])
+    assert not any("N or S" in other for other in signed.notes)
+
+
+@pytest.mark.parametrize(
+    ("zone_tag", "stamp", "fix", "utc"),
+    [
+        (piexif.ExifIFD.OffsetTime, "+02:00", None, 10),
+        (None, None, ("2026:05:01", (10, 0, 3)), 10),  # 3 s after the exposure on a clock at UTC+2
+        (None, None, ("2026:05:01", (9, 50, 0)), None),  # no zone is 2:10 from UTC
+        (None, None, ("2026:04:01", (10, 0, 0)), None),
+    ],
+)
+def test_the_zone_of_the_camera_clock(tmp_path, zone_tag, stamp, fix, utc):
+    """UTC is known from any of the offset tags, or from the time of the fix if it differs by a zone."""
+    exif = {piexif.ExifIFD.DateTimeOriginal: "2026:05:01 12:00:00"}
+    if zone_tag:
+        exif[zone_tag] = stamp
+    gps = {}
+    if fix:
+        gps = {
+            piexif.GPSIFD.GPSDateStamp: fix[0],
+            piexif.GPSIFD.GPSTimeStamp: [(n, 1) for n in fix[1]],
+        }
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif=exif, gps=gps))
+    expected = NAN if utc is None else datetime(2026, 5, 1, utc, tzinfo=UTC).timestamp()
+    np.testing.assert_equal(photo.utc_s, expected)
+
+
+def test_photos_in_another_order_than_their_names_are_said():
+    """Photos sorted by time keep their times, and a note names the first that its name puts elsewhere."""
+    photos = [photo("DJI_0999.JPG", local_s=10.0), photo("DJI_0001.JPG", local_s=12.0)]
+    t = telemetry_from_photos(photos)
+    assert t.time_s.tolist() == [0.0, 2.0]
+    assert any("not of their names, from DJI_0999.JPG on" in note for note in t.notes)
+
+
+def test_gimbal_angles_of_zero_in_all_photos_are_left_out():
+    """Photos of a camera that looks down, whose drone wrote zeros, have no gimbal angles."""
+    photos = [photo(f"{i}.jpg", local_s=float(i), gimbal_deg=(0.0, 0.0, 0.0)) for i in range(3)]
+    t = telemetry_from_photos(photos)
+    assert np.isnan(t.gimbal_deg).all()
+    assert any("all gimbal angles are exactly 0" in note for note in t.notes)

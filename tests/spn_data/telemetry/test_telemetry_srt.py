@@ -8,6 +8,7 @@ import pytest
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.dji_srt import parse_dji_srt, read_dji_srt
+from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.track import summarize
 
 NAN = np.nan
@@ -299,3 +300,110 @@ def test_a_hostile_file_takes_no_time():
         "[latitude: 5.5] [longitude: 8.0] " + "GPS(" * 200_000 + "<a" * 200_000 + "H " * 100_000
     )
     assert len(parse_dji_srt(text, source="x.srt")) == 1
+
+
+@pytest.mark.parametrize(
+    ("position", "lat_lon"),
+    [
+        ("GPS(W: -20.5, N: 48.25, -37)", (48.25, -20.5)),
+        ("GPS(W: 20.5, S: -48.25, -37)", (-48.25, -20.5)),
+        ("GPS(E: 20.5, S: 48.25, -37)", (-48.25, 20.5)),
+    ],
+)
+def test_a_letter_and_a_minus_say_the_same(position, lat_lon):
+    """West or south with a minus is still west or south."""
+    np.testing.assert_allclose(one(position).lat_lon_deg, [lat_lon])
+
+
+@pytest.mark.parametrize("position", ["GPS(E: -20.5, N: 48.25, 3)", "GPS(N: 20.5, N: 48.25, 3)"])
+def test_letters_that_contradict_are_refused(position):
+    """East with a minus, or two latitudes, is no position."""
+    with pytest.raises(InputError, match=r"contradict each other|not one latitude"):
+        one(position)
+
+
+def test_a_height_named_reh_is_above_take_off():
+    """Autel's ReH is the height above take-off."""
+    assert one("GPS(W: -20.5000, N: 48.2654, -37) ReH:20 ").rel_alt_m.tolist() == [20.0]
+
+
+def test_a_damaged_number_loses_its_record_only():
+    """A number like -20.-5000 loses its record; the others stay."""
+    body = "GPS(W: {}, N: 48.25, -37) ReH:20"
+    t = parse_dji_srt(
+        "".join(
+            record(body.format(n), f"00:00:0{i},000", i)
+            for i, n in enumerate(["-20.5", "-20.-5000", "-20.4"])
+        ),
+        source="x.srt",
+    )
+    assert t.lat_lon_deg[:, 1].tolist() == [-20.5, -20.4]
+    assert any("records left out: 1" in note and "-20.-5000" in note for note in t.notes)
+
+
+def test_a_position_far_from_home_is_left_out():
+    """A position that names its hemisphere and HOME in the same record must be in one place."""
+    t = one("HOME(20.5000, 48.2654)\nGPS(W: 20.5000, N: 48.2654, -37) ReH:20")
+    assert not t.has_fix.any()
+    assert any("HOME in the same record is in another place: 1" in note for note in t.notes)
+
+
+@pytest.mark.parametrize(
+    ("fix", "home", "distance_m", "lat_lon"),
+    [
+        # 0.001 degrees of longitude at 48 degrees north are 74.1 m, of latitude 111.2 m.
+        ("GPS(11.672200, 48.265401, 103.55)", "HOME(11.671200, 48.265401)", 74.0, (48.265401, 11.6722)),
+        ("GPS(48.265401, 11.672200, 17)", "HOME(48.265401, 11.671200)", 74.0, (48.265401, 11.6722)),
+        # Without a distance, RTK is the Phantom 4 RTK's and longitude first.
+        ("RTK(11.672200, 48.265401, 103.55)", "HOME(11.671200, 48.265401)", 0.0, (48.265401, 11.6722)),
+    ],
+)  # fmt: skip
+def test_home_and_its_distance_decide_the_order(fix, home, distance_m, lat_lon):
+    """Only one order of latitude and longitude gives the stated distance from HOME."""
+    t = one(f"F/6.3, SS 60, {fix}, {home}, D {distance_m:.2f}m, H 76.19m, H.S 7.40m/s")
+    np.testing.assert_allclose(t.lat_lon_deg, [lat_lon])
+    assert any("is read as" in note for note in t.notes)
+
+
+def test_zeros_in_all_records_are_no_measurement():
+    """Gimbal angles and heights that are exactly zero in all records are left out, each with a note."""
+    zero = "[latitude: 50.5] [longitude: 8.2{}] [rel_alt: {} abs_alt: 160.0] [gb_yaw: {}"
+    zero += " gb_pitch: 0.0 gb_roll: 0.0]"
+    rows = [record(zero.format(i, "0.000", "0.0"), f"00:00:0{i},000", i) for i in range(3)]
+    t = parse_dji_srt("".join(rows), source="x.srt")
+    assert np.isnan(t.gimbal_deg).all()
+    assert np.isnan(t.rel_alt_m).all()
+    assert np.isfinite(t.abs_alt_m).all()
+    assert sum("exactly 0 in all 3 records" in note for note in t.notes) == 2
+    rows[1] = record(zero.format(1, "0.100", "0.1"), "00:00:01,000", 1)
+    measured = parse_dji_srt("".join(rows), source="x.srt")
+    assert np.isfinite(measured.gimbal_deg).all()
+    assert measured.rel_alt_m.tolist() == [0.0, 0.1, 0.0]
+
+
+def test_the_wrong_side_of_the_earth(shared_cases):
+    """Files whose positions once came out east instead of west, or exchanged, are read right."""
+    west = read_dji_srt(shared_cases / "input" / "01-west-letter-and-minus" / "MAX_0001.srt")
+    np.testing.assert_allclose(west.lat_lon_deg[0], (48.2654, -20.5))
+    assert set(west.rel_alt_m.tolist()) == {20.0}
+    rtk = read_dji_srt(shared_cases / "input" / "13-rtk-third-is-a-height" / "DJI_0001.srt")
+    np.testing.assert_allclose(rtk.lat_lon_deg[0], (48.2654, 11.6712))
+
+
+def test_autel_writes_ass_beside_a_video(tmp_path):
+    """Dialogue lines of an .ass file are records on the video's clock; one without a time is left out."""
+    line = (
+        "Dialogue: 0,{},0:00:02.00,Default,,0,0,0,,GPS(W: -20.5, N: 48.25, -37)\\NReH:20 ISO:100\n"
+    )
+    head = "[Script Info]\n[V4+ Styles]\nFormat: Name\n[Events]\n"
+    head += "Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text\n"
+    path = tmp_path / "MAX_0001.ass"
+    path.write_text(head + line.format("0:00:00.50") + line.format("x") + line.format("0:01:01.00"))
+    t = read_telemetry(path)
+    assert t.time_s.tolist() == [0.5, 61.0]
+    np.testing.assert_allclose(t.lat_lon_deg, [(48.25, -20.5)] * 2)
+    assert t.rel_alt_m.tolist() == [20.0, 20.0]
+    assert any("records left out: 1, the first at line 7" in note for note in t.notes)
+    path.write_text(head)
+    with pytest.raises(InputError, match=r"MAX_0001.ass"):
+        read_telemetry(path)

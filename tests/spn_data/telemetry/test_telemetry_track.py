@@ -180,3 +180,21 @@ def test_increasing_sorts_and_keeps_the_first_of_equal_times():
     np.testing.assert_array_equal(index, [1, 0, 3])
     assert len(notes) == 2
     assert time_order(np.array([1.0, 2.0]))[1] == []
+
+
+def test_one_rule_of_gaps_for_summary_and_interpolation():
+    """A point each 5 s has no gap and is interpolated, with a sigma that grows towards the middle."""
+    t = track(np.arange(0, 51, 5.0), sigma_m=np.full((11, 3), 2.0))
+    assert summarize(t).gaps == ()
+    at = t.at(np.array([5.0, 6.0, 7.5]))
+    assert at.has_fix.all()
+    np.testing.assert_allclose(at.sigma_m[:, 0], np.hypot(2.0, [0.0, 1.0, 1.5625]))
+    with_hole = t.select(np.array([0, 1, 2, 3, 4, 8, 9, 10]))
+    assert summarize(with_hole).gaps == ((20.0, 40.0),)
+    assert not with_hole.at(np.array([30.0])).has_fix.any()
+
+
+def test_sigma_stays_at_usual_rates():
+    """Between records up to 2.5 s apart, sigma is that of the fixes."""
+    t = track([0.0, 1.0, 3.4], sigma_m=np.full((3, 3), 2.0))
+    np.testing.assert_allclose(t.at(np.array([0.5, 2.2])).sigma_m, 2.0)

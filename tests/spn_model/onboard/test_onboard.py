@@ -439,3 +439,13 @@ def test_benchmark_of_given_frames(bundle, flown, camera_file, tmp_path):
     assert broken.exit_code == 1
     assert "the onboard program failed" in broken.output
     assert "cannot be read as an image" in broken.output
+
+
+def test_images_with_few_of_16_bits_are_refused(tmp_path):
+    """An image of 12 bits in 16 would be nearly black for the network; one of 16 bits is read."""
+    values = np.linspace(0, 65535, 64 * 48).astype(np.uint16).reshape(48, 64)
+    cv2.imwrite(str(tmp_path / "whole.png"), values)
+    cv2.imwrite(str(tmp_path / "few.png"), values >> 4)
+    assert read_image(tmp_path / "whole.png").max() == 255
+    with pytest.raises(InputError, match=r"few.png: uses only values \d+ to 3\d\d\d of 16 bits"):
+        read_image(tmp_path / "few.png")
