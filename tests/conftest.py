@@ -19,6 +19,15 @@ def shared_data() -> Path:
     return SHARED_DATA
 
 
+@pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """Folder of inputs that once gave wrong results, which lies beside a checkout and is not part of it."""
+    folder = SHARED_DATA.parent / "cases"
+    if not folder.is_dir():
+        pytest.skip(f"cases are not at {folder}")
+    return folder
+
+
 @pytest.fixture(scope="module")
 def tiny_kind() -> Iterator[None]:
     """Recipes and checkpoints know the small network of `tests.worlds.training_world`."""

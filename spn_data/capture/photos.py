@@ -18,7 +18,7 @@ from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
 MAX_PHOTO_PIXELS = 500_000_000
 _MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
-_FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG includes MPO
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")  # JPEG includes MPO
 _ORIENTATION = 0x0112
 _DIAGONAL_35MM = 43.267
 _TURNS = {
@@ -100,13 +100,15 @@ def read_headers(paths: Sequence[Path]) -> PhotoHeaders:
     return PhotoHeaders(tuple(paths), tuple(metadata), tuple(problem))
 
 
-def decode_photo(path: Path) -> np.ndarray:
+def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
     """Decode a photo, upright by its EXIF orientation.
 
     Parameters
     ----------
     path : Path
-        A JPEG, PNG or TIFF.
+        A JPEG, PNG, TIFF, BMP or WebP.
+    upright : bool
+        False to leave the pixels as they are stored (not possible for a TIFF).
 
     Returns
     -------
@@ -119,7 +121,7 @@ def decode_photo(path: Path) -> np.ndarray:
         If the photo is damaged, too large or of a pixel format without a known range.
     """
     with _open_image(path) as image:
-        rgb = _to_8_bits(_upright(image), path).convert("RGB")
+        rgb = _to_8_bits(_upright(image) if upright else image, path).convert("RGB")
         return np.ascontiguousarray(np.asarray(rgb)[:, :, ::-1])
 
 
