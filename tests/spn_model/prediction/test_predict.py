@@ -397,7 +397,7 @@ def test_images_without_texture_get_no_pose(network, photos, tmp_path):
         Image.fromarray(image).save(photos / f"{stem}.png")
     done = predicted(network, photos, tmp_path / "poses")
     rows = read_csv(tmp_path / "poses" / "poses.csv", list(COLUMNS))
-    found = {row["source"]: (row["status"], row["reason"]) for row in rows}
+    found = {row["source"]: (row["status"], row["reason"]) for _, row in rows}
     assert found["000.png"] == (ESTIMATED, "")
     for stem, told in (("900", "nearly black"), ("901", "nearly white"), ("902", "fogged")):
         status, reason = found[f"{stem}.png"]
