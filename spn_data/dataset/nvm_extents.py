@@ -14,7 +14,7 @@ _MARGIN_PX = 1.0
 _OUTSIDE_SHARE, _OUTSIDE_COUNT = 0.02, 2
 # In images of the right size, measurements reach the border, if there are many of them.
 _MIN_FRAMES, _MIN_MEASURED = 5, 200
-_TOO_SMALL, _SUSPICIOUS = 0.6, 0.8
+_TOO_SMALL, _SUSPICIOUS = 0.7, 0.85
 _SAME_FOCAL, _OTHER_WIDTH = 0.05, 0.1
 
 
@@ -104,8 +104,8 @@ def shrunken_sizes(
     Returns
     -------
     refusal, note : str
-        One sentence each, or "". Measurements that reach less than 0.6 of the way to the border of the image,
-        or images of two sizes with the same focal length in pixels, are refused; less than 0.8 is noted.
+        One sentence each, or "". Measurements that reach less than 0.7 of the way to the border of the image,
+        or images of two sizes with the same focal length in pixels, are refused; less than 0.85 is noted.
     """
     note = ""
     reach: dict[tuple[int, int], tuple[float, float, int]] = {}

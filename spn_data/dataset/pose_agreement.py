@@ -121,8 +121,8 @@ def _other_world(listed: Poses, model: Poses) -> str:
     if same_poses(listed_from_model.apply_to_poses(model), listed).mean() < _EXPLAINED_SHARE:
         return ""
     return (
-        f"they are in different worlds (1 unit of the model is {listed_from_model.scale:.6g} of the list, "
-        "with other origin or axes)"
+        "the model is moved into the world of the list (1 unit of the model is "
+        f"{listed_from_model.scale:.6g} of the list, with other origin or axes)"
     )
 
 

@@ -187,7 +187,8 @@ def _check_resolution(centers: np.ndarray, path: Path) -> None:
         digits = -int(np.floor(np.log10(max(spread, 1.0))))
         offset = " ".join(f"{value:.0f}" for value in np.round(middle, digits))
         raise InputError(
-            f"the positions are far from zero (about {', '.join(f'{v:.0f}' for v in middle)}, as in UTM), so "
+            f"the positions are far from zero (about {', '.join(f'{v:.0f}' for v in middle)}, as in UTM or "
+            "Earth-centred coordinates), so "
             f"networks, which compute in float32, would round them to {step:.2g}; subtract an offset with "
             f"--subtract {offset}",
             path=path,

@@ -22,10 +22,12 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.nvm import build_nvm_model, read_nvm, read_nvm_models, write_nvm
 from spn_data.dataset.nvm_frames import camera_from_visualsfm, match_names
+from spn_data.dataset.pose_agreement import name_disagreement
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import (
     Poses,
+    Similarity,
     quats_from_rotations,
     rotations_from_angles,
     rotations_from_vectors,
@@ -385,6 +387,10 @@ def turned_about(axis: np.ndarray) -> Callable[[list[str]], list[str]]:
         (turned_about(np.array([np.pi, 0, 0])), "if the camera's axes are y up and z backward"),
         (turned_about(np.array([0, 0, -np.pi / 2])), "turned by 90 degrees about their optical"),
         (turned_about(np.array([0, 0, np.pi / 2])), "turned by 270 degrees about their optical"),
+        (
+            lambda cells: [cells[0], *(str(2 * float(v)) for v in cells[1:4]), *cells[4:]],
+            "no usual mistake of conventions explains that",  # on a line, the axes are unknown
+        ),
         (turned_about(np.array([0.2, 0, 0])), "no usual mistake of conventions explains that"),
     ],
 )
@@ -416,13 +422,15 @@ def textured(width: int, height: int, seed: int) -> np.ndarray:
 def resize_all(scene: Path, factor: float, names=NAMES) -> None:
     for name in names:
         image = cv2.imread(str(scene / name))
-        cv2.imwrite(str(scene / name), cv2.resize(image, None, fx=factor, fy=factor))
+        size = (round(factor * 160), round(factor * 90))
+        cv2.imwrite(str(scene / name), cv2.resize(image, size))
 
 
 @pytest.mark.parametrize(
     ("factor", "told"),
     [
         (0.5, "the image is 80x45, but the model's measurements in it span"),
+        (1.5, "other images of 240x135: the model's measurements reach only"),
         (2.0, "other images of 320x180: the model's measurements reach only"),
     ],
 )
@@ -653,3 +661,17 @@ def test_cases_from_outside_are_told(shared_cases, tmp_path, case, told):
     assert told in "\n".join(notes)
     if case == "base":
         assert len(notes) == 1
+
+
+def test_a_model_in_another_world_is_named():
+    """A scale, a turn and a shift of the whole model are told from a mistake of conventions."""
+    rng = np.random.default_rng(3)
+    rotations = rotations_from_vectors(rng.normal(0, 1, (12, 3)))
+    model = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
+    listed_from_model = Similarity(
+        2.5, rotations_from_vectors(np.array([[0.1, 0.2, 0.3]]))[0], np.array([7.0, 8, 9])
+    )
+    told = name_disagreement(listed_from_model.apply_to_poses(model), model)
+    assert "1 unit of the model is 2.5 of the list" in told
+    others = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
+    assert name_disagreement(others, model) == ""
