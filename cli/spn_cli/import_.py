@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console
+from spn_cli import console, options
 
 
 @click.command(name="import")
@@ -38,9 +38,23 @@ from spn_cli import console
     is_flag=True,
     help="Keep frames whose position is implausibly far from all others.",
 )
+@click.option(
+    "--subtract",
+    nargs=3,
+    type=options.Finite(-1e15, 1e15),
+    default=(0.0, 0.0, 0.0),
+    help="Offset X Y Z to subtract from all positions, such as those of UTM.  [default: none]",
+)
 @click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
 def import_(
-    folder: Path, target: Path, width_px: int, units: str, keep_outliers: bool, overwrite: bool
+    folder: Path,
+    target: Path,
+    *,
+    width_px: int,
+    units: str,
+    keep_outliers: bool,
+    subtract: tuple[float, float, float],
+    overwrite: bool,
 ) -> None:
     """Convert a folder in the format of Cambridge Landmarks to a data set.
 
@@ -53,9 +67,11 @@ def import_(
     """
     from spn_data.pipeline.import_cambridge import ImportOptions, import_cambridge
 
-    options = ImportOptions(width_px=width_px, units=units, keep_outliers=keep_outliers)
+    wanted = ImportOptions(
+        width_px=width_px, units=units, keep_outliers=keep_outliers, subtract=subtract
+    )
     with console.progress() as progress:
-        done = import_cambridge(folder, target, options, progress, overwrite=overwrite)
+        done = import_cambridge(folder, target, wanted, progress, overwrite=overwrite)
     for note in done.notes:
         console.note(note)
     frames = ", ".join(f"{name} {count}" for name, count in done.counts.items())

@@ -19,7 +19,7 @@ from spn_data.telemetry.exif import PhotoMetadata, read_photo
 MAX_PHOTO_PIXELS = 500_000_000
 _MIN_RANGE_16 = 64 * 256  # of 16-bit values: a quarter of the grey levels
 _MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
-_FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG includes MPO
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")  # JPEG includes MPO
 _ORIENTATION = 0x0112
 _DIAGONAL_35MM = 43.267
 _TURNS = {
@@ -101,13 +101,15 @@ def read_headers(paths: Sequence[Path]) -> PhotoHeaders:
     return PhotoHeaders(tuple(paths), tuple(metadata), tuple(problem))
 
 
-def decode_photo(path: Path) -> np.ndarray:
+def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
     """Decode a photo, upright by its EXIF orientation.
 
     Parameters
     ----------
     path : Path
-        A JPEG, PNG or TIFF.
+        A JPEG, PNG, TIFF, BMP or WebP.
+    upright : bool
+        False to leave the pixels as they are stored (not possible for a TIFF).
 
     Returns
     -------
@@ -122,7 +124,7 @@ def decode_photo(path: Path) -> np.ndarray:
     """
     with _open_image(path) as image:
         _check_deep_colour(image, path)
-        rgb = _to_8_bits(_upright(image), path).convert("RGB")
+        rgb = _to_8_bits(_upright(image) if upright else image, path).convert("RGB")
         return np.ascontiguousarray(np.asarray(rgb)[:, :, ::-1])
 
 

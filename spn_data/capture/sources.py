@@ -23,7 +23,7 @@ _logger = logging.getLogger(__name__)
 
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
-PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff"])
+PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"])
 SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
 TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv"}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])

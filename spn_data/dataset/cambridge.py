@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.dataset.nvm import has_image_suffix
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import canonical_quats
@@ -36,6 +37,8 @@ _FAR_TIMES = 20.0
 class CambridgeList:
     """Images and their poses, in the order of the file.
 
+    Names may contain spaces, if they end as names of images.
+
     Attributes
     ----------
     names : tuple of str
@@ -56,6 +59,11 @@ class CambridgeList:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def select(self, index: np.ndarray) -> CambridgeList:
+        """Return some of the images, by their rows."""
+        names = tuple(self.names[k] for k in index)
+        return CambridgeList(names, self.poses[index], self.quats_as_read[index], self.header)
 
 
 def read_cambridge(path: Path | str) -> CambridgeList:
@@ -253,31 +261,40 @@ def _rows(path: Path, lines: Iterator[tuple[int, str]]) -> dict[str, list[float]
 
 
 def _row(text: str) -> tuple[str, list[float]]:
-    cells = text.split()
-    if len(cells) != 8:
-        raise ValueError(f"{len(cells)} fields, expected 8: path x y z qw qx qy qz")
-    _check_name(cells[0])
-    for cell in cells[1:]:
+    cells = text.rsplit(None, 7)
+    if len(cells) != 8 or (len(cells[0].split()) > 1 and not has_image_suffix(cells[0])):
+        raise ValueError(f"{len(text.split())} fields, expected 8: path x y z qw qx qy qz")
+    _check_name(cells[0], spaces=True)
+    try:
+        return cells[0], _pose(cells[1:])
+    except ValueError as error:
+        raise ValueError(f"{cells[0]}: {error}") from error
+
+
+def _pose(cells: list[str]) -> list[float]:
+    for cell in cells:
         if not _NUMBER.fullmatch(cell):
             raise ValueError(f"{cell[:40]!r} is not a number")
-    values = [float(cell) for cell in cells[1:]]
+    values = [float(cell) for cell in cells]
     if not max(map(abs, values)) <= 1e15:
         raise ValueError("a number exceeds 1e15")
     length = float(np.linalg.norm(values[3:]))
+    if length == 0:
+        raise ValueError("the quaternion is zero, so the image has no pose: remove the line")
     if not abs(length - 1) <= _UNIT_AT_ALL:
         raise ValueError(
             f"the quaternion has length {length:.6g} instead of 1: check the order of the columns"
         )
-    return cells[0], values
+    return values
 
 
-def _check_name(name: str) -> None:
-    """Raise ValueError unless the name is a relative path that stays below the list's folder."""
+def _check_name(name: str, *, spaces: bool = False) -> None:
+    """Raise ValueError unless the name is a relative path below the list's folder."""
     parts = name.split("/")
     if (
         any(part in ("", ".", "..") for part in parts)
         or any(c in name for c in '\\:"<>|?*')
-        or any(c.isspace() or not c.isprintable() for c in name)
+        or any((c.isspace() and not (spaces and c == " ")) or not c.isprintable() for c in name)
         or len(name) > 1024
     ):
         raise ValueError(f"{name[:80]!r} is not a path below the list's folder")

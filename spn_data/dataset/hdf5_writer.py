@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -66,7 +66,7 @@ class DatasetWriter:
     def __init__(self, path: Path, info: DatasetInfo, groups: Mapping[str, Role]):
         self._path = path
         self._part = path.with_name(path.name + ".part")
-        self._info = info
+        self._info: DatasetInfo = info
         self._names: set[str] = set()
         for name in groups:
             if not _GROUP_NAME.fullmatch(name):
@@ -106,13 +106,18 @@ class DatasetWriter:
             self._groups[group].append(frame)
         except _SizeMismatch as error:
             raise InputError(
-                f"images of group {group} have sizes {error.before} and {error.now}: all images of a "
-                "group must have the same size",
+                f"{frame.name} is {error.now}, but the images before it in group {group} are "
+                f"{error.before}: all images of a group must have the same size",
                 path=self._path,
             ) from error
         if self._disk.error is not None:
             raise _unwritable(self._path, self._disk.error)
         self._names.add(frame.name)
+
+    def add_notes(self, notes: Sequence[str]) -> None:
+        """Append to the notes of the data set what was found while its images were read."""
+        self._info = replace(self._info, notes=(*self._info.notes, *notes))
+        _set_attribute(self._file, "notes", self._info.to_attributes()["notes"])
 
     def __enter__(self) -> DatasetWriter:
         return self

@@ -26,6 +26,8 @@ from spn_data.storage.files import atomic_writer
 MAX_IMAGES = 1_000_000
 MAX_POINTS = 100_000_000
 _MAX_LINE_BYTES = 64_000_000  # a point seen in a million images
+_UNIT_AT_ALL = 0.01
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,10 +181,32 @@ def _text(model: NvmModel) -> Iterator[str]:
 
 def read_nvm(path: Path | str) -> NvmModel:
     """Read the first model of a file; raise InputError, with the line number, if it is malformed."""
+    return read_nvm_models(path)[0]
+
+
+def read_nvm_models(path: Path | str) -> tuple[NvmModel, ...]:
+    """Read all models of a file.
+
+    Parameters
+    ----------
+    path : path-like
+        File of VisualSFM, which writes one model after the other, the largest first as a rule, and a last
+        one without points of the images that it could not register.
+
+    Returns
+    -------
+    tuple of NvmModel
+        At least one model; a later model without points is left out.
+
+    Raises
+    ------
+    InputError
+        With the line number, if the file is malformed.
+    """
     path = Path(path)
     lines = _Lines(path)
     try:
-        return _read(lines)
+        return tuple(_read_all(lines))
     except ValueError as error:
         raise InputError(str(error), path=path, line=lines.number) from error
     except OSError as error:
@@ -206,7 +230,7 @@ class _Lines:
         self._file.close()
 
     def next(self, what: str) -> str:
-        """Return the next line; ValueError at the end of the file, where `what` was expected."""
+        """Return the next line; at the end of the file "", or ValueError if `what` was expected."""
         while raw := self._file.readline(_MAX_LINE_BYTES + 1):
             self.number += 1
             if len(raw) > _MAX_LINE_BYTES:
@@ -217,28 +241,59 @@ class _Lines:
                 raise ValueError("the line is not UTF-8 text") from error
             if text:
                 return text
+        if not what:
+            return ""
         raise ValueError(f"the file ends where {what} is expected")
 
 
-def _read(lines: _Lines) -> NvmModel:
+def _read_all(lines: _Lines) -> Iterator[NvmModel]:
     head = lines.next("NVM_V3")
     # A fixed calibration may follow NVM_V3; it is ignored because each image has its own focal length.
     if head.split()[0] != "NVM_V3":
         raise ValueError(f"begins with {head[:40]!r}, not NVM_V3")
+    yield _read(lines, _count(lines.next("the number of images"), MAX_IMAGES), is_first=True)
+    # Models end with a zero, and after it stand the names of PLY files.
+    while (text := lines.next("")) and text[0] != "#" and (images := _count(text, MAX_IMAGES)):
+        model = _read(lines, images, is_first=False)
+        if len(model.xyz):
+            yield model
+
+
+def _read_camera(lines: _Lines) -> tuple[str, list[float]]:
+    """Read one image: its name, which may contain spaces, and ten numbers."""
+    text = lines.next("an image")
+    cells = text.rsplit(None, 10)
+    if len(cells) != 11 or (len(cells[0].split()) > 1 and not has_image_suffix(cells[0])):
+        raise ValueError(
+            f"{len(text.split())} fields, expected 11: name focal qw qx qy qz cx cy cz r 0"
+        )
+    try:
+        return cells[0], _numbers(cells[1:])
+    except ValueError as error:
+        raise ValueError(f"{cells[0][:80]}: {error}") from error
+
+
+def _read(lines: _Lines, images: int, *, is_first: bool) -> NvmModel:
     names: dict[str, None] = {}
     cameras = array("d")
-    for _ in range(_count(lines.next("the number of images"), MAX_IMAGES)):
-        cells = lines.next("an image").split()
-        if len(cells) != 11:
-            raise ValueError(
-                f"{len(cells)} fields, expected 11: name focal qw qx qy qz cx cy cz r 0"
-            )
-        if cells[0] in names:
-            raise ValueError(f"{cells[0][:80]!r} is listed twice")
-        names[cells[0]] = None
-        cameras.extend(_numbers(cells[1:]))
+    damaged: tuple[int, str] | None = None
+    for _ in range(images):
+        name, numbers = _read_camera(lines)
+        if name in names:
+            raise ValueError(f"{name[:80]!r} is listed twice")
+        length = math.sqrt(sum(value * value for value in numbers[1:5]))
+        if damaged is None and abs(length - 1) > _UNIT_AT_ALL:
+            damaged = (lines.number, f"{name[:80]}: {_bad_length(length)}")
+        names[name] = None
+        cameras.extend(numbers)
+    points = _count(lines.next("the number of points"), MAX_POINTS)
+    if damaged is not None and (
+        points or is_first
+    ):  # images that were not registered may have any pose
+        lines.number = damaged[0]
+        raise ValueError(damaged[1])
     xyz, colors, owners, offsets = array("d"), array("B"), array("q"), array("d")
-    for point in range(_count(lines.next("the number of points"), MAX_POINTS)):
+    for point in range(points):
         cells = lines.next("a point").split()
         count = _count(cells[6], MAX_IMAGES) if len(cells) > 6 else -1
         if len(cells) != 7 + 4 * count:
@@ -253,13 +308,16 @@ def _read(lines: _Lines) -> NvmModel:
                 raise ValueError(f"image {image} is out of range, there are {len(names)} images")
             owners.extend((point, image, _count(cells[k + 1], 2**62)))
             offsets.extend(_numbers(cells[k + 2 : k + 4]))
-    numbers = np.array(cameras).reshape(-1, 10)
+    table = np.array(cameras).reshape(-1, 10)
+    quats = table[:, 1:5].copy()
+    if not (points or is_first):
+        quats[:] = (1, 0, 0, 0)  # of a model that is left out
     index = np.array(owners, dtype=np.int64).reshape(-1, 3)
     return NvmModel(
         tuple(names),
-        numbers[:, 0],
-        numbers[:, 8],
-        Poses(numbers[:, 5:8], canonical_quats(numbers[:, 1:5])),
+        table[:, 0],
+        table[:, 8],
+        Poses(table[:, 5:8], canonical_quats(quats)),
         np.array(xyz).reshape(-1, 3),
         np.array(colors, dtype=np.uint8).reshape(-1, 3),
         index[:, 0],
@@ -267,6 +325,17 @@ def _read(lines: _Lines) -> NvmModel:
         index[:, 2],
         np.array(offsets).reshape(-1, 2),
     )
+
+
+def has_image_suffix(name: str) -> bool:
+    """Return whether a name ends as that of an image, so that spaces in it can be told from other fields."""
+    return name.lower().endswith(_IMAGE_SUFFIXES)
+
+
+def _bad_length(length: float) -> str:
+    if length == 0:
+        return "its quaternion is zero, so it has no pose: remove the image from the model"
+    return f"the quaternion has length {length:.6g} instead of 1: check the order of the columns"
 
 
 def _count(cell: str, most: int) -> int:

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
 import numpy as np
 
 from spn_data.dataset.nvm import NvmModel
+from spn_data.dataset.pose_agreement import same_poses
 from spn_data.errors import GeometryError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.pose import Poses
 
 _RADII = 400
 _MAX_ERROR_PX = 0.1
-# If poses of list and model differ by more, they refer to different worlds, or to different versions of one.
-_SAME_POSITION_SHARE = 1e-3  # of the frames' median distance from their middle
-_SAME_ROTATION_DEG = 0.1
 
 
 class NvmFrames:
     """Lookup of N listed frames in an NVM model.
 
     Images are matched by name, or by path without suffix, because suffixes differ between lists and models of
-    Cambridge Landmarks. Points are used only if list and model agree on the pose.
+    Cambridge Landmarks, or by the ending of the path, if that is unique in both. Points are used only if list
+    and model agree on the pose.
 
     Parameters
     ----------
@@ -48,15 +48,11 @@ class NvmFrames:
         self, model: NvmModel, names: Sequence[str], poses: Poses, is_training: np.ndarray
     ):
         self._model, self._is_training = model, is_training
-        by_name = {name: k for k, name in enumerate(model.names)}
-        by_stem = {_stem(name): k for k, name in enumerate(model.names)}
-        self._image = np.array(
-            [by_name.get(name, by_stem.get(_stem(name), -1)) for name in names], dtype=np.int64
-        )
+        self._image = match_names(names, model.names)
         self.is_known = self._image >= 0
         known = np.flatnonzero(self.is_known)
         self.has_points = np.zeros(len(names), dtype=bool)
-        self.has_points[known] = _same_poses(poses[known], model.poses[self._image[known]])
+        self.has_points[known] = same_poses(poses[known], model.poses[self._image[known]])
         self._by_image = np.argsort(model.image_idx, kind="stable")
         self._first = np.searchsorted(
             model.image_idx[self._by_image], np.arange(len(model.names) + 1)
@@ -68,6 +64,22 @@ class NvmFrames:
             np.stack([model.point_idx, model.image_idx])[:, trains[model.image_idx]], axis=1
         )
         self._training_frames = np.bincount(pairs[0], minlength=len(model.xyz))
+
+    def focal_px(self, k: int) -> float:
+        """Return the focal length of frame k, which is in the model."""
+        return float(self._model.focal_px[self._image[k]])
+
+    def model_poses(self, rows: np.ndarray) -> Poses:
+        """Return the model's poses of frames that are in it."""
+        return self._model.poses[self._image[rows]]
+
+    def offsets(self, k: int) -> np.ndarray:
+        """Return all measurements in frame k as pixels from the image centre, (M, 2)."""
+        image = int(self._image[k])
+        if image < 0:
+            return np.zeros((0, 2))
+        rows = self._by_image[self._first[image] : self._first[image + 1]]
+        return np.asarray(self._model.offsets_px[rows])
 
     def camera(self, k: int, width: int, height: int) -> Camera | None:
         """Return the camera of frame k for the given image size; None if the frame is not in the model."""
@@ -123,15 +135,71 @@ def camera_from_visualsfm(focal_px: float, distortion: float, width: int, height
     return Camera("RADIAL", width, height, np.array([focal_px, *center, k1, k2]))
 
 
-def _same_poses(poses: Poses, others: Poses) -> np.ndarray:
-    """Return a mask (N,) of poses that agree."""
-    if not len(poses):
-        return np.zeros(0, dtype=bool)
-    distance, angle_deg = pose_errors(others, poses)
-    spread = np.median(np.linalg.norm(poses.centers - np.median(poses.centers, axis=0), axis=1))
-    same = (distance <= _SAME_POSITION_SHARE * spread + 1e-5) & (angle_deg <= _SAME_ROTATION_DEG)
-    return np.asarray(same)
+def match_names(names: Sequence[str], model_names: Sequence[str]) -> np.ndarray:
+    """Find listed images in a model.
+
+    Parameters
+    ----------
+    names : sequence of str
+        N names of a list.
+    model_names : sequence of str
+        Names of the model's images; a backslash separates folders as "/" does, and VisualSFM's double
+        quotation mark represents a space.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+        Index in the model, -1 if there is none: the same name, otherwise the same path without suffix,
+        otherwise a path without suffix of which one is the ending of the other. No image of the model is
+        given to two names, and none is chosen if several match.
+    """
+    plain = [name.replace("\\", "/").replace('"', " ") for name in model_names]
+    found = np.full(len(names), -1, dtype=np.int64)
+    for listed, given in (
+        (list(names), plain),
+        ([_stem(name) for name in names], [_stem(name) for name in plain]),
+    ):
+        by_name = _rows_by(given)
+        rows_of = _rows_by(listed)
+        taken = set(found.tolist())
+        for k, name in enumerate(listed):
+            rows = [row for row in by_name.get(name, []) if row not in taken]
+            if found[k] < 0 and len(rows) == 1 and len(rows_of[name]) == 1:
+                found[k] = rows[0]
+    _match_endings(found, [_stem(name) for name in names], [_stem(name) for name in plain])
+    return found
+
+
+def _match_endings(found: np.ndarray, stems: list[str], model_stems: list[str]) -> None:
+    """Give names without an image those of the model whose path is the only one with the same ending."""
+    taken = set(found.tolist())
+    free = [row for row in range(len(model_stems)) if row not in taken]
+    missing = [k for k in range(len(stems)) if found[k] < 0]
+    by_end = _rows_by([PurePosixPath(model_stems[row]).name for row in free])
+    candidates: dict[int, list[int]] = {}
+    for k in missing:
+        rows = [free[i] for i in by_end.get(PurePosixPath(stems[k]).name, [])]
+        candidates[k] = [row for row in rows if _is_ending(stems[k], model_stems[row])]
+    wanted: dict[int, int] = defaultdict(int)
+    for rows in candidates.values():
+        for row in rows:
+            wanted[row] += 1
+    for k, rows in candidates.items():
+        if len(rows) == 1 and wanted[rows[0]] == 1:
+            found[k] = rows[0]
+
+
+def _is_ending(one: str, other: str) -> bool:
+    short, long = sorted((f"/{one.strip('/')}", f"/{other.strip('/')}"), key=len)
+    return long.endswith(short)
+
+
+def _rows_by(names: list[str]) -> dict[str, list[int]]:
+    rows: dict[str, list[int]] = defaultdict(list)
+    for k, name in enumerate(names):
+        rows[name].append(k)
+    return rows
 
 
 def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))
+    return str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).name else name

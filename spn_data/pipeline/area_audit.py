@@ -22,6 +22,8 @@ from spn_data.area.names import (
 from spn_data.colmap.model import read_scene
 from spn_data.dataset.cambridge import NVM, read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
+from spn_data.dataset.image_copies import ImageChecks
 from spn_data.dataset.nvm import read_nvm
 from spn_data.errors import FormatError, SpnError
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
@@ -42,6 +44,7 @@ from spn_data.split.audit import (
     check_training_marks,
     check_training_points,
     check_up_to_date,
+    make_finding,
 )
 from spn_data.split.audit_files import (
     PoseList,
@@ -142,7 +145,9 @@ def _check_files(
             tracked = {name: group.tracked for name, group in dataset.groups.items()}
             marks = {name: g.points_for_training for name, g in dataset.groups.items()}
             point_ids = _point_ids(dataset)
+            copies = _check_images(dataset)
         findings = [
+            copies,
             check_dataset(lists, parts, split),
             check_training_points(point_ids, labelled.mapping, labelled.mapping_seen, split),
             check_training_marks(marks),
@@ -156,6 +161,31 @@ def _check_files(
             )
         ]
     return findings
+
+
+def _check_images(dataset: Dataset) -> AuditFinding:
+    """Check that no held-out image has the pixels of a training image; similar ones are a notice."""
+    check = "no copy of a training image"
+    checks, copies = ImageChecks(), []
+    for role in (Role.TRAIN, Role.VALIDATION, Role.TEST):
+        for group in dataset.of_role(role) if dataset.info.has_images else ():
+            for row, name in enumerate(group.names.tolist()):
+                other = checks.add(name, role, group.image(row))
+                copies += [f"{name} ({group.name}) has the pixels of {other}"] if other else []
+    if not copies and (alike := checks.lookalikes()):
+        return AuditFinding(
+            check,
+            AuditVerdict.NOTICE,
+            f"{len(alike)} held-out images look the same as a training image: the camera did not move, or "
+            "they are copies that were compressed again",
+            tuple(f"{name} looks the same as {other}" for name, other in alike),
+        )
+    return make_finding(
+        check,
+        copies,
+        "no validation or test image looks the same as a training image",
+        "held-out images are copies of training images",
+    )
 
 
 def _point_ids(dataset: Dataset) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -11,37 +10,22 @@ import cv2
 import numpy as np
 
 from spn_data.capture.photos import decode_photo
-from spn_data.dataset.cambridge import (
-    NVM,
-    TEST_LIST,
-    TRAIN_LIST,
-    VALIDATION_LIST,
-    CambridgeList,
-    find_anomalies,
-    position_outliers,
-    read_cambridge,
-)
+from spn_data.dataset.cambridge import NVM
 from spn_data.dataset.hdf5_schema import DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
-from spn_data.dataset.nvm import read_nvm
-from spn_data.dataset.nvm_frames import NvmFrames
+from spn_data.dataset.image_copies import ImageChecks
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
+from spn_data.inputs.cambridge_frames import LISTS, first_name, read_listed_frames
+from spn_data.inputs.cambridge_model import OpenedFrames, check_sizes, read_model
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
 
-LISTS = {
-    Role.TRAIN: TRAIN_LIST,
-    Role.VALIDATION: VALIDATION_LIST,
-    Role.TEST: TEST_LIST,
-}
 _NOT_GEOREFERENCED = (
     "the lists are not georeferenced (unknown origin and up direction), so the poses cannot be used for "
     "navigation"
 )
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +40,14 @@ class ImportOptions:
         Unit of the positions in the lists: "m", or "model" if it is unknown.
     keep_outliers : bool
         Whether to keep frames whose position is absurdly far from all others.
+    subtract : tuple of float
+        Offset to subtract from all positions, such as (563200, 5934700, 300) for UTM coordinates.
     """
 
     width_px: int = 480
     units: str = "m"
     keep_outliers: bool = False
+    subtract: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,24 +68,6 @@ class Imported:
     has_images: bool
     with_focal: int
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Frames:
-    """N frames of all lists: names, (N,) roles, poses, image files (None if missing)."""
-
-    names: tuple[str, ...]
-    roles: np.ndarray
-    poses: Poses
-    files: tuple[Path | None, ...]
-
-    def select(self, index: np.ndarray) -> _Frames:
-        return _Frames(
-            tuple(self.names[k] for k in index),
-            self.roles[index],
-            self.poses[index],
-            tuple(self.files[k] for k in index),
-        )
 
 
 def import_cambridge(
@@ -132,22 +101,24 @@ def import_cambridge(
     Raises
     ------
     InputError
-        If a list is missing or damaged, or `target` exists and `overwrite` is false.
+        If a list, an image or the model is missing or damaged, if list and model disagree on nearly all
+        poses, if the model was made of images of another size, if a test image is a copy of a training image,
+        or if `target` exists and `overwrite` is false.
     """
     if target.suffix.lower() not in (".h5", ".hdf5") or target.is_dir():
         raise InputError("is not the name of an HDF5 file; it must end in .h5", path=target)
     if target.exists() and not overwrite:
         raise InputError("already exists; use --overwrite to replace it", path=target)
-    frames, notes = _read_lists(folder, options)
-    if not (frames.roles == Role.TRAIN).any():
-        raise InputError("contains no training frame", path=folder / LISTS[Role.TRAIN])
-    model = None
-    if (folder / NVM).is_file():
-        is_training = frames.roles == Role.TRAIN
-        model = NvmFrames(read_nvm(folder / NVM), frames.names, frames.poses, is_training)
-        notes += _model_notes(frames, model)
-    else:
-        notes.append(f"no {NVM}: focal lengths are unknown and there are no map points")
+    frames, notes = read_listed_frames(
+        folder, keep_outliers=options.keep_outliers, subtract=options.subtract
+    )
+    notes.insert(0, _NOT_GEOREFERENCED)
+    if any(options.subtract):
+        offset = " ".join(f"{value:.12g}" for value in options.subtract)
+        notes.append(f"{offset} was subtracted from all positions: add it to every position")
+    model, model_notes = read_model(folder, frames, options.subtract)
+    opened, size_notes = check_sizes(folder, frames, model, options.width_px)
+    notes += model_notes + size_notes
     has_images = any(file is not None for file in frames.files)
     info = DatasetInfo(
         units=options.units,
@@ -165,97 +136,42 @@ def import_cambridge(
     )
     groups = {role.value: role for role in LISTS if (folder / LISTS[role]).is_file()}
     counts = dict.fromkeys(groups, 0)
-    with_focal = 0
+    with_focal, checks = 0, ImageChecks()
     with DatasetWriter(target, info, groups) as writer:
         for k in range(len(frames.names)):
             progress("images" if has_images else "poses", k, len(frames.names))
-            frame = _frame(frames, k, model, options)
+            frame = _frame(opened, k, options, checks)
             writer.append(str(frames.roles[k]), frame)
             counts[str(frames.roles[k])] += 1
             with_focal += bool(np.isfinite(frame.intrinsics).all())
+        image_notes = _image_notes(checks)
+        writer.add_notes(image_notes)
         progress("images" if has_images else "poses", len(frames.names), len(frames.names))
-    return Imported(counts, has_images, with_focal, tuple(notes))
+    return Imported(counts, has_images, with_focal, (*notes, *image_notes))
 
 
-def _read_lists(folder: Path, options: ImportOptions) -> tuple[_Frames, list[str]]:
-    """Read the frames of all lists; return them with notes on anomalies."""
-    if not folder.is_dir():
-        raise InputError("is not a folder", path=folder)
-    lists = {
-        role: read_cambridge(folder / name)
-        for role, name in LISTS.items()
-        if role is Role.TRAIN or (folder / name).is_file()
-    }
-    notes = [_NOT_GEOREFERENCED]
-    if Role.TEST not in lists:
-        notes.append(f"no {LISTS[Role.TEST]}: there are no frames to evaluate on")
-    listed: dict[str, str] = {}
-    kept = []
-    for role, found in lists.items():
-        for name in found.names:
-            if name in listed:
-                raise InputError(f"{name} is also in {listed[name]}", path=folder / LISTS[role])
-            listed[name] = LISTS[role]
-        notes += [f"{LISTS[role]}: {sentence}" for sentence in find_anomalies(found)]
-        far = position_outliers(found.poses.centers)
-        if far.any() and not options.keep_outliers:
-            names = [name for name, is_far in zip(found.names, far, strict=True) if is_far]
-            notes.append(
-                f"{_first_name(names)}: left out because of its position; use --keep-outliers to keep it"
-            )
-        kept.append(_frames(folder, found, role, far & (not options.keep_outliers)))
-    frames = _Frames(
-        tuple(name for part in kept for name in part.names),
-        np.concatenate([part.roles for part in kept]),
-        Poses.concatenate(part.poses for part in kept),
-        tuple(file for part in kept for file in part.files),
-    )
-    return _without_missing_images(frames, notes), notes
-
-
-def _frames(folder: Path, found: CambridgeList, role: Role, dropped: np.ndarray) -> _Frames:
-    files = tuple(_image_file(folder, name) for name in found.names)
-    roles = np.full(len(found), role.value)
-    return _Frames(found.names, roles, found.poses, files).select(np.flatnonzero(~dropped))
-
-
-def _image_file(folder: Path, name: str) -> Path | None:
-    """Return the listed image file, or the same image converted to another format; None if missing."""
-    path = folder / name
-    candidates = [path, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
-
-
-def _without_missing_images(frames: _Frames, notes: list[str]) -> _Frames:
-    exists = np.array([file is not None for file in frames.files], dtype=bool)
-    if not exists.any():
-        notes.append(
-            "none of the listed images exists: the data set has only poses and cannot be used for training"
-        )
-        return frames
-    if not exists.all():
-        missing = [name for name, found in zip(frames.names, exists, strict=True) if not found]
-        notes.append(f"{_first_name(missing)}: left out because the image is missing")
-    return frames.select(np.flatnonzero(exists))
-
-
-def _model_notes(frames: _Frames, model: NvmFrames) -> list[str]:
+def _image_notes(checks: ImageChecks) -> list[str]:
+    """Return notes on images without texture and on images that are the same."""
     notes = []
-    for rows, what in (
-        (~model.is_known, f"not in {NVM}, so the focal length is unknown"),
-        (
-            model.is_known & ~model.has_points,
-            f"the pose in {NVM} is different, so its map points are left out",
-        ),
+    if checks.bare:
+        notes.append(
+            f"{first_name(checks.bare)}: the image is nearly black, white or without texture, so a network "
+            "can learn nothing from it (12-bit images in 16-bit files have to be brightened)"
+        )
+    for pairs, what in (
+        (checks.repeated, "has the same pixels as"),
+        (checks.lookalikes(), "looks the same as the training image"),
     ):
-        if rows.any():
-            notes.append(f"{_first_name([frames.names[k] for k in np.flatnonzero(rows)])}: {what}")
+        if pairs:
+            more = f"; {len(pairs) - 1} more such images" if len(pairs) > 1 else ""
+            notes.append(f"{pairs[0][0]}: {what} {pairs[0][1]}{more}")
     return notes
 
 
 def _frame(
-    frames: _Frames, k: int, model: NvmFrames | None, options: ImportOptions
+    opened: OpenedFrames, k: int, options: ImportOptions, checks: ImageChecks
 ) -> DatasetFrame:
+    frames, model = opened.frames, opened.model
     name, file = frames.names[k], frames.files[k]
     sequence = str(PurePosixPath(name).parent)
     frame = DatasetFrame(
@@ -268,7 +184,15 @@ def _frame(
     )
     if file is None:
         return frame
-    image = decode_photo(file)
+    image = decode_photo(file, upright=bool(opened.upright[k]))
+    role = Role(str(frames.roles[k]))
+    copied = checks.add(name, role, image)
+    if copied:
+        raise InputError(
+            f"is a copy of {copied}, which is in another list: networks must not be tested on training "
+            f"images; remove {name} from {LISTS[role]}",
+            path=file,
+        )
     height, width = image.shape[:2]
     try:
         camera = None if model is None else model.camera(k, width, height)
@@ -312,8 +236,3 @@ class _Key:
 def _renderer(key: _Key, width_px: int) -> PinholeRenderer:
     camera = key.camera
     return PinholeRenderer(camera, canonical_camera([camera], RenderingOptions(width_px=width_px)))
-
-
-def _first_name(names: Sequence[str]) -> str:
-    """Return the first name and the number of further ones."""
-    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")

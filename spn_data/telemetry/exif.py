@@ -99,7 +99,7 @@ class PhotoMetadata:
 
 
 def read_photo(path: Path | str) -> PhotoMetadata:
-    """Read the metadata of a JPEG, PNG or TIFF.
+    """Read the metadata of a JPEG, PNG, TIFF, BMP or WebP.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def read_photo(path: Path | str) -> PhotoMetadata:
                     f"is larger than {MAX_PHOTO_BYTES / 1e9:.0f} GB, the limit for a photo",
                     path=path,
                 )
-            with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+            with Image.open(path, formats=("JPEG", "PNG", "TIFF", "BMP", "WEBP")) as image:
                 width, height = image.size
                 main, exif, gps = exif_tags(image, notes)
                 if image.format == "TIFF" and number(main.get(_ORIENTATION)) in (5, 6, 7, 8):
@@ -141,7 +141,7 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         ) as error:
             reason = (
                 getattr(error, "strerror", None)
-                or "it is not a JPEG, PNG or TIFF, or it is damaged"
+                or "it is not a JPEG, PNG, TIFF, BMP or WebP, or it is damaged"
             )
             raise InputError(f"cannot be read as a photo: {reason}", path=path) from error
     damage = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
@@ -12,11 +13,11 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(100_000_000))
 
 import cv2
 
-from spn_data.errors import SpnError
+from spn_data.errors import InputError, SpnError
 from spn_data.geometry.camera_file import read_camera
 from spn_model.onboard import lines
-from spn_model.onboard.localizer import Localizer
-from spn_model.onboard.sources import frames
+from spn_model.onboard.localizer import Localizer, Located
+from spn_model.onboard.sources import check_sources, frames
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -54,6 +55,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _localize_all(given: argparse.Namespace) -> None:
+    """Write a row for each frame; a frame that cannot be used has a reason, and the next one follows.
+
+    Raises InputError if a file does not exist, or none of the frames can be used.
+    """
     cv2.setNumThreads(given.threads)
     camera = read_camera(given.camera)
     localizer = Localizer(given.bundle, int8=given.int8, threads=given.threads)
@@ -61,19 +66,34 @@ def _localize_all(given: argparse.Namespace) -> None:
     line = lines.csv_line if given.format == "csv" else lines.json_line
     if given.format == "csv":
         sys.stdout.write(lines.csv_header() + "\n")
+    check_sources(given.sources)
     noted = False
+    used, problems = 0, []
     for source in given.sources:
-        for frame, time_s, image in frames(source):
-            covered = localizer.renderer(camera, image.shape[1], image.shape[0]).valid.mean()
-            if covered < 1 and not noted:
-                sys.stderr.write(
-                    f"Note: the camera covers {100 * covered:.0f} % of the view that the network was trained "
-                    "on; the rest is black.\n"
-                )
-                noted = True
-            located = localizer.localize(image, camera)
-            sys.stdout.write(line(str(source), frame, time_s, located, origin) + "\n")
+        number = 0
+        try:
+            for number, time_s, image in frames(source):
+                covered = localizer.renderer(camera, image.shape[1], image.shape[0]).valid.mean()
+                if covered < 1 and not noted:
+                    sys.stderr.write(
+                        f"Note: the camera covers {100 * covered:.0f} % of the view that the network was "
+                        "trained on; the rest is black.\n"
+                    )
+                    noted = True
+                located = localizer.localize(image, camera)
+                sys.stdout.write(line(str(source), number, time_s, located, origin) + "\n")
+                sys.stdout.flush()
+                used, number = used + 1, number + 1
+        except InputError as error:
+            problems.append(error if error.path else InputError(str(error), path=source))
+            reason = str(error).removeprefix(f"{source}: ")
+            failed = Located.failed(reason)
+            sys.stdout.write(line(str(source), number, math.nan, failed, origin) + "\n")
             sys.stdout.flush()
+    if problems and not used:
+        raise problems[0]
+    for problem in problems:
+        sys.stderr.write(f"Note: {problem}\n")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import onnxruntime
 
 from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
 from spn_data.geometry.rotations import canonical_quats
@@ -62,7 +63,7 @@ class Located:
 class Localizer:
     """A bundle loaded into memory at one precision, for use by one thread at a time.
 
-    `localize` consists of the steps `view`, `run` and `decode`.
+    `localize` consists of the steps `view`, `run` and `decode`, after a check of the image's texture.
 
     Parameters
     ----------
@@ -127,13 +128,17 @@ class Localizer:
         Returns
         -------
         Located
+            Without a pose, and with the reason, if the image has too little texture (`missing_texture`): a
+            network returns a pose and an ordinary covariance for a black image too.
 
         Raises
         ------
         InputError
             If the aspect ratios of image and camera differ, or the camera sees nothing of the network's view.
         """
-        return self.decode(self.run(self.view(image, camera, rgb=rgb)))
+        seen = self.view(image, camera, rgb=rgb)
+        reason = missing_texture(image)
+        return Located.failed(reason) if reason else self.decode(self.run(seen))
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.

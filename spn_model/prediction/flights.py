@@ -17,6 +17,7 @@ from spn_data.capture.sources import Source, SourceKind, discover
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length
+from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.telemetry.exif import telemetry_from_photos
 from spn_model.onboard.view import View
@@ -62,13 +63,19 @@ class Flight:
     time_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     headers: PhotoHeaders | None = None
 
+    @property
+    def is_readable(self) -> bool:
+        """Whether it is a video, or the header of at least one photo can be read."""
+        return self.headers is None or any(m is not None for m in self.headers.metadata)
+
 
 @dataclass(frozen=True, eq=False)
 class FlightFrame:
     """One frame, rendered into the view of a network.
 
     name : `<sequence>/<frame>.jpg`, as in the labels; source : name of its file. image : (H, W, 3) uint8 RGB
-    in the view, None if `problem` says why; matrix : its camera matrix (3, 3), NaN without an image.
+    in the view, None if `problem` says why; matrix : its camera matrix (3, 3), NaN without an image;
+    readable : whether the problem is what the image shows, not that it cannot be read.
     """
 
     name: str
@@ -79,6 +86,7 @@ class FlightFrame:
     image: np.ndarray | None
     matrix: np.ndarray
     problem: str = ""
+    readable: bool = False
 
 
 def find_flights(paths: Sequence[Path], given: Camera | None) -> tuple[list[Flight], list[str]]:
@@ -120,6 +128,12 @@ def find_flights(paths: Sequence[Path], given: Camera | None) -> tuple[list[Flig
         if found.ignored:
             first, why = found.ignored[0]
             notes.append(f"{len(found.ignored)} other files were ignored, e.g. {first} ({why}).")
+    unreadable = [f.headers for f in flights if f.headers is not None and not f.is_readable]
+    if unreadable and len(unreadable) == len(flights):
+        raise InputError(
+            f"none of its photos can be read: {unreadable[0].problem[0]}",
+            path=unreadable[0].paths[0].parent,
+        )
     return flights, notes
 
 
@@ -135,9 +149,9 @@ def _open_flight(source: Source, given: Camera | None) -> tuple[Flight, list[str
     headers = read_headers(source.parts)
     known = [m for m in headers.metadata if m is not None]
     if not known:
-        raise InputError(
-            f"none of its photos can be read: {headers.problem[0]}", path=source.parts[0].parent
-        )
+        nothing = np.full(len(source.parts), np.nan)
+        unknown: tuple[Camera | None, ...] = (None,) * len(source.parts)
+        return Flight(source, unknown, "unknown", len(source.parts), nothing, headers), []
     photos = tuple(_photo_camera(headers, row, given) for row in range(len(source.parts)))
     readable = [row for row, metadata in enumerate(headers.metadata) if metadata is not None]
     if all(photos[row] is None for row in readable):
@@ -290,6 +304,9 @@ def _render(frame: FlightFrame, camera: Camera, views: ViewRenderers) -> FlightF
         height, width = frame.image.shape[:2]
         problem = f"is {width}x{height}, expected {camera.width}x{camera.height}"
         return replace(frame, image=None, problem=problem)
+    problem = missing_texture(frame.image)
+    if problem:
+        return replace(frame, image=None, problem=problem, readable=True)
     try:
         renderer = views.renderer(camera)
     except GeometryError as error:

@@ -58,7 +58,10 @@ class PoseRows:
             np.array([frame.source for frame in frames], dtype=object),
             np.array([frame.video_frame for frame in frames], dtype=np.int64),
             np.array([frame.time_s for frame in frames], dtype=np.float64),
-            np.array([UNREADABLE if f.image is None else FAILED for f in frames], dtype=object),
+            np.array(
+                [UNREADABLE if f.image is None and not f.readable else FAILED for f in frames],
+                dtype=object,
+            ),
             np.array([frame.problem for frame in frames], dtype=object),
             Poses.unknown(n),
             np.full((n, 6, 6), np.nan),

@@ -304,7 +304,9 @@ def test_images_of_two_sizes_are_refused(tmp_path):
     other = replace(
         frame("train", 1), image=np.zeros((20, 48, 3), np.uint8), point_pixels=np.zeros((1, 2))
     )
-    with pytest.raises(InputError, match="group train have sizes 48x27 and 48x20"):
+    with pytest.raises(
+        InputError, match="is 48x20, but the images before it in group train are 48x27"
+    ):
         write(tmp_path / "d.h5", [("train", frame("train", 0)), ("train", other)])
 
 

@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import piexif
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from spn_cli.data import main
 from spn_cli.import_ import import_
 
-from spn_data.dataset.cambridge import read_cambridge, write_cambridge
+from spn_data.dataset.cambridge import HEADER, read_cambridge, write_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_data.dataset.nvm import build_nvm_model, write_nvm
-from spn_data.dataset.nvm_frames import camera_from_visualsfm
+from spn_data.dataset.nvm import build_nvm_model, read_nvm, read_nvm_models, write_nvm
+from spn_data.dataset.nvm_frames import camera_from_visualsfm, match_names
+from spn_data.dataset.pose_agreement import name_disagreement
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses
-from spn_data.geometry.rotations import rotations_from_angles
-from spn_data.pipeline.import_cambridge import LISTS, Imported, ImportOptions, import_cambridge
+from spn_data.geometry.pose import Poses, Similarity
+from spn_data.geometry.rotations import (
+    quats_from_rotations,
+    rotations_from_angles,
+    rotations_from_vectors,
+)
+from spn_data.inputs.cambridge_frames import LISTS
+from spn_data.pipeline.import_cambridge import Imported, ImportOptions, import_cambridge
 
 OUTLIER = "seq5/frame00297.png"
 LENS = Camera("SIMPLE_PINHOLE", 160, 90, np.array([120.0, 80.0, 45.0]))
@@ -186,21 +197,29 @@ def test_points_for_training_are_seen_by_two_training_frames(scene, tmp_path):
         assert not np.isin(of_test, ids).all()
 
 
-def test_points_of_another_world_are_left_out(scene, tmp_path):
-    """A model whose poses are not the lists' keeps its cameras and loses its points, which is reported."""
+def test_a_model_of_another_world_is_refused(scene, tmp_path):
+    """A model whose poses are not the lists' is of another reconstruction, and so may be its cameras."""
     moved = Poses(poses().centers + np.array([0, 0, 5.0]), poses().quats_wxyz)
     for name, rows in (("train", TRAIN), ("test", TEST)):
         write_cambridge(
             scene / f"dataset_{name}.txt", [NAMES[k] for k in rows], moved[np.array(rows)]
         )
+    with pytest.raises(InputError, match="for 6 of 6 images"):
+        run(scene, tmp_path / "dataset.h5", width_px=80)
+    write_cambridge(scene / "dataset_test.txt", [NAMES[k] for k in TEST], poses()[np.array(TEST)])
+    write_cambridge(
+        scene / "dataset_train.txt",
+        [NAMES[k] for k in TRAIN],
+        Poses.concatenate([moved[:2], poses()[2:4]]),
+    )
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
     assert done.with_focal == 6
     assert (
-        f"{NAMES[0]} and 5 more: the pose in reconstruction.nvm is different, so its map points are left out"
+        f"{NAMES[0]} and 1 more: the pose in reconstruction.nvm is different, so its map points are left out"
         in (done.notes)
     )
     with Dataset(tmp_path / "dataset.h5") as dataset:
-        assert [len(dataset.groups["train"].points(k).ids) for k in range(4)] == [0] * 4
+        assert [len(dataset.groups["train"].points(k).ids) for k in range(2)] == [0] * 2
 
 
 def test_without_a_model_images_are_reduced_and_the_focal_length_is_unknown(scene, tmp_path):
@@ -319,3 +338,339 @@ def test_lists_without_a_frame_are_refused(tmp_path):
     with pytest.raises(InputError, match="contains no training frame"):
         run(tmp_path, tmp_path / "dataset.h5")
     assert not (tmp_path / "dataset.h5").exists()
+
+
+def listed(folder: Path, name: str) -> list[list[str]]:
+    """Rows of a list as cells, to be changed and written again by `relist`."""
+    return [line.split() for line in (folder / f"dataset_{name}.txt").read_text().splitlines()[3:]]
+
+
+def relist(folder: Path, change: Callable[[list[str]], list[str]], names=("train", "test")) -> None:
+    for name in names:
+        rows = [" ".join(change(cells)) for cells in listed(folder, name)]
+        (folder / f"dataset_{name}.txt").write_text("\n".join([*HEADER, *rows, ""]))
+
+
+def conjugate(cells: list[str]) -> list[str]:
+    return [*cells[:5], *(str(-float(value)) for value in cells[5:])]
+
+
+def scalar_last(cells: list[str]) -> list[str]:
+    return [*cells[:4], *cells[5:], cells[4]]
+
+
+def translation(cells: list[str]) -> list[str]:
+    center, quat = np.array(cells[1:4], float), np.array([cells[4:]], float)
+    return [cells[0], *map(str, -Poses(center[None], quat).rotations[0] @ center), *cells[4:]]
+
+
+def turned_about(axis: np.ndarray) -> Callable[[list[str]], list[str]]:
+    def change(cells: list[str]) -> list[str]:
+        pose = Poses(np.zeros((1, 3)), np.array([cells[4:]], float))
+        quat = quats_from_rotations(rotations_from_vectors(axis[None]) @ pose.rotations)[0]
+        return [*cells[:4], *map(str, quat)]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (conjugate, "if the quaternions rotate camera axes into world axes"),
+        (scalar_last, r"if the quaternions are in the order x y z w \(write w first\);"),
+        (
+            lambda cells: scalar_last(conjugate(cells)),
+            "order x y z w .* and rotate camera axes into world axes",
+        ),
+        (translation, r"if the positions are the translation t = -R C"),
+        (turned_about(np.array([np.pi, 0, 0])), "if the camera's axes are y up and z backward"),
+        (turned_about(np.array([0, 0, -np.pi / 2])), "turned by 90 degrees about their optical"),
+        (turned_about(np.array([0, 0, np.pi / 2])), "turned by 270 degrees about their optical"),
+        (
+            lambda cells: [cells[0], *(str(2 * float(v)) for v in cells[1:4]), *cells[4:]],
+            "no usual mistake of conventions explains that",  # on a line, the axes are unknown
+        ),
+        (turned_about(np.array([0.2, 0, 0])), "no usual mistake of conventions explains that"),
+    ],
+)
+def test_a_list_in_another_convention_is_refused_by_its_name(scene, tmp_path, change, cause):
+    """Where list and model disagree in all frames, the message names what would make them agree."""
+    relist(scene, change)
+    with pytest.raises(InputError, match=f"for 6 of 6 images; .*{cause}"):
+        run(scene, tmp_path / "dataset.h5")
+    assert not (tmp_path / "dataset.h5").exists()
+
+
+def test_some_frames_in_another_convention_are_refused_too(scene, tmp_path):
+    """Four of six conjugate quaternions are no noise; two frames elsewhere are only noted."""
+    relist(scene, conjugate, names=("train",))
+    with pytest.raises(InputError, match="for 4 of 6 images; they agree if the quaternions rotate"):
+        run(scene, tmp_path / "dataset.h5")
+    relist(scene, conjugate, names=("train",))
+    relist(scene, lambda c: [c[0], c[1], "0.3", *c[3:]], names=("test",))
+    done = run(scene, tmp_path / "dataset.h5")
+    assert any("the pose in reconstruction.nvm is different" in note for note in done.notes)
+
+
+def textured(width: int, height: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 255, (height // 8, width // 8, 3), dtype=np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def resize_all(scene: Path, factor: float, names=NAMES) -> None:
+    for name in names:
+        image = cv2.imread(str(scene / name))
+        size = (round(factor * 160), round(factor * 90))
+        cv2.imwrite(str(scene / name), cv2.resize(image, size))
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (0.5, "the image is 80x45, but the model's measurements in it span"),
+        (1.5, "other images of 240x135: the model's measurements reach only"),
+        (2.0, "other images of 320x180: the model's measurements reach only"),
+    ],
+)
+def test_images_of_another_size_than_the_models_are_refused(scene, tmp_path, factor, told):
+    """A focal length of the model would be wrong by the factor, and half of the points lost."""
+    resize_all(scene, factor)
+    with pytest.raises(InputError, match=told):
+        run(scene, tmp_path / "dataset.h5")
+
+
+def test_one_image_of_another_size_is_refused_by_name(scene, tmp_path):
+    """One thumbnail among the images is found."""
+    resize_all(scene, 0.5, NAMES[3:4])
+    with pytest.raises(InputError, match=rf"{NAMES[3]}: the image is 80x45, but the model's"):
+        run(scene, tmp_path / "dataset.h5")
+
+
+def test_an_image_of_another_shape_is_refused_by_name(scene, tmp_path):
+    """Without a model to compare with, the message names both images and what to do."""
+    (scene / "reconstruction.nvm").unlink()
+    cv2.imwrite(str(scene / NAMES[2]), np.zeros((160, 90, 3), np.uint8))
+    told = rf"{NAMES[2]}: the image is 90x160, but {NAMES[0]} is 160x90: all images of .* crop them"
+    with pytest.raises(InputError, match=told):
+        run(scene, tmp_path / "dataset.h5")
+
+
+def as_jpeg(scene: Path, orientation: int, *, rotate: int | None = None) -> None:
+    """Write all images as JPEG with an EXIF orientation, their pixels turned by `rotate`."""
+    exif = piexif.dump({"0th": {piexif.ImageIFD.Orientation: orientation}})
+    for name in NAMES:
+        image = cv2.imread(str(scene / name))
+        (scene / name).unlink()
+        image = image if rotate is None else cv2.rotate(image, rotate)
+        rgb = Image.fromarray(image[..., ::-1].copy())
+        rgb.save((scene / name).with_suffix(".jpg"), exif=exif, quality=95)
+
+
+def test_exif_is_applied_only_where_the_model_is_of_upright_images(scene, tmp_path):
+    """Measurements show which pixels the poses belong to; the points lie on the dots in both cases."""
+    as_jpeg(scene, 6)
+    done = run(scene, tmp_path / "stored.h5", width_px=160)
+    assert any("read as stored, although the EXIF" in note for note in done.notes)
+    for name in NAMES:
+        image = cv2.imread(str((scene / name).with_suffix(".jpg")), cv2.IMREAD_IGNORE_ORIENTATION)
+        (scene / name).with_suffix(".jpg").unlink()
+        cv2.imwrite(str(scene / name), image)
+    as_jpeg(scene, 6, rotate=cv2.ROTATE_90_COUNTERCLOCKWISE)
+    done = run(scene, tmp_path / "upright.h5", width_px=160)
+    assert any("turned upright by their EXIF, as the images" in note for note in done.notes)
+    for file in ("stored.h5", "upright.h5"):
+        with Dataset(tmp_path / file) as dataset:
+            group = dataset.groups["train"]
+            assert group.image_size == (160, 90)
+            column, row = group.points(0).pixels.astype(int).T
+            assert np.median(group.image(0)[row, column, 0]) > 50
+
+
+def test_an_orientation_that_nothing_confirms_is_noted(scene, tmp_path):
+    """Half a turn leaves all measurements inside, and without a model there is none."""
+    as_jpeg(scene, 3)
+    done = run(scene, tmp_path / "half.h5", width_px=80)
+    assert any("nothing shows whether the poses are of the upright" in n for n in done.notes)
+
+
+def test_failed_frames_at_zero_are_left_out(scene, tmp_path):
+    """Two frames at 0 0 0 are no frames; one whose neighbours are near is kept and named."""
+    relist(scene, lambda c: [c[0], *"0001000"] if c[0] in NAMES[1:3] else c)
+    done = run(scene, tmp_path / "dataset.h5", width_px=80)
+    assert done.counts == {"train": 2, "test": 2}
+    assert any(f"{NAMES[1]} and 1 more: left out because the pos" in note for note in done.notes)
+
+
+def test_one_frame_at_zero_may_be_the_first_of_its_world(scene, tmp_path):
+    """It is kept near others and left out far from them."""
+    (scene / "reconstruction.nvm").unlink()
+    relist(scene, lambda c: [c[0], c[1], "0", "0", *c[4:]])
+    done = run(scene, tmp_path / "near.h5", width_px=80)
+    assert done.counts == {"train": 4, "test": 2}
+    assert any(f"{NAMES[0]}: its position is 0 0 0; it is kept" in note for note in done.notes)
+    relist(scene, lambda c: [c[0], c[1], "0", "0" if c[0] == NAMES[0] else "90", *c[4:]])
+    assert run(scene, tmp_path / "far.h5", width_px=80).counts == {"train": 3, "test": 2}
+
+
+def test_positions_that_are_all_equal_are_noted(scene, tmp_path):
+    """A network learns no position from one place."""
+    (scene / "reconstruction.nvm").unlink()
+    relist(scene, lambda c: [c[0], "1", "2", "3", *c[4:]])
+    done = run(scene, tmp_path / "dataset.h5", width_px=80)
+    assert any("all 4 positions are equal, so a network cannot learn" in n for n in done.notes)
+
+
+def test_a_copy_of_a_training_image_among_the_test_images_is_refused(scene, tmp_path):
+    """Equal pixels count, whatever the file's name and format; lossy copies are noted."""
+    (scene / "reconstruction.nvm").unlink()
+    for k, name in enumerate(NAMES):
+        cv2.imwrite(str(scene / name), textured(160, 90, k))
+    assert not any("looks the same" in n for n in run(scene, tmp_path / "a.h5").notes)
+    (scene / NAMES[4]).unlink()
+    copy = (scene / NAMES[4]).with_suffix(".jpg")
+    cv2.imwrite(str(copy), textured(160, 90, 0), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    done = run(scene, tmp_path / "b.h5")
+    assert f"{NAMES[4]}: looks the same as the training image {NAMES[0]}" in done.notes
+    copy.unlink()
+    cv2.imwrite(str((scene / NAMES[4]).with_suffix(".bmp")), textured(160, 90, 0))
+    with pytest.raises(InputError, match=rf"is a copy of {NAMES[0]}, which is in another list"):
+        run(scene, tmp_path / "c.h5")
+    assert not (tmp_path / "c.h5").exists()
+
+
+def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
+    """Twelve bits in a 16-bit file are nearly black, which training cannot tell."""
+    (scene / "reconstruction.nvm").unlink()
+    for k, name in enumerate(NAMES):
+        cv2.imwrite(str(scene / name), textured(160, 90, k).astype(np.uint16)[..., 0] * 16)
+    done = run(scene, tmp_path / "dataset.h5")
+    assert any(f"{NAMES[0]} and 5 more: the image is nearly black" in n for n in done.notes)
+    with Dataset(tmp_path / "dataset.h5") as dataset:
+        assert dataset.info.notes == done.notes
+
+
+def test_coordinates_far_from_zero_are_refused_until_an_offset_is_subtracted(scene, tmp_path):
+    """UTM in float32 has steps of half a metre; the message gives an offset that mends it exactly."""
+    offset = np.array([563247.0, 5934791.0, 323.0])
+    run(scene, tmp_path / "near.h5", width_px=80)
+    relist(scene, lambda c: [c[0], *map(repr, (np.array(c[1:4], float) + offset).tolist()), *c[4:]])
+    shift_model(scene, offset)
+    with pytest.raises(InputError, match=r"would round them to 0.5; subtract .* --subtract 56"):
+        run(scene, tmp_path / "far.h5", width_px=80)
+    done = run(scene, tmp_path / "far.h5", width_px=80, subtract=tuple(offset.tolist()))
+    assert any("was subtracted from all positions" in note for note in done.notes)
+    with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "far.h5") as two:
+        near, far = one.groups["train"], two.groups["train"]
+        assert np.allclose(near.poses.centers, far.poses.centers, atol=1e-8)
+        assert np.allclose(near.points(0).xyz, far.points(0).xyz, atol=1e-8)
+
+
+def shift_model(scene: Path, offset: np.ndarray) -> None:
+    model = read_nvm(scene / "reconstruction.nvm")
+    moved = Poses(model.poses.centers + offset, model.poses.quats_wxyz)
+    write_nvm(scene / "reconstruction.nvm", replace(model, poses=moved, xyz=model.xyz + offset))
+
+
+def test_the_model_that_the_lists_belong_to_is_used(scene, tmp_path):
+    """A file holds several models; the one with the lists' poses counts, not the first."""
+    path = scene / "reconstruction.nvm"
+    right = path.read_text().split("\n", 2)[2].strip().removesuffix("0").strip()
+    shift_model(scene, np.array([50.0, 0, 0]))
+    wrong = path.read_text().strip().removesuffix("0")
+    unregistered = "1\nseq9/a b.jpg 100 0 0 0 0 0 0 0 0 0\n\n0"
+    path.write_text(f"{wrong}\n{right}\n\n{unregistered}\n\n0\n\n#the last part\n0\n")
+    assert [len(model.names) for model in read_nvm_models(path)] == [6, 6]
+    done = run(scene, tmp_path / "dataset.h5", width_px=80)
+    assert any("contains 2 models; number 2 is used, which has 6 of the 6" in n for n in done.notes)
+    assert not any("different" in note for note in done.notes)
+
+
+def test_names_are_matched_by_a_unique_ending_and_may_have_spaces():
+    """Absolute Windows paths, other suffixes and VisualSFM's quotation marks are found; twins are not."""
+    given = [
+        r"D:\scans\seq1\a.jpg",
+        'D:/scans/my"seq/b.JPG',
+        "c.jpg",
+        "x/seq3/d.jpg",
+        "y/seq3/d.jpg",
+    ]
+    names = ["seq1/a.png", "my seq/b.png", "seq2/c.png", "seq3/d.png", "eq1/a.png", "e.png"]
+    assert match_names(names, given).tolist() == [0, 1, 2, -1, -1, -1]
+    assert match_names(["seq1/c.png", "seq2/c.png"], ["c.jpg"]).tolist() == [-1, -1]
+    assert match_names(["a.png"], ["a.jpg", "a.bmp"]).tolist() == [-1]
+    assert match_names(["a.png", "a.jpg"], ["a.jpg"]).tolist() == [-1, 0]
+
+
+def test_a_name_with_spaces_is_imported(scene, tmp_path):
+    """Folder and file with spaces, in list and model."""
+    spaced = {name: name.replace("seq", "my seq ") for name in NAMES}
+    for name in NAMES:
+        (scene / spaced[name]).parent.mkdir(exist_ok=True)
+        (scene / name).rename(scene / spaced[name])
+    relist(scene, lambda c: [spaced[c[0]], *c[1:]])
+    path = scene / "reconstruction.nvm"
+    path.write_text(path.read_text().replace("seq", 'my"seq"'))
+    done = run(scene, tmp_path / "dataset.h5", width_px=80)
+    assert done.counts == {"train": 4, "test": 2}
+    assert done.with_focal == 6
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".webp"])
+def test_bmp_and_webp_are_read(scene, tmp_path, suffix):
+    """The listed file, and the converted one."""
+    for name in NAMES:
+        image = cv2.imread(str(scene / name))
+        (scene / name).unlink()
+        cv2.imwrite(str((scene / name).with_suffix(suffix)), image)
+    assert run(scene, tmp_path / "dataset.h5", width_px=80).counts == {"train": 4, "test": 2}
+
+
+@pytest.mark.parametrize(
+    ("case", "told"),
+    [
+        ("01-nvm-of-other-image-size", "made of images of another size"),
+        ("04-nvm-mixed-scale", "made of smaller images"),
+        ("05-exif-turned-against-poses", "read as stored"),
+        ("07-utm-labels", "--subtract 563238 5934792 324"),
+        ("09-sixteen-bit-of-twelve", "nearly black"),
+        (
+            "10-failed-frames-at-origin",
+            "and 2 more: left out because the position is exactly 0 0 0",
+        ),
+        ("11-all-poses-another-convention", "conjugate them"),
+        ("14-nvm-second-model", "number 2 is used"),
+        ("20-nvm-zero-quaternion", "reconstruction.nvm:9: seq1/frame00005.jpg"),
+        ("21-size-unnamed", "seq2/frame00010.png and 9 more: the image is 320x180"),
+        ("base", ""),
+    ],
+)
+def test_cases_from_outside_are_told(shared_cases, tmp_path, case, told):
+    """Scenes that someone else spoiled are refused or noted in the words of the documentation."""
+    folder = tmp_path / case
+    shutil.copytree(shared_cases / "labels" / "base", folder)
+    shutil.copytree(shared_cases / "labels" / case, folder, dirs_exist_ok=True)
+    if case.startswith("05"):
+        for path in folder.rglob("*.png"):
+            path.unlink()
+    try:
+        notes = run(folder, tmp_path / "dataset.h5", width_px=160).notes
+    except InputError as error:
+        notes = (str(error),)
+    assert told in "\n".join(notes)
+    if case == "base":
+        assert len(notes) == 1
+
+
+def test_a_model_in_another_world_is_named():
+    """A scale, a turn and a shift of the whole model are told from a mistake of conventions."""
+    rng = np.random.default_rng(3)
+    rotations = rotations_from_vectors(rng.normal(0, 1, (12, 3)))
+    model = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
+    listed_from_model = Similarity(
+        2.5, rotations_from_vectors(np.array([[0.1, 0.2, 0.3]]))[0], np.array([7.0, 8, 9])
+    )
+    told = name_disagreement(listed_from_model.apply_to_poses(model), model)
+    assert "1 unit of the model is 2.5 of the list" in told
+    others = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
+    assert name_disagreement(others, model) == ""

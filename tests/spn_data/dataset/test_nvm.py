@@ -97,7 +97,7 @@ def test_measurements_are_without_distortion_and_from_the_centre() -> None:
         ("\n2\n", "\n99999999999999999999\n", 3, "is not a number from 0"),
         ("\n2\n", "\n3\n", 7, "expected 11"),
         ("a/2.png", "a/1.png", 5, "listed twice"),
-        ("a/2.png", "a/2 .png", 5, "expected 11"),
+        ("a/2.png", "a/2 x", 5, "expected 11"),
         ("0 0 0 0 0\n", "0 0 nan 0 0\n", 4, "not finite"),
         ("1 0 0 0 0 0 0 0 0", "x 0 0 0 0 0 0 0 0", 4, "could not convert"),
         (" 2 0 0 5", " 3 0 0 5", 8, "expected x y z r g b n"),

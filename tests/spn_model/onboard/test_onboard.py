@@ -235,7 +235,93 @@ def test_a_source_that_is_none_is_told_in_one_line(
     assert done.returncode == 1
     assert told in done.stderr
     assert "Traceback" not in done.stderr
-    assert done.stdout.splitlines() == [lines.csv_header()]
+    rows = list(csv.DictReader(io.StringIO(done.stdout)))
+    assert [row["reason"] for row in rows] == ([] if content is None else [told.split(": ")[1]])
+
+
+def test_a_damaged_image_has_a_row_and_the_next_follows(bundle, flown, camera_file, tmp_path):
+    """Text, cut PNG and JPEG, another shape, and an early end of a video cost no other row."""
+    jpeg = cv2.imencode(".jpg", flown[0])[1].tobytes()
+    png = cv2.imencode(".png", flown[0])[1].tobytes()
+    square = cv2.imencode(".png", np.ascontiguousarray(flown[0][:, :360]))[1].tobytes()
+    content = {
+        "a.png": png,
+        "text.jpg": b"no image",
+        "cut.png": png[: len(png) // 2],
+        "cut.jpg": jpeg[: len(jpeg) // 2],
+        "square.png": square,
+        "b.jpg": jpeg,
+    }
+    for name, data in content.items():
+        (tmp_path / name).write_bytes(data)
+    sources = [str(tmp_path / name) for name in content]
+    done = run_blocked(str(bundle), *sources, "--camera", str(camera_file))
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader(io.StringIO(done.stdout)))
+    assert [row["source"] for row in rows] == sources
+    reasons = [row["reason"] for row in rows]
+    assert (reasons[0], reasons[5]) == ("", "")
+    assert reasons[1] == reasons[2] == "cannot be read as an image"
+    assert reasons[3] == "cannot be read as an image: it is truncated"
+    assert reasons[4].startswith("the image is 360x360, but the camera is 640x360")
+    assert [row["x"] == "" for row in rows] == [False, True, True, True, True, False]
+    assert f"Note: {tmp_path / 'cut.jpg'}: cannot be read" in done.stderr
+
+
+def test_a_video_that_ends_early_says_so(tmp_path, monkeypatch):
+    """Frames that the container promises and the decoder does not give are told after the last one."""
+
+    class Cut:
+        def __init__(self, *_: object):
+            self.left = 3
+
+        def read(self) -> tuple[bool, np.ndarray]:
+            self.left -= 1
+            return self.left >= 0, np.zeros((4, 4, 3), np.uint8)
+
+        def get(self, what: int) -> float:
+            return 40.0 if what == cv2.CAP_PROP_FRAME_COUNT else 0.0
+
+        def release(self) -> None:
+            pass
+
+    (tmp_path / "a.mp4").write_bytes(b"x")
+    monkeypatch.setattr("spn_model.onboard.sources.cv2.VideoCapture", Cut)
+    found = frames(tmp_path / "a.mp4")
+    assert [next(found)[0] for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(InputError, match="only 3 of about 40 frames can be decoded"):
+        next(found)
+
+
+@pytest.mark.parametrize("tail", [b"", b"\0" * 40, b"\xff\xda\x00"])
+def test_a_whole_jpeg_is_not_taken_for_a_cut_one(flown, tmp_path, tail):
+    """Progressive, with a thumbnail of its own, or with bytes after its end."""
+    for options in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]):
+        jpeg = cv2.imencode(".jpg", flown[0], options)[1].tobytes()
+        thumbnail = cv2.imencode(".jpg", flown[0][::8, ::8])[1].tobytes()
+        segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+        (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:] + tail)
+        assert read_image(tmp_path / "a.jpg").shape == (360, 640, 3)
+        (tmp_path / "a.jpg").write_bytes((jpeg[:2] + segment + jpeg[2:])[:-400])
+        with pytest.raises(InputError, match="it is truncated"):
+            read_image(tmp_path / "a.jpg")
+
+
+def test_an_image_without_texture_gets_no_pose_on_board(bundle, flown):
+    """A network would answer black, fog and a covered lens with a pose and an ordinary covariance."""
+    localizer = Localizer(bundle)
+    noise = np.random.default_rng(0).normal(10, 4, flown[0].shape)
+    for image, told in (
+        (np.zeros_like(flown[0]), "nearly black"),
+        (np.clip(noise, 0, 255).astype(np.uint8), "nearly black"),
+        (np.full_like(flown[0], 250), "nearly white"),
+        ((flown[0] * 0.05 + 180).astype(np.uint8), "fogged or covered"),
+        (cv2.GaussianBlur(flown[0], (0, 0), 60), "fogged or covered"),
+    ):
+        found = localizer.localize(image, LENS)
+        assert told in found.reason
+        assert np.isnan(found.poses.centers).all()
+        assert np.isnan(found.covariance).all()
 
 
 def test_a_place_on_the_globe_is_told():

@@ -22,6 +22,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
+from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.simulate.video_out import write_video
@@ -66,6 +67,13 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = [cv2.resize(frame("video", k).image, (256, 192)) for k in range(10)]  # type: ignore[call-overload]
     write_video(path, images, width=256, height=192, fps=5, crf=18)
     return path
+
+
+@pytest.fixture(autouse=True)
+def smooth_is_enough(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """The coloured field of these tests has no texture, which a network of real images needs."""
+    if "texture" not in request.node.name:
+        monkeypatch.setattr("spn_model.prediction.flights.missing_texture", lambda image: "")
 
 
 def silent(step: str, done: int, total: int) -> None:
@@ -377,3 +385,35 @@ def test_options_are_documented_with_their_defaults(name):
     for parameter in command.params:
         if isinstance(parameter.default, int) and not isinstance(parameter.default, bool):
             assert listed[parameter.opts[0]] == str(parameter.default)
+
+
+def test_images_without_texture_get_no_pose(network, photos, tmp_path):
+    """Black, white and fogged images have a row with a reason, the function of the program on board."""
+    steps = np.random.default_rng(0).integers(40, 200, (12, 16, 3), dtype=np.uint8)
+    shape = np.asarray(Image.open(photos / "000.png")).shape
+    good = cv2.resize(steps, shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    Image.fromarray(good).save(photos / "000.png")
+    images = {"900": good * 0, "901": good * 0 + 250, "902": (good * 0.03 + 180).astype(np.uint8)}
+    for stem, image in images.items():
+        Image.fromarray(image).save(photos / f"{stem}.png")
+    done = predicted(network, photos, tmp_path / "poses")
+    rows = read_csv(tmp_path / "poses" / "poses.csv", list(COLUMNS))
+    found = {row["source"]: (row["status"], row["reason"]) for _, row in rows}
+    assert found["000.png"] == (ESTIMATED, "")
+    for stem, told in (("900", "nearly black"), ("901", "nearly white"), ("902", "fogged")):
+        status, reason = found[f"{stem}.png"]
+        assert status == FAILED
+        assert told in reason
+        assert reason == missing_texture(images[stem])
+    assert done.counts[ESTIMATED] == 1
+
+
+def test_a_damaged_photo_beside_a_good_one_ends_nothing(network, photos, tmp_path):
+    """Given one by one, each photo is a flight; the bad one has a row, and alone it is an error."""
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no image")
+    flights, _ = find_flights([bad, photos / "000.png"], CAMERA)
+    done = predict(network, flights, tmp_path / "poses", silent, facts={})
+    assert done.counts == {ESTIMATED: 1, FAILED: 0, UNREADABLE: 1}
+    with pytest.raises(InputError, match="none of its photos can be read"):
+        find_flights([bad], CAMERA)
