@@ -116,9 +116,7 @@ RULES = {
     ),
     "coverage unknown": (lambda d: replace(d, coverage=None), Level.CAUTION, "is not known"),
     "coverage stale": (
-        lambda d: replace(
-            d, coverage=replace(d.coverage, stale="4-eval/medium was redone since")
-        ),
+        lambda d: replace(d, coverage=replace(d.coverage, stale="4-eval/medium was redone since")),
         Level.CAUTION,
         "Coverage is out of date: 4-eval/medium",
     ),
