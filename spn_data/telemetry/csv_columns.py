@@ -45,7 +45,8 @@ _UNITS: dict[str, dict[str, float]] = {
     "time": _SECONDS | _PARTS,
     "utc": _SECONDS | _PARTS | {"utc": 1.0, "local": 1.0},
 }
-_BRACKETS = re.compile(r"(.*?)\s*[(\[]\s*([^()\[\]]*?)\s*[)\]]\s*")
+# No two neighbouring repetitions match the same character: a long header would take long. Blanks are stripped.
+_BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def parse_header(header: Sequence[str]) -> dict[str, CsvColumn]:
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
     """Split "height_above_takeoff(feet)" or "OSD.height [ft]" into a normalised name and a unit."""
-    match = _BRACKETS.fullmatch(cell)
+    match = _BRACKETS.fullmatch(cell.strip())
     name, unit = (match[1], match[2]) if match else (cell, "")
     name = re.sub(r"[\s.\-]+", "_", name.strip().lower())
     return name.removeprefix("osd_").removeprefix("custom_"), unit.strip().lower()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from spn_data.errors import InputError
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_IMAGE_BYTES = 500_000_000
+# Only self-contained formats: a playlist or script could refer to other files or hosts.
+_DEMUXERS = "mov,matroska,webm,mpegts,mpeg,avi,asf,flv,h264,hevc,mpegvideo,ogg,mxf"
+_LOCAL_ONLY = f"protocol_whitelist;file|format_whitelist;{_DEMUXERS}"
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"  # OpenCV has no argument for them
 
 
 def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
@@ -25,8 +30,7 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
         yield 0, math.nan, read_image(source)
         return
     _check_file(source)
-    # Resolved, because OpenCV interprets some names as a device, a pattern or a URL.
-    video = cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
+    video = _open_video(source)
     try:
         number = 0
         while True:
@@ -36,9 +40,26 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
             yield number, video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image
             number += 1
         if not number:
-            raise InputError("cannot be decoded as a video", path=source)
+            raise InputError(
+                "cannot be decoded as a video; playlists, URLs and streams are not read", path=source
+            )
     finally:
         video.release()
+
+
+def _open_video(source: Path) -> cv2.VideoCapture:
+    """Open one local file that refers to no other file or host."""
+    before = os.environ.get(_OPTIONS)
+    # FFmpeg uses the last of several values of an option.
+    os.environ[_OPTIONS] = _LOCAL_ONLY if before is None else f"{before}|{_LOCAL_ONLY}"
+    try:
+        # Resolved, because OpenCV interprets some names as a device, a pattern or a URL.
+        return cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
+    finally:
+        if before is None:
+            del os.environ[_OPTIONS]
+        else:
+            os.environ[_OPTIONS] = before
 
 
 def read_image(path: Path) -> np.ndarray:
