@@ -11,6 +11,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.json_values import numbers
 
 _MAX_BYTES = 100_000
 
@@ -40,17 +41,14 @@ def camera_from_json(value: dict[str, Any]) -> Camera:
     """
     if not isinstance(value, dict):
         raise TypeError(f"{type(value).__name__} instead of an object")
-    try:
-        camera = Camera(
-            str(value["model"]),
-            int(value["width"]),
-            int(value["height"]),
-            np.array(value["params"], dtype=np.float64),
-        )
-    except OverflowError as error:
-        raise ValueError("a number is too large") from error
-    if not (np.isfinite(camera.params).all() and min(camera.focal_px) > 0):
-        raise ValueError("its parameters are not finite, or its focal length is not positive")
+    camera = Camera(
+        str(value["model"]),
+        int(numbers(value["width"])),
+        int(numbers(value["height"])),
+        numbers(value["params"], len(value["params"])),
+    )
+    if min(camera.focal_px) <= 0:
+        raise ValueError("its focal length is not positive")
     if not (0 < camera.width <= 100_000 and 0 < camera.height <= 100_000):
         raise ValueError(f"its image size of {camera.width}x{camera.height} is not valid")
     return camera

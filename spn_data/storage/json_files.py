@@ -18,7 +18,7 @@ VERSION = 1  # of the area's layout and of stage.json
 MAX_BYTES = 500_000_000  # far beyond the files of an area of 100 000 frames
 # Raised when values of a damaged file are used.
 DAMAGE = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
-_MAX_DIGITS = 18  # integers then fit into 64 bits
+_MAX_DIGITS = 100  # the state of a random generator needs 39, a float holds 308
 _MAX_TOLD = 200
 _KINDS = {
     dict: "an object",
@@ -72,7 +72,7 @@ def load_json(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON of any kind; raise ValueError if it is none, nested too deeply, or has too large a number."""
+    """Parse JSON; raise ValueError if it is damaged, nested too deeply, or has too large a number."""
     try:
         return json.loads(text, parse_int=_integer, parse_float=_float)
     except RecursionError as error:
@@ -119,7 +119,7 @@ def _float(digits: str) -> float:
 
 
 def check_version(path: Path, found: Any) -> None:
-    """Raise FormatError if the version found in a file is newer than this program's, TypeError if it is none."""
+    """Raise FormatError if the version found in a file is newer than this program's, TypeError for no number."""
     if not isinstance(found, int) or isinstance(found, bool):
         raise TypeError(f"its version is {kind_of(found)}")
     if found > VERSION:

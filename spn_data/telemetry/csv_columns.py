@@ -45,7 +45,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "time": _SECONDS | _PARTS,
     "utc": _SECONDS | _PARTS | {"utc": 1.0, "local": 1.0},
 }
-# No two neighbouring repetitions match the same character: a long header would take long. Blanks are stripped.
+# Without repetitions that can match the same blanks: a long header would take long.
 _BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 
 

@@ -1,4 +1,4 @@
-"""Check that an ONNX file is self-contained, by walking its protobuf fields; the package onnx is not on board."""
+"""Check that an ONNX file refers to no other file, by walking its protobuf fields without the package onnx"""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def check_self_contained(path: Path) -> None:
                 if at > end or field == 0:
                     raise ValueError("it is not an ONNX file")
                 if kind == "tensor" and (
-                    field == _EXTERNAL_DATA or (field == _DATA_LOCATION and (value or form != _VARINT))
+                    field == _EXTERNAL_DATA
+                    or (field == _DATA_LOCATION and (value or form != _VARINT))
                 ):
                     raise ValueError("it keeps a weight in another file, which no hash covers")
                 if form == _BYTES and field in _MESSAGES[kind]:

@@ -41,7 +41,8 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
             number += 1
         if not number:
             raise InputError(
-                "cannot be decoded as a video; playlists, URLs and streams are not read", path=source
+                "cannot be decoded as a video; playlists, URLs and streams are not read",
+                path=source,
             )
     finally:
         video.release()

@@ -38,7 +38,7 @@ def test_the_last_brackets_of_a_cell_hold_its_unit():
 def test_a_long_number_takes_no_time():
     """A number of many digits that ends in a letter is refused at once."""
     start = time.process_time()
-    with pytest.raises(ValueError, match="latitude is '111.*not a number"):
+    with pytest.raises(ValueError, match=r"latitude is '111.*not a number"):
         parse_record(1, 0.0, "[latitude: " + "1" * MANY + "x]")
     assert time.process_time() - start < MOST_S
 
