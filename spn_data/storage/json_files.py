@@ -119,7 +119,7 @@ def _float(digits: str) -> float:
 
 
 def check_version(path: Path, found: Any) -> None:
-    """Raise FormatError if the version found in a file is newer than this program's, TypeError for no number."""
+    """Raise FormatError if a file's version is newer than this program's, TypeError if it is none."""
     if not isinstance(found, int) or isinstance(found, bool):
         raise TypeError(f"its version is {kind_of(found)}")
     if found > VERSION:

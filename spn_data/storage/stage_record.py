@@ -30,6 +30,11 @@ _HELD: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("inputs", "upstream", "versions", "notes"), str),
     **dict.fromkeys(("seconds", "cpu_seconds"), (int, float)),
 }
+# Counts that are numbers in every stage that has them.
+_NUMBERS = {
+    *("chosen", "candidates", "with_fix", "unreadable"),
+    *("registered", "frames", "points", "mean_error_px"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +103,10 @@ def read_record(path: Path) -> StageRecord:
             wanted = _PARTS.get(name)
             if wanted is not None:
                 _check(name, value, wanted)
+        for name in _NUMBERS & set(table.get("counts", {})):
+            value = table["counts"][name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise TypeError(f"the count {name!r} is {kind_of(value)}")
         del table["version"]
         return StageRecord(
             **{
