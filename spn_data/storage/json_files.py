@@ -96,8 +96,10 @@ def damage_told(path: Path, what: str = "") -> Iterator[None]:
         why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         if isinstance(error, KeyError):
             why = f"{error} is missing"
-        told = f"is not {what} written by this program" if what else "cannot be read"
-        raise FormatError(f"{path}: {told} ({why[:_MAX_TOLD]})") from error
+        why = why[:_MAX_TOLD]
+        if what:
+            raise FormatError(f"{path}: is not {what} written by this program ({why})") from error
+        raise FormatError(f"{path}: cannot be read ({why})") from error
 
 
 def kind_of(value: Any) -> str:

@@ -140,7 +140,7 @@ def test_a_camera_of_other_kinds_is_refused(tmp_path, text):
     ("line", "told"),
     [
         (f"momentum = {HUGE}", "2: momentum is too large"),
-        (f"momentum = {DEEP[49_000:-49_000]}", " is not a valid recipe: nested too deeply"),
+        (f"momentum = {DEEP[97_500:-97_500]}", " is not a valid recipe: nested too deeply"),
     ],
 )
 def test_a_recipe_beyond_bounds_is_refused(tmp_path, line, told):
