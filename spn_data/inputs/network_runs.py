@@ -104,7 +104,7 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
             figures=figures,
             left_out=left_out,
         )
-    except (*DAMAGE, OSError) as error:
+    except (*DAMAGE, OSError, FormatError) as error:
         raise FormatError(
             f"{path}: cannot be shown ({str(error)[:_MAX_TEXT]!r}); run spn-model evaluate again"
         ) from error

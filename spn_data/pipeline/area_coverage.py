@@ -206,7 +206,8 @@ def read_coverage(area: Area, folder: str = COVERAGE) -> dict[str, Any] | None:
         raise FormatError(f"{path}: is not a coverage file written by this program")
     with damage_told(path, "a coverage file"):
         for name in ("sequences", "made_of", "options"):
-            if not isinstance(value[name], dict):
+            # Without metres there are no options.
+            if not isinstance(value[name], dict) and (name != "options" or value[name] is not None):
                 raise TypeError(f"{name!r} is {kind_of(value[name])} instead of an object")
         if not isinstance(value["fly_again"], list | None):
             raise TypeError(f"'fly_again' is {kind_of(value['fly_again'])} instead of a list")
