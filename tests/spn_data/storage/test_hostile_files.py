@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
+from spn_cli.data import main
 
 from spn_data.area.area import Area, StageWork
 from spn_data.area.names import FRAMES, MODEL
@@ -110,6 +112,18 @@ def test_an_area_file_that_is_a_folder_is_told(tmp_path):
     (tmp_path / "area.toml").mkdir()
     with pytest.raises(FormatError, match=r"area\.toml: .*Is a directory"):
         Area(tmp_path)
+
+
+@pytest.mark.parametrize("counts", [{}, {"chosen": 3}, None, {"chosen": [], "sequences": 1}])
+def test_status_tells_damage_in_one_line(area, counts):
+    """The command names the damaged record and ends with code 1."""
+    path = area.folder(FRAMES) / "stage.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "counts": counts}))
+    result = CliRunner().invoke(main, ["status", "--area", str(area.root)])
+    assert result.exit_code == 1, result.output
+    assert result.output.startswith("Error: ")
+    assert "stage.json" in result.output
+    assert len(result.output.splitlines()) == 1
 
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 360, "params": [400, 400, 320, 180]}
