@@ -67,9 +67,10 @@ def test_only_colmap_knows_pycolmaps_objects():
 
 
 def test_pyav_stays_with_video():
-    """PyAV is imported where videos are decoded, encoded, or searched for subtitles."""
+    """PyAV is imported where videos are opened, decoded, encoded, or searched for subtitles."""
     assert _importers("av") == {
         "spn_data/capture/video_container.py",
+        "spn_data/media/container.py",
         "spn_data/telemetry/subtitles.py",
         "spn_data/simulate/video_out.py",
     }

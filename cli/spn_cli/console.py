@@ -43,7 +43,7 @@ class Group(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; turn errors into click's, and Ctrl-C into exit code 130."""
+        """Run a command; turn errors into click's, Ctrl-C into exit code 130, and SIGTERM into 143."""
         if ctx.params.get("verbose"):
             ctx.with_resource(_log_on_stderr())
         try:
@@ -58,7 +58,7 @@ class Group(click.Group):
             click.echo(
                 "\nStopped. Completed work is kept: run the same command to resume.", err=True
             )
-            ctx.exit(130)
+            ctx.exit(128 + _stopped_by)
         except OSError as error:
             # Without a file name it is a bug, unless the disk refused a write.
             if ctx.params.get("verbose") or (error.filename is None and error.errno not in _DISK):
@@ -97,27 +97,38 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 _stop_wanted = False
+_stopped_by = int(signal.SIGINT)
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Remember Ctrl-C within the block: Python drops the exception in callbacks of native libraries."""
-    global _stop_wanted
-    _stop_wanted = False
+    """Remember Ctrl-C within the block: Python drops the exception in callbacks of native libraries.
+
+    SIGTERM is treated as Ctrl-C.
+    """
+    global _stop_wanted, _stopped_by
+    _stop_wanted, _stopped_by = False, int(signal.SIGINT)
 
     def stop(*_: object) -> None:
         global _stop_wanted
         _stop_wanted = True
         raise KeyboardInterrupt
 
+    def terminate(*_: object) -> None:
+        global _stopped_by
+        _stopped_by = int(signal.SIGTERM)
+        # Whoever handles or defers Ctrl-C at this moment does the same for SIGTERM.
+        signal.raise_signal(signal.SIGINT)
+
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, stop)
+    before = signal.signal(signal.SIGINT, stop), signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])
 
 
 def _raise_if_stopped() -> None:

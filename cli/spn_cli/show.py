@@ -24,6 +24,7 @@ from spn_data.area.names import (
 )
 from spn_data.errors import StageError
 from spn_data.pipeline.frames_stage import Plan
+from spn_data.storage.json_files import damage_told
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
@@ -226,11 +227,13 @@ def status(area: Area) -> None:
             rows.append((stage, state, "", ""))
             continue
         record = area.record(stage)
+        with damage_told(area.folder(stage)):
+            holds = _summary(record)
         reason = area.stale_because(stage)
         state = f"stale: {reason}" if reason else "complete"
         if area.partial(stage).exists():
             state += "; redoing it is unfinished"
-        rows.append((stage, state, _summary(record), record.finished))
+        rows.append((stage, state, holds, record.finished))
     rows += [_run(area, name) for name in area.sequences(RUNS)]
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
     if area.has_unfinished_addition():
@@ -244,17 +247,20 @@ def verdict(area: Area) -> None:
         console.out.print("There is no model yet; run spn-data reconstruct.")
         return
     counts = area.record(MODEL).counts
-    share = counts["registered"] / counts["frames"]
+    with damage_told(area.folder(MODEL)):
+        share = counts["registered"] / max(counts["frames"], 1)
     sentence = f"{counts['registered']} of {counts['frames']} frames ({share:.1%}) have a pose"
     if area.has(GEO) and area.stale_because(GEO) is None:
         c = area.record(GEO).counts
-        horizontal = _m(_twice(c["sigma_horizontal_m"]))
+        with damage_told(area.folder(GEO)):
+            horizontal = _m(_twice(c["sigma_horizontal_m"]))
+            vertical = _m(_twice(c["sigma_vertical_m"]))
         sentence += f" in {area.folder(GEO)}; "
         sentence += f"uncertainty of the whole model (2 sigma): horizontal {horizontal}"
         if c["height_reference"] == "unknown":
             sentence += "; its height reference is unknown."
         else:
-            sentence += f", vertical {_m(_twice(c['sigma_vertical_m']))}."
+            sentence += f", vertical {vertical}."
     else:
         sentence += f" in {area.folder(MODEL)}, in model units, not metres."
     console.out.print(sentence)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.area.facts import Facts, read_facts, write_facts
+from spn_data.area.leftovers import remove_leftovers
 from spn_data.area.names import (
     COMPARED,
     EVALUATION,
@@ -29,8 +30,8 @@ from spn_data.area.names import (
     TRACKED,
 )
 from spn_data.capture.sources import safe_name
-from spn_data.errors import InputError, InUseError, StageError
-from spn_data.storage.files import LOCK, locked
+from spn_data.errors import FormatError, InputError, InUseError, StageError
+from spn_data.storage.files import LOCK, locked, make_folder
 from spn_data.storage.json_files import VERSION, write_json
 from spn_data.storage.stage_record import (
     StageRecord,
@@ -175,7 +176,10 @@ class Area:
         path = self.folder(stage) / _RECORD
         if not path.exists():
             raise StageError(f"{self.folder(stage)} is missing; run {command_of(stage)} first")
-        return read_record(path)
+        record = read_record(path)
+        if current_stage(record.stage).partition("/")[0] != stage.partition("/")[0]:
+            raise FormatError(f"{path}: is the record of another stage, {record.stage!r:.60}")
+        return record
 
     def stale_because(self, stage: str) -> str | None:
         """Return why a stage is out of date with respect to its upstream stages, or None."""
@@ -271,7 +275,7 @@ class Area:
                 return self.record(stage)
         if not resumed:
             shutil.rmtree(path, ignore_errors=True)
-            _make_folder(path)
+            make_folder(path)
             write_json(started, {"version": VERSION, **asdict(record)})
         _logger.debug("%s: %s", stage, "resumed" if resumed else "started")
         return StageWork(self, record, path, resumed=resumed)
@@ -295,8 +299,9 @@ class Area:
         Creates the folder, and removes it again if it stays empty. Raises InUseError if it is in use.
         """
         is_new = not self.root.exists()
-        _make_folder(self.root)
+        make_folder(self.root)
         with locked(self.root, "spn-data"):
+            remove_leftovers(self.root, (*STAGES, SPLIT), [self.group_folder(g) for g in GROUPS])
             try:
                 yield
             finally:
@@ -387,13 +392,6 @@ def command_of(stage: str) -> str:
         SPLIT: "spn-data split",
     }
     return commands.get(group, "spn-data reconstruct")
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StageError(f"{path} cannot be created: {error.strerror}") from error
 
 
 def _has_files(path: Path) -> bool:

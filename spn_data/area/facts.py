@@ -9,9 +9,10 @@ from pathlib import Path
 
 import tomli_w
 
-from spn_data.errors import FormatError
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import VERSION, check_version
+from spn_data.storage.json_files import VERSION, check_version, damage_told
+
+_MAX_BYTES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +42,22 @@ def read_facts(path: Path) -> Facts:
     """
     if not path.exists():
         return Facts()
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    with damage_told(path, "an area file"):
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"larger than {_MAX_BYTES // 1_000_000} MB")
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+        except RecursionError as error:
+            raise ValueError("nested too deeply") from error
         check_version(path, table["version"])
-        evaluation = {str(k): str(v) for k, v in dict(table.get("evaluation", {})).items()}
-        return Facts(sources=tuple(str(s) for s in table["sources"]), evaluation=evaluation)
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: not an area file of this program ({error!r})") from error
+        sources, evaluation = table["sources"], table.get("evaluation", {})
+        if not isinstance(sources, list) or not all(isinstance(s, str) for s in sources):
+            raise TypeError("sources is not a list of texts")
+        if not isinstance(evaluation, dict) or not all(
+            isinstance(s, str) for s in evaluation.values()
+        ):
+            raise TypeError("evaluation is not a table of texts")
+        return Facts(sources=tuple(sources), evaluation=evaluation)
 
 
 def write_facts(path: Path, facts: Facts) -> None:

@@ -16,12 +16,12 @@ from spn_data.capture.video_container import (
     Orientation,
     decoded_frames,
     frame_orientation,
-    open_container,
     pixel_aspect_ratio,
     upright_size,
     video_stream,
 )
 from spn_data.errors import InputError
+from spn_data.media.container import open_container
 
 MAX_PIXELS = 200_000_000
 _MAX_PACKETS_TO_FIRST_FRAME = 1000

@@ -1,4 +1,4 @@
-"""Opening video containers with PyAV, demuxing damaged ones, and the geometry of stored frames."""
+"""Decoding of video containers, damaged ones too, and the geometry of stored frames."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ import cv2
 import numpy as np
 
 from spn_data.errors import InputError
-
-# Only self-contained formats: a playlist or script could refer to other files or hosts.
-_DEMUXERS = "mov,matroska,webm,mpegts,mpeg,avi,asf,flv,h264,hevc,mpegvideo,ogg,mxf"
 
 
 @dataclass(frozen=True)
@@ -33,39 +30,6 @@ class Orientation:
         if self.flip_x or self.flip_y:
             image = cv2.flip(image, -1 if self.flip_x and self.flip_y else int(self.flip_x))
         return image
-
-
-def open_container(path: Path) -> Any:
-    """Open one local file for reading; refuse anything that refers to other files."""
-    if path.is_dir():
-        raise InputError("is a folder, not a video", path=path)
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-    if size == 0:
-        raise InputError("is empty (0 bytes)", path=path)
-    try:
-        return av.open(
-            f"file:{path.resolve()}",
-            options={"format_whitelist": _DEMUXERS, "protocol_whitelist": "file"},
-            metadata_errors="replace",
-        )
-    except av.error.FFmpegError as error:
-        raise InputError(_why_unreadable(path), path=path) from error
-    except OSError as error:
-        raise InputError(f"can't be read: {error.strerror}", path=path) from error
-
-
-def _why_unreadable(path: Path) -> str:
-    with path.open("rb") as file:
-        head = file.read(12)
-    if head[4:8] in (b"ftyp", b"mdat", b"wide", b"free", b"moov"):
-        return (
-            "is truncated: the index (moov) that a camera writes at the end of a recording is missing; "
-            "copy it again or let the drone repair it"
-        )
-    return "is not a video"
 
 
 def video_stream(container: Any, path: Path) -> Any:

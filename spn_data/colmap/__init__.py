@@ -3,11 +3,18 @@
 Import pycolmap from here: cv2 must be loaded before it, otherwise writing a PNG aborts the process.
 """
 
+import signal
+import threading
+
 import cv2  # noqa: F401  (must be loaded first)
 import pycolmap
 
 # Keep COLMAP's log off the terminal; child processes write theirs to a log file.
 pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
 pycolmap.logging.alsologtostderr = False
+
+# Its import replaces the handler of SIGTERM by one that prints a native stack trace.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 __all__ = ["pycolmap"]

@@ -13,6 +13,7 @@ import numpy as np
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.storage.json_files import parse_json
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1
@@ -234,7 +235,7 @@ def flag(value: Any) -> bool:
 
 
 def _json(value: Any) -> Any:
-    return json.loads(_text(value))
+    return parse_json(_text(value))
 
 
 def _origin(attributes: Mapping[str, Any]) -> GeoOrigin:

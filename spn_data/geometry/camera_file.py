@@ -11,6 +11,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.json_values import numbers
 
 _MAX_BYTES = 100_000
 
@@ -38,14 +39,16 @@ def camera_from_json(value: dict[str, Any]) -> Camera:
     KeyError, TypeError, ValueError
         If it does not describe a valid camera.
     """
+    if not isinstance(value, dict):
+        raise TypeError(f"{type(value).__name__} instead of an object")
     camera = Camera(
         str(value["model"]),
-        int(value["width"]),
-        int(value["height"]),
-        np.array(value["params"], dtype=np.float64),
+        int(numbers(value["width"])),
+        int(numbers(value["height"])),
+        numbers(value["params"], len(value["params"])),
     )
-    if not (np.isfinite(camera.params).all() and min(camera.focal_px) > 0):
-        raise ValueError("its parameters are not finite, or its focal length is not positive")
+    if min(camera.focal_px) <= 0:
+        raise ValueError("its focal length is not positive")
     if not (0 < camera.width <= 100_000 and 0 < camera.height <= 100_000):
         raise ValueError(f"its image size of {camera.width}x{camera.height} is not valid")
     return camera
@@ -73,9 +76,10 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         if path.stat().st_size > _MAX_BYTES:
             raise InputError("is too large for a camera file", path=path)
         return camera_from_json(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        why = f"{error} is missing" if isinstance(error, KeyError) else str(error)[:200]
         raise InputError(
-            f"does not contain a camera ({error}); expected model, width, height and params "
+            f"does not contain a camera ({why}); expected model, width, height and params "
             "in COLMAP's order",
             path=path,
         ) from error

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.json_values import numbers
 from spn_data.geometry.rotations import (
     canonical_quats,
     quats_from_rotations,
@@ -260,11 +261,12 @@ class Similarity:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Similarity:
         """Return the similarity of `to_json`. Raises KeyError, TypeError or ValueError for other values."""
-        return cls(
-            float(value["scale"]),
-            np.array(value["rotation"], np.float64).reshape(3, 3),
-            np.array(value["translation"], np.float64).reshape(3),
-        )
+        scale, rotation = float(numbers(value["scale"])), numbers(value["rotation"], 3, 3)
+        if not (scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
+            raise ValueError("its scale is not positive, or its rotation is none")
+        if np.linalg.det(rotation) < 0:
+            raise ValueError("its rotation is a reflection")
+        return cls(scale, rotation, numbers(value["translation"], 3))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Transform points (..., 3) into the target frame."""

@@ -34,7 +34,7 @@ from spn_data.labels.labels import LabelObservations, Labels, read_label_observa
 from spn_data.labels.map_points import MapPoints
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.registration_file import read_reasons
-from spn_data.storage.json_files import read_json
+from spn_data.storage.json_files import DAMAGE, damage_told, read_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,11 @@ def chosen_frames(area: Area) -> Frames:
 
 def read_geo(area: Area) -> GeoFit | None:
     """Read the georegistration of an area; None if it has none."""
-    return GeoFit.from_json(read_json(area.folder(GEO) / GEO_FIT)) if area.has(GEO) else None
+    if not area.has(GEO):
+        return None
+    path = area.folder(GEO) / GEO_FIT
+    with damage_told(path, "a georegistration"):
+        return GeoFit.from_json(read_json(path))
 
 
 def read_world_from_model(area: Area) -> Similarity:
@@ -203,10 +207,19 @@ def _read_stage(
     """Read the labels of one stage in the present world frame: the georegistration may have changed since."""
     folder = area.folder(stage)
     labels = read_labels(folder / POSES)
-    written = Similarity.from_json(read_json(folder / REGISTRATION)["world_from_model"])
+    written = read_written_world(folder / REGISTRATION)
     if written.to_json() != world_from_model.to_json():
         labels = labels.transformed(world_from_model @ written.inverse())
     return labels, read_label_observations(folder / OBSERVATIONS)
+
+
+def read_written_world(path: Path) -> Similarity:
+    """Read from registration.json the world frame that the labels of a stage were written in.
+
+    Raises FormatError if the file is damaged.
+    """
+    with damage_told(path, "a registration"):
+        return Similarity.from_json(read_json(path)["world_from_model"])
 
 
 def merge_labels(
@@ -227,5 +240,5 @@ def merge_labels(
 def _read_camera(path: Path) -> Camera:
     try:
         return camera_from_json(read_json(path))
-    except (KeyError, TypeError, ValueError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{path}: is not a camera file ({error})") from error

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from spn_data.area.area import Area
 from spn_data.area.names import EVALUATION, POSES, REGISTRATION, TRACKED
-from spn_data.geometry.pose import Similarity
-from spn_data.inputs.area_labels import read_world_from_model
+from spn_data.inputs.area_labels import read_world_from_model, read_written_world
 from spn_data.inputs.file_links import link_or_copy
 from spn_data.labels.labels import read_labels, write_labels
 from spn_data.storage.json_files import read_json, write_json
@@ -40,7 +39,7 @@ def move_labels(area: Area) -> tuple[str, ...]:
 def _move(area: Area, stage: str) -> bool:
     folder = area.folder(stage)
     registration = read_json(folder / REGISTRATION)
-    before = Similarity.from_json(registration["world_from_model"])
+    before = read_written_world(folder / REGISTRATION)
     now = read_world_from_model(area)
     if before.to_json() == now.to_json():
         return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import finite_or_none
+from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json
 
 _VERSION = 1  # format of metrics.json
 _MAX_BYTES = 20_000_000
@@ -64,9 +63,7 @@ def read_runs(area: Area) -> tuple[tuple[RunFacts, ...], tuple[str, ...]]:
 def _read(folder: Path, current: str, budget: int) -> RunFacts:
     path = folder / METRICS
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError(f"larger than {_MAX_BYTES // 1_000_000} MB")
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = load_json(path, max_bytes=_MAX_BYTES)
         if table["version"] != _VERSION:
             raise ValueError(f"format version {table['version']!r}, this program reads {_VERSION}")
         facts = table["facts"]
@@ -107,10 +104,7 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
             figures=figures,
             left_out=left_out,
         )
-    except (
-        *(OSError, ValueError, KeyError, TypeError, AttributeError),
-        *(OverflowError, RecursionError),
-    ) as error:
+    except (*DAMAGE, OSError, FormatError) as error:
         raise FormatError(
             f"{path}: cannot be shown ({str(error)[:_MAX_TEXT]!r}); run spn-model evaluate again"
         ) from error

@@ -56,7 +56,7 @@ from spn_data.split.audit_files import (
 )
 from spn_data.split.groups import TRAIN, Split
 from spn_data.split.split_file import read_split
-from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.json_files import DAMAGE, VERSION, read_json, write_json
 
 
 def audit(area: Area) -> tuple[AuditFinding, ...]:
@@ -255,5 +255,5 @@ def read_audit(path: Path) -> tuple[AuditFinding, ...]:
             )
             for f in table["findings"]
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{path}: is not an audit written by this program ({error!r})") from error

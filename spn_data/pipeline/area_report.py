@@ -41,7 +41,7 @@ from spn_data.report.html import render
 from spn_data.report.verdict import AreaVerdict, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import read_json
+from spn_data.storage.json_files import DAMAGE, damage_told, read_json
 from spn_data.storage.stage_record import versions
 
 
@@ -118,8 +118,9 @@ def report_data(area: Area) -> ReportData:
     if fresh.has(GEO):
         path = fresh.folder(GEO) / GEO_FIT
         value = read_json(path)
-        geo = GeoFit.from_json(value)
-        residuals = _residuals(path, value, geo)
+        with damage_told(path, "a georegistration"):
+            geo = GeoFit.from_json(value)
+            residuals = _residuals(path, value, geo)
     split, checks = None, None
     if fresh.has(SPLIT):
         split = read_split(fresh.folder(SPLIT) / SPLIT_FILE)
@@ -276,7 +277,7 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
             for stop in value["fly_again"] or ()
         )
         limits = _limits(value["options"])
-    except (KeyError, TypeError, ValueError) as error:
+    except DAMAGE as error:
         raise _damaged(area.folder(folder), error) from error
     return CoverageFacts(counts, stops, limits, coverage_stage.stale_because(area, value))
 

@@ -40,7 +40,7 @@ from spn_data.registration.frame_covariance import (
     PointObservations,
     frame_covariances,
 )
-from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.json_files import DAMAGE, VERSION, read_json, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.tracking.label_video import track_frames
 from spn_data.tracking.tracked_frames import TrackingOptions
@@ -214,7 +214,7 @@ def _own_lens(area: Area, sequence: str, camera: Camera) -> LensUncertainty:
         if estimated not in (names, ()):
             raise ValueError("its covariance is for other parameters")
         matrix = np.array(value["covariance"], np.float64).reshape((len(estimated),) * 2)
-    except (KeyError, TypeError, ValueError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{path}: cannot be read ({error})") from error
     return LensUncertainty(covariance=matrix)
 

@@ -6,7 +6,6 @@ import csv
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Poses
 from spn_data.simulate.flight import FlightPath
 from spn_data.simulate.presets import SimulateOptions
+from spn_data.storage.json_files import read_json
 
 VERSION = 1
 _COLUMNS = ("frame", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "blurred")
@@ -108,7 +108,7 @@ def read_truth(folder: Path, flight: str) -> Truth:
     table_path, camera_path = folder / f"{flight}.csv", folder / f"{flight}_camera.json"
     if not table_path.is_file():
         raise InputError(f"no ground truth for flight {flight!r}", path=folder)
-    camera, origin = _read_json(camera_path), _read_json(folder / "origin.json")
+    camera, origin = read_json(camera_path), read_json(folder / "origin.json")
     try:
         with table_path.open(encoding="utf-8", newline="") as file:
             header = tuple(next(csv.reader(file)))
@@ -131,14 +131,3 @@ def read_truth(folder: Path, flight: str) -> Truth:
         raise FormatError(
             f"{table_path}: not a ground-truth file of spn-data simulate ({error})"
         ) from error
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        version = int(values["version"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: cannot be read as JSON with a version ({error})") from error
-    if version > VERSION:
-        raise FormatError(f"{path}: version {version} is newer than this program's {VERSION}")
-    return dict(values)

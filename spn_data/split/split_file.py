@@ -19,7 +19,7 @@ from spn_data.split.groups import (
     Split,
     SplitOptions,
 )
-from spn_data.storage.json_files import VERSION, read_json, write_json
+from spn_data.storage.json_files import DAMAGE, VERSION, kind_of, read_json, write_json
 from spn_data.storage.stage_record import current_options
 
 _VALIDATION_LIMITATIONS = (
@@ -77,6 +77,8 @@ def read_split(path: Path) -> Split:
         options["validation"] = Policy(options["validation"])
         names, group, reason = [], [], []
         for own, members in table["groups"].items():
+            if not isinstance(members, list):
+                raise TypeError(f"group {own!r} is {kind_of(members)} instead of a list")
             names += members
             group += [str(own)] * len(members)
             reason += [""] * len(members)
@@ -94,7 +96,7 @@ def read_split(path: Path) -> Split:
             optimistic=bool(table["optimistic"]),
             notes=tuple(str(note) for note in table["notes"]),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{path}: is not a split written by this program ({error!r})") from error
     return split
 

@@ -180,3 +180,11 @@ def read_csv(
         raise InputError(f"can't be read: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
         raise InputError("is not UTF-8 text", path=path) from error
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents; raise StageError if that is impossible."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StageError(f"{path} cannot be created: {error.strerror}") from error

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,18 @@ from spn_data.errors import FormatError
 from spn_data.storage.files import write_atomically
 
 VERSION = 1  # of the area's layout and of stage.json
+MAX_BYTES = 500_000_000  # far beyond the files of an area of 100 000 frames
+# Raised when values of a damaged file are used.
+DAMAGE = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+_MAX_DIGITS = 100  # the state of a random generator needs 39, a float holds 308
+_MAX_TOLD = 200
+_KINDS = {
+    dict: "an object",
+    list: "a list",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
+}
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -27,24 +40,90 @@ def write_json(path: Path, value: Any) -> None:
     write_atomically(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object that has a `version`.
 
     Raises
     ------
     FormatError
-        If the file is missing, damaged, or of a newer version.
+        If the file is missing, damaged, too large, or of a newer version.
     """
-    try:
-        value = json.loads(path.read_text())
+    value = load_json(path)
+    with damage_told(path):
         check_version(path, value["version"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: cannot be read ({error!r})") from error
     return value
 
 
-def check_version(path: Path, found: int) -> None:
-    """Raise FormatError if the version found in a file is newer than this program's."""
+def load_json(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
+    """Read a file that holds a JSON object.
+
+    Raises
+    ------
+    FormatError
+        If the file is missing, damaged or too large, or holds something else.
+    """
+    with damage_told(path):
+        if path.stat().st_size > max_bytes:
+            raise ValueError(f"larger than {max_bytes / 1e6:.0f} MB")
+        value = parse_json(path.read_text(encoding="utf-8"))
+        if not isinstance(value, dict):
+            raise TypeError(f"{kind_of(value)} instead of an object")
+    return value
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON; raise ValueError if it is damaged, nested too deeply, or has too large a number."""
+    try:
+        return json.loads(text, parse_int=_integer, parse_float=_float)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+@contextmanager
+def damage_told(path: Path, what: str = "") -> Iterator[None]:
+    """Turn what a damaged file's values raise within the block into a FormatError that names the file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    what : str
+        What the file should be, such as "a split"; if empty, it is said that the file cannot be read.
+    """
+    try:
+        yield
+    except (*DAMAGE, OSError) as error:
+        why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        if isinstance(error, KeyError):
+            why = f"{error} is missing"
+        why = why[:_MAX_TOLD]
+        if what:
+            raise FormatError(f"{path}: is not {what} written by this program ({why})") from error
+        raise FormatError(f"{path}: cannot be read ({why})") from error
+
+
+def kind_of(value: Any) -> str:
+    """Return the kind of a JSON value in words."""
+    return _KINDS.get(type(value), "a number")
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > _MAX_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
+
+
+def _float(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"{digits[:40]} is too large a number")
+    return value
+
+
+def check_version(path: Path, found: Any) -> None:
+    """Raise FormatError if a file's version is newer than this program's, TypeError if it is none."""
+    if not isinstance(found, int) or isinstance(found, bool):
+        raise TypeError(f"its version is {kind_of(found)}")
     if found > VERSION:
         raise FormatError(
             f"{path}: made by a newer version of this program (format {found}, this reads {VERSION}); "

@@ -6,17 +6,35 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from spn_data.errors import FormatError
-from spn_data.storage.json_files import read_json
+from spn_data.storage.json_files import damage_told, kind_of, read_json
 
 # Names that version 0.1 used in stage.json and split.json, and the current ones.
 _RENAMED_GROUPS = {"4-dense": "4-tracked"}
 _RENAMED_OPTIONS = {"dense": "tracked"}
+
+
+# Kinds of the parts of a record, and of what objects and lists among them hold.
+_PARTS: dict[str, type] = {
+    **dict.fromkeys(("stage", "finished"), str),
+    **dict.fromkeys(("options", "inputs", "upstream", "counts", "versions"), dict),
+    **dict.fromkeys(("seconds", "cpu_seconds"), dict),
+    "notes": list,
+}
+_HELD: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("inputs", "upstream", "versions", "notes"), str),
+    **dict.fromkeys(("seconds", "cpu_seconds"), (int, float)),
+}
+# Counts that are numbers in every stage that has them.
+_NUMBERS = {
+    *("chosen", "candidates", "with_fix", "unreadable"),
+    *("registered", "frames", "points", "mean_error_px"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,12 +95,53 @@ class StageRecord:
 def read_record(path: Path) -> StageRecord:
     """Read a stage.json; raise FormatError if it is missing, damaged, or of a newer version."""
     table = read_json(path)
-    del table["version"]
-    try:
-        stage = current_stage(table["stage"])
-        return StageRecord(**{**table, "stage": stage, "notes": tuple(table["notes"])})
-    except (TypeError, KeyError, AttributeError) as error:
-        raise FormatError(f"{path}: not a record of a stage ({error!r})") from error
+    with damage_told(path, "a record of a stage"):
+        known = {each.name: each for each in fields(StageRecord)}
+        for name, value in table.items():
+            if name != "version" and name not in known:
+                raise ValueError(f"{name!r} is not a part of it")
+            wanted = _PARTS.get(name)
+            if wanted is not None:
+                _check(name, value, wanted)
+        for name in _NUMBERS & set(table.get("counts", {})):
+            value = table["counts"][name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise TypeError(f"the count {name!r} is {kind_of(value)}")
+        del table["version"]
+        return StageRecord(
+            **{
+                **table,
+                "stage": current_stage(table["stage"]),
+                "counts": Counts(table.get("counts", {}), path),
+                "notes": tuple(table["notes"]),
+            }
+        )
+
+
+class Counts(dict[str, Any]):
+    """The counts of a record that was read: a missing one is told with the file, as damage of it."""
+
+    path: Path | None = None
+
+    def __init__(self, counts: Any = (), path: Path | None = None):
+        super().__init__(counts)
+        self.path = path
+
+    def __missing__(self, name: str) -> Any:
+        """Raise FormatError that names the file."""
+        where = "stage.json" if self.path is None else self.path
+        raise FormatError(f"{where}: is damaged: its counts have no {name!r}")
+
+
+def _check(name: str, value: Any, wanted: type) -> None:
+    """Raise TypeError if a part of a record is of another kind, or an object or list holds other kinds."""
+    held = _HELD.get(name, object)
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if not isinstance(value, wanted):
+        raise TypeError(f"{name!r} is {kind_of(value)} instead of {kind_of(wanted())}")
+    for item in items:
+        if not isinstance(item, held) or (isinstance(item, bool) and held is not object):
+            raise TypeError(f"{name!r} holds {kind_of(item)}")
 
 
 def current_stage(name: str) -> str:

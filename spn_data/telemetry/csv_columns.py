@@ -69,7 +69,8 @@ _UNITS: dict[str, dict[str, float]] = {
     "time": _SECONDS | _PARTS,
     "utc": _SECONDS | _PARTS | {"utc": 1.0, "local": 1.0},
 }
-_BRACKETS = re.compile(r"(.*?)\s*[(\[]\s*([^()\[\]]*?)\s*[)\]]\s*")
+# Without repetitions that can match the same blanks: a long header would take long.
+_BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def _names_and_unit(cell: str) -> list[tuple[str, str]]:
 
     The name counts with and without the prefix of a DJI flight record.
     """
-    match = _BRACKETS.fullmatch(cell)
+    match = _BRACKETS.fullmatch(cell.strip())
     name, unit = (match[1], match[2]) if match else (cell, "")
     name = re.sub(r"[\s.\-]+", "_", name.strip().lower())
     plain = name.removeprefix("osd_").removeprefix("custom_")

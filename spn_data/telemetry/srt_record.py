@@ -26,7 +26,7 @@ _DISTANCE = re.compile(r"(?<![\w.])D\s?[ =:]\s?([\d.]+)\s?m(?![\w/])")  # from H
 _POSITION = re.compile(r"(?<![\w.])(GPS|RTK|HOME)\s*\(([^()]{0,120})\)", re.IGNORECASE)
 _GIMBAL = re.compile(r"(?<![\w.])G\.PRY\s*\(([^()]{0,120})\)", re.IGNORECASE)
 # U+FFFD is a degree sign that was not written as UTF-8.
-_NUMBER = re.compile("([-+]?(?:\\d+\\.?\\d*|\\.\\d+))\\s*(?:ms|m|M|°|\ufffd+|deg)?")
+_NUMBER = re.compile("([-+]?(?:\\d+(?:\\.\\d*)?|\\.\\d+))\\s*(?:ms|m|M|°|\ufffd+|deg)?")
 _UNKNOWN = {"", "n/a", "na", "nan", "null", "none", "-", "--"}
 _LETTER = re.compile(r"([NSEW])\s*:\s*(.*)", re.IGNORECASE)
 

@@ -9,6 +9,7 @@ from typing import Any
 import av
 
 from spn_data.errors import InputError
+from spn_data.media.container import open_container
 from spn_data.telemetry.dji_srt import telemetry_from_records
 from spn_data.telemetry.textfile import MAX_TEXT_BYTES
 from spn_data.telemetry.track import Telemetry
@@ -37,7 +38,7 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
         If the subtitles contain no telemetry, or the file is not a video.
     """
     try:
-        with av.open(str(path)) as container:
+        with open_container(Path(path)) as container:
             streams = [
                 s
                 for s in container.streams.subtitles

@@ -11,6 +11,7 @@ import numpy as np
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.storage.files import write_atomically
+from spn_data.storage.json_files import DAMAGE, parse_json
 from spn_data.telemetry.track import Telemetry
 
 _COLUMNS = (
@@ -78,7 +79,7 @@ def read_track(path: Path) -> Telemetry:
         if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"{path}: too large for a telemetry track")
         first, header, *lines = path.read_text(encoding="utf-8").splitlines()
-        properties = json.loads(first.removeprefix("# "))
+        properties = parse_json(first.removeprefix("# "))
         if properties["version"] != 1 or header != _COLUMNS:
             raise FormatError(f"{path}: not a telemetry track of this version")
         rows = np.array(
@@ -102,5 +103,5 @@ def read_track(path: Path) -> Telemetry:
             utc_is_local=properties["utc_is_local"],
             notes=tuple(properties["notes"]),
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (*DAMAGE, OSError) as error:
         raise FormatError(f"{path}: not a telemetry track ({error})") from error

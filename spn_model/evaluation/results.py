@@ -15,7 +15,7 @@ import numpy as np
 
 from spn_data.area.names import CONFIG, ERRORS, METRICS
 from spn_data.errors import FormatError, InputError
-from spn_data.storage.json_files import number_or, read_json
+from spn_data.storage.json_files import DAMAGE, number_or, read_json
 from spn_model.evaluation.metrics import AxisErrors, Spread, Summary, Within
 
 _TEXT_COLUMNS = ("method", "group", "name", "stratum")
@@ -97,7 +97,7 @@ def read_run(folder: str | PathLike[str]) -> RunResults:
             for group, methods in document["groups"].items()
         }
         return RunResults(folder, str(document["units"]), read_json(folder / CONFIG), groups)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{path}: cannot be read ({error!r})") from error
 
 

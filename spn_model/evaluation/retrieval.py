@@ -12,7 +12,7 @@ import numpy as np
 
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import write_json
+from spn_data.storage.json_files import parse_json, write_json
 from spn_data.storage.stage_record import versions
 from spn_data.work.timing import Progress
 from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad
@@ -102,7 +102,7 @@ def _read(
     try:
         if path.stat().st_size > _MAX_BYTES:
             return None
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = parse_json(path.read_text(encoding="utf-8"))
         if table["key"] != key:
             return None
         found = {

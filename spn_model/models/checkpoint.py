@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import atomic_writer
-from spn_data.storage.json_files import finite
+from spn_data.storage.json_files import finite, parse_json
 from spn_model.models.pose_model import PoseModel
 from spn_model.models.registry import make
 from spn_model.onboard.view import View
@@ -196,7 +196,7 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, An
             text = header.get("document", "")
             if len(text) > _MAX_DOCUMENT:
                 raise ValueError(f"a document of {len(text)} characters")
-            document = json.loads(text)
+            document = parse_json(text)
             if not isinstance(document, dict):
                 raise TypeError("its document is not an object")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

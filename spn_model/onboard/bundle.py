@@ -19,6 +19,7 @@ from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_model.onboard.decoding import DecodingOptions
+from spn_model.onboard.graph_check import check_self_contained
 from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-bundle"
@@ -228,7 +229,7 @@ def verified_path(graph: GraphFile) -> Path:
     Raises
     ------
     FormatError
-        If the file is missing, is a link, or has another size or hash.
+        If the file is missing, is a link, has another size or hash, or keeps weights in another file.
     """
     path = graph.path
     if path.is_symlink() or not path.is_file():
@@ -240,6 +241,10 @@ def verified_path(graph: GraphFile) -> Path:
         )
     if sha256_of(path) != graph.sha256:
         raise FormatError(f"{path}: its SHA-256 differs from {DOCUMENT}; copy it again")
+    try:
+        check_self_contained(path)
+    except ValueError as error:
+        raise FormatError(f"{path}: cannot be used: {error}; export the run again") from error
     return path
 
 

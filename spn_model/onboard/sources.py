@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,10 @@ _MAX_IMAGE_BYTES = 500_000_000
 _MISSING_FRAMES, _MISSING_SHARE = 2, 0.05
 _START, _END = 0xD8, 0xD9  # markers of a JPEG
 _MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")  # neither a stuffed byte nor a restart
+# Only self-contained formats: a playlist or script could refer to other files or hosts.
+_DEMUXERS = "mov,matroska,webm,mpegts,mpeg,avi,asf,flv,h264,hevc,mpegvideo,ogg,mxf"
+_LOCAL_ONLY = f"protocol_whitelist;file|format_whitelist;{_DEMUXERS}"
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"  # OpenCV has no argument for them
 
 
 def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
@@ -31,8 +36,7 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
         yield 0, math.nan, read_image(source)
         return
     _check_file(source)
-    # Resolved, because OpenCV interprets some names as a device, a pattern or a URL.
-    video = cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
+    video = _open_video(source)
     try:
         number = 0
         while True:
@@ -42,7 +46,10 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
             yield number, video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image
             number += 1
         if not number:
-            raise InputError("cannot be decoded as a video", path=source)
+            raise InputError(
+                "cannot be decoded as a video; playlists, URLs and streams are not read",
+                path=source,
+            )
         expected = round(video.get(cv2.CAP_PROP_FRAME_COUNT))  # estimated in some containers
         if expected - number > max(_MISSING_FRAMES, _MISSING_SHARE * expected):
             raise InputError(
@@ -51,6 +58,21 @@ def frames(source: Path) -> Iterator[tuple[int, float, np.ndarray]]:
             )
     finally:
         video.release()
+
+
+def _open_video(source: Path) -> cv2.VideoCapture:
+    """Open one local file that refers to no other file or host."""
+    before = os.environ.get(_OPTIONS)
+    # FFmpeg uses the last of several values of an option.
+    os.environ[_OPTIONS] = _LOCAL_ONLY if before is None else f"{before}|{_LOCAL_ONLY}"
+    try:
+        # Resolved, because OpenCV interprets some names as a device, a pattern or a URL.
+        return cv2.VideoCapture(str(source.resolve()), cv2.CAP_FFMPEG)
+    finally:
+        if before is None:
+            del os.environ[_OPTIONS]
+        else:
+            os.environ[_OPTIONS] = before
 
 
 def check_sources(sources: Sequence[Path]) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from spn_data.area.names import GEO, MODEL
+from spn_data.errors import FormatError
 from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import DAMAGE, load_json
 from spn_data.work.timing import Progress
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export, is_up_to_date
@@ -108,11 +109,11 @@ def _read_metrics(run: RunFiles, fingerprint: str) -> tuple[dict[str, Any] | Non
     if not run.metrics.is_file():
         return None, []
     try:
-        metrics = json.loads(run.metrics.read_text(encoding="utf-8"))
+        metrics = load_json(run.metrics)
         is_same = metrics["facts"]["runs"][run.name]["checkpoint"] == fingerprint
         has_run = any(run.name in methods for methods in metrics["groups"].values())
         return (metrics if is_same and has_run else None), []
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (*DAMAGE, FormatError) as error:
         return None, [
             f"{run.metrics} cannot be read ({error!r}): the model card contains no errors."
         ]

@@ -15,7 +15,7 @@ from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.storage.files import LOCK, locked
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import finite, read_json, write_json
+from spn_data.storage.json_files import DAMAGE, finite, kind_of, read_json, write_json
 from spn_data.storage.stage_record import StageRecord, difference, versions
 from spn_model.runs.run_files import RunFiles
 from spn_model.training.machine import is_main_process
@@ -196,6 +196,9 @@ def _existing_config(
         return None
     config: dict[str, Any] = read_json(run.config)
     try:
+        for name in ("options", "inputs"):
+            if not isinstance(config[name], dict):
+                raise TypeError(f"{name!r} is {kind_of(config[name])} instead of an object")
         found = StageRecord(
             stage=record.stage, options=config["options"], inputs=config["inputs"], upstream={}
         )
@@ -203,7 +206,7 @@ def _existing_config(
         facts = config["facts"]
         if not isinstance(facts, dict | None):
             raise TypeError(f"facts is {facts!r:.40}")
-    except (KeyError, TypeError, AttributeError) as error:
+    except DAMAGE as error:
         raise FormatError(f"{run.config}: cannot be read ({error!r})") from error
     if is_same and (facts is None or run.checkpoint.exists()):
         return config

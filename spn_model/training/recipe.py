@@ -19,6 +19,7 @@ OPTIMIZERS = ("adamw", "sgd", "muon")
 SCHEDULES = ("cosine", "linear", "constant")
 _MAX_BYTES = 100_000
 _IMAGES_PER_S = 200  # speed of the default network on two cores
+_MAX_INTEGER = 2**63 - 1  # TOML promises no more
 _MAX_STAGES = 50
 _RANGES: dict[str, tuple[float, float]] = {
     "images": (0, 10**10),
@@ -160,6 +161,8 @@ def read_recipe(name_or_file: str) -> Recipe:
     try:
         text = path.read_text(encoding="utf-8")
         table = tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError("is not a valid recipe: nested too deeply", path=path) from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"is not a valid recipe: {error}", path=path) from error
     return _Reader(path, text).recipe(table)
@@ -233,6 +236,8 @@ class _Reader:
                 text = f"unknown key {name!r} of {of}; keys are {', '.join(defaults)}"
                 raise self._wrong(name, text, stage)
             wanted = type(defaults[name])
+            if type(value) is int and abs(value) > _MAX_INTEGER:
+                raise self._wrong(name, f"{name} is too large a number", stage)
             if wanted is float and type(value) is int:
                 value = float(value)
             if type(value) is not wanted:
@@ -247,6 +252,6 @@ class _Reader:
         begins = [n for n, text in enumerate(self._lines) if re.match(r"\s*\[\[\s*stages", text)]
         first = begins[stage] if 0 <= stage < len(begins) else 0
         for n, text in enumerate(self._lines[first:], first + 1):
-            if re.match(rf"""\s*\[*\s*(\w+\.)?["']?{re.escape(key)}["']?\s*(=|\.|\])""", text):
+            if re.match(rf"""\s*(?:\[+\s*)?(\w+\.)?["']?{re.escape(key)}["']?\s*(=|\.|\])""", text):
                 return InputError(message, path=self._path, line=n)
         return InputError(message, path=self._path)

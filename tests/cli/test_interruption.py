@@ -199,3 +199,17 @@ def test_kills_at_random_moments(flight1: Path, flight2: Path, tmp_path: Path) -
         assert kill.difference.rotation_deg < 0.05
         if not kill.step.startswith("mapping"):  # which goes on from its last snapshot
             assert kill.difference.largest_as_is_m < 1e-9
+
+
+def test_sigterm_is_treated_as_ctrl_c(start: Start) -> None:
+    """SIGTERM to the command alone: exit code 143, the same line, no native stack trace, no survivor."""
+    run = start()
+    run.wait_for("features")
+    family = run.family()
+    os.kill(run.process.pid, signal.SIGTERM)
+    assert run.process.wait(20) == 143, run.output
+    assert interruption.outliving(family, 3.0) == []
+    lines = run.output.splitlines()
+    assert lines[-1] == "Stopped. Completed work is kept: run the same command to resume."
+    assert "Traceback" not in run.output
+    assert "SIGTERM" not in run.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
@@ -262,9 +263,10 @@ def test_unusable_csv_is_refused(tmp_path, text, message):
     assert "\n" not in str(error.value)
 
 
-def video(path, records, codec, *, first_frame=0, box=b""):
+def video(path, records, codec, *, first_frame=0, box=b"", title=""):
     """Write a tiny video with a subtitle track of (seconds, text) records; none if `codec` is None."""
     with av.open(str(path), "w") as out:
+        out.metadata.update({"title": title} if title else {})
         stream = out.add_stream("mpeg4", rate=10)
         stream.width = stream.height = 64
         stream.pix_fmt = "yuv420p"
@@ -338,12 +340,41 @@ def test_subtitles_of_other_content_are_refused(tmp_path):
     path = video(tmp_path / "a.mp4", [(0.0, "Hello"), (1.0, "Bye")], "mov_text")
     with pytest.raises(InputError, match=r"a.mp4: no subtitle record contains drone telemetry"):
         read_subtitles(path)
-    for name, data in (("b.mp4", b"text"), ("c.mp4", b"")):
+    for name, data, why in (("b.mp4", b"text", "not a video"), ("c.mp4", b"", "is empty")):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match=f"{name}: its subtitles cannot be read"):
+        with pytest.raises(InputError, match=f"{name}: .*{why}"):
             read_subtitles(tmp_path / name)
-    with pytest.raises(InputError, match=r"d.mp4: its subtitles cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"d.mp4: can't be read: No such file"):
         read_subtitles(tmp_path / "d.mp4")
+
+
+def test_a_path_that_looks_like_a_url_is_a_file(tmp_path, monkeypatch):
+    """Subtitles are read from the file even if its relative path could be taken for a URL."""
+    folder = tmp_path / "http:" / "127.0.0.1:9"
+    folder.mkdir(parents=True)
+    video(folder / "x.mp4", RECORDS, "mov_text")
+    video(tmp_path / "a.mp4", RECORDS, "mov_text").rename(tmp_path / "flight:2.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert len(read_subtitles(Path("http:/127.0.0.1:9/x.mp4"))) == 5
+    assert len(read_subtitles(Path("flight:2.mp4"))) == 5
+
+
+@pytest.mark.parametrize(
+    "text", ["#EXTM3U\n#EXTINF:1,\na.mp4\n", "ffconcat version 1.0\nfile a.mp4\n"]
+)
+def test_a_playlist_named_as_a_video_is_refused(tmp_path, text):
+    """A playlist is not opened for its subtitles: it refers to other files."""
+    video(tmp_path / "a.mp4", RECORDS, "mov_text")
+    (tmp_path / "b.mp4").write_text(text)
+    with pytest.raises(InputError, match=r"b\.mp4: is not a video"):
+        read_subtitles(tmp_path / "b.mp4")
+
+
+def test_metadata_that_is_not_utf8_does_not_matter(tmp_path):
+    """A title in Latin-1 does not keep the subtitles from being read."""
+    path = video(tmp_path / "a.mkv", RECORDS, "subrip", title="Zuerich")
+    path.write_bytes(path.read_bytes().replace(b"Zuerich", b"Z\xfcrich "))
+    assert len(read_subtitles(path)) == 5
 
 
 def test_the_reader_is_chosen_by_name_and_content(tmp_path):

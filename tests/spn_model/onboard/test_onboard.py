@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -363,12 +364,12 @@ def edited(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
     return apply
 
 
-def with_graph(model: onnx.ModelProto) -> Callable[[Path], None]:
+def with_graph(model: onnx.ModelProto | bytes) -> Callable[[Path], None]:
     """Another graph, which bundle.json says is the right one."""
 
     def apply(folder: Path) -> None:
         path = folder / "model.onnx"
-        path.write_bytes(model.SerializeToString())
+        path.write_bytes(model if isinstance(model, bytes) else model.SerializeToString())
 
         def vouch(document: dict[str, Any]) -> None:
             document["graphs"]["float32"] |= {
@@ -381,14 +382,25 @@ def with_graph(model: onnx.ModelProto) -> Callable[[Path], None]:
     return apply
 
 
-def reading(location: str) -> onnx.ModelProto:
-    """A graph whose weight lies in another file."""
-    weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4], data_location=1)
-    for key, value in (("location", location), ("offset", "0"), ("length", "16")):
-        weight.external_data.add(key=key, value=value)
+def reading(location: str = "") -> onnx.ModelProto:
+    """A graph whose weight lies in another file, if one is named."""
+    weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4])
+    if location:
+        weight.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", location), ("offset", "0"), ("length", "16")):
+            weight.external_data.add(key=key, value=value)
+    else:
+        weight.raw_data = bytes(16)
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [4]) for name in ("x", "y")]
     node = helper.make_node("Add", ["x", "w"], ["y"])
     graph = helper.make_graph([node], "g", values[:1], values[1:], [weight])
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def within(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A graph with another one in a branch of an If."""
+    node = helper.make_node("If", ["c"], ["y"], then_branch=model.graph, else_branch=model.graph)
+    graph = helper.make_graph([node], "outer", [], list(model.graph.output))
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
@@ -442,9 +454,12 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "flipped": (flipped, r"SHA-256 differs from bundle\.json"),
     "gone": (lambda f: (f / "model.onnx").unlink(), "copy the whole bundle folder"),
     "link": (linked, "copy the whole bundle folder"),
-    "weights outside": (with_graph(reading("../secret.bin")), "cannot load it"),
-    "weights anywhere": (with_graph(reading("/etc/hostname")), "cannot load it"),
-    "other graph": (with_graph(reading("near.bin")), "its input is"),
+    "weights outside": (with_graph(reading("../secret.bin")), "keeps a weight in another file"),
+    "weights anywhere": (with_graph(reading("/etc/hostname")), "keeps a weight in another file"),
+    "weights beside": (with_graph(reading("near.bin")), "keeps a weight in another file"),
+    "weights in a branch": (with_graph(within(reading("near.bin"))), "keeps a weight in another"),
+    "no graph": (with_graph(b"\x3a\x7fnothing"), "is not an ONNX file"),
+    "other graph": (with_graph(reading()), "its input is"),
 }
 
 
@@ -471,6 +486,28 @@ def test_what_is_no_bundle_is_told(bundle, tmp_path):
     assert Localizer(folder).camera.width == 320
     with pytest.raises(InputError, match="has no int8 graph"):
         Localizer(folder, int8=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "b.m3u8",
+            "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nflight.avi\n#EXT-X-ENDLIST\n",
+        ),
+        ("b.mp4", "ffconcat version 1.0\nfile flight.avi\n"),
+    ],
+)
+def test_a_playlist_is_not_followed(sources, name, text):
+    """A playlist refers to other files or hosts: it is refused, whatever its name."""
+    _, video = sources
+    assert len(list(frames(video))) == 4
+    playlist = video.parent / name
+    playlist.write_text(text)
+    before = dict(os.environ)
+    with pytest.raises(InputError, match=rf"{name}: cannot be decoded as a video; playlists"):
+        list(frames(playlist))
+    assert dict(os.environ) == before
 
 
 def test_frames_are_read_upright_and_bounded(tmp_path, flown, monkeypatch):

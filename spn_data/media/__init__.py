@@ -1,0 +1,1 @@
+"""Media files from outside, opened the same safe way for pictures and for subtitles."""
