@@ -24,7 +24,7 @@ from spn_data.area.names import (
 )
 from spn_data.errors import StageError
 from spn_data.pipeline.frames_stage import Plan
-from spn_data.storage.json_files import damage_told
+from spn_data.storage.json_files import reporting_damage
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
@@ -227,7 +227,7 @@ def status(area: Area) -> None:
             rows.append((stage, state, "", ""))
             continue
         record = area.record(stage)
-        with damage_told(area.folder(stage)):
+        with reporting_damage(area.folder(stage)):
             holds = _summary(record)
         reason = area.stale_because(stage)
         state = f"stale: {reason}" if reason else "complete"
@@ -247,12 +247,12 @@ def verdict(area: Area) -> None:
         console.out.print("There is no model yet; run spn-data reconstruct.")
         return
     counts = area.record(MODEL).counts
-    with damage_told(area.folder(MODEL)):
+    with reporting_damage(area.folder(MODEL)):
         share = counts["registered"] / max(counts["frames"], 1)
     sentence = f"{counts['registered']} of {counts['frames']} frames ({share:.1%}) have a pose"
     if area.has(GEO) and area.stale_because(GEO) is None:
         c = area.record(GEO).counts
-        with damage_told(area.folder(GEO)):
+        with reporting_damage(area.folder(GEO)):
             horizontal = _m(_twice(c["sigma_horizontal_m"]))
             vertical = _m(_twice(c["sigma_vertical_m"]))
         sentence += f" in {area.folder(GEO)}; "

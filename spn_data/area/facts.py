@@ -10,7 +10,7 @@ from pathlib import Path
 import tomli_w
 
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import VERSION, check_version, damage_told
+from spn_data.storage.json_files import VERSION, check_version, reporting_damage
 
 _MAX_BYTES = 10_000_000
 
@@ -42,7 +42,7 @@ def read_facts(path: Path) -> Facts:
     """
     if not path.exists():
         return Facts()
-    with damage_told(path, "an area file"):
+    with reporting_damage(path, "an area file"):
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"larger than {_MAX_BYTES // 1_000_000} MB")
         try:

@@ -328,7 +328,7 @@ def _read(lines: _Lines, images: int, *, is_first: bool) -> NvmModel:
 
 
 def has_image_suffix(name: str) -> bool:
-    """Return whether a name ends as that of an image, so that spaces in it can be told from other fields."""
+    """Return whether a name ends like that of an image: spaces in it are not separators then."""
     return name.lower().endswith(_IMAGE_SUFFIXES)
 
 

@@ -34,7 +34,7 @@ from spn_data.labels.labels import LabelObservations, Labels, read_label_observa
 from spn_data.labels.map_points import MapPoints
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.registration_file import read_reasons
-from spn_data.storage.json_files import DAMAGE, damage_told, read_json
+from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def read_geo(area: Area) -> GeoFit | None:
     if not area.has(GEO):
         return None
     path = area.folder(GEO) / GEO_FIT
-    with damage_told(path, "a georegistration"):
+    with reporting_damage(path, "a georegistration"):
         return GeoFit.from_json(read_json(path))
 
 
@@ -218,7 +218,7 @@ def read_written_world(path: Path) -> Similarity:
 
     Raises FormatError if the file is damaged.
     """
-    with damage_told(path, "a registration"):
+    with reporting_damage(path, "a registration"):
         return Similarity.from_json(read_json(path)["world_from_model"])
 
 

@@ -31,7 +31,14 @@ from spn_data.geometry.pose import Poses
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
 from spn_data.pipeline.geo_stage import recorded_options
-from spn_data.storage.json_files import VERSION, damage_told, finite, kind_of, read_json, write_json
+from spn_data.storage.json_files import (
+    VERSION,
+    finite,
+    kind_of,
+    read_json,
+    reporting_damage,
+    write_json,
+)
 from spn_data.work.timing import Progress
 
 WAYPOINTS = "waypoints"  # name of the plan, in place of the name of a sequence
@@ -204,7 +211,7 @@ def read_coverage(area: Area, folder: str = COVERAGE) -> dict[str, Any] | None:
     value: dict[str, Any] = read_json(path)
     if not value.keys() >= {"sequences", "made_of", "fly_again", "units", "options"}:
         raise FormatError(f"{path}: is not a coverage file written by this program")
-    with damage_told(path, "a coverage file"):
+    with reporting_damage(path, "a coverage file"):
         for name in ("sequences", "made_of", "options"):
             # Without metres there are no options.
             if not isinstance(value[name], dict) and (name != "options" or value[name] is not None):

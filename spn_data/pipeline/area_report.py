@@ -41,7 +41,7 @@ from spn_data.report.html import render
 from spn_data.report.verdict import AreaVerdict, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import DAMAGE, damage_told, read_json
+from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
 from spn_data.storage.stage_record import versions
 
 
@@ -118,7 +118,7 @@ def report_data(area: Area) -> ReportData:
     if fresh.has(GEO):
         path = fresh.folder(GEO) / GEO_FIT
         value = read_json(path)
-        with damage_told(path, "a georegistration"):
+        with reporting_damage(path, "a georegistration"):
             geo = GeoFit.from_json(value)
             residuals = _residuals(path, value, geo)
     split, checks = None, None

@@ -39,7 +39,7 @@ from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.register import RegisteredSequence, labels_of, register_sequence
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.storage.json_files import VERSION, damage_told, read_json, write_json
+from spn_data.storage.json_files import VERSION, read_json, reporting_damage, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch
@@ -249,7 +249,7 @@ def _mapping_lenses(area: Area) -> dict[str, Camera]:
     """Return the mapping cameras as estimated by the reconstruction, by key."""
     path = area.folder(FRAMES) / CAMERAS
     sizes, estimated = read_json(path), area.record(MODEL).counts["cameras"]
-    with damage_told(path, "a list of cameras"):
+    with reporting_damage(path, "a list of cameras"):
         return {
             key: camera_from_json(
                 {**sizes["cameras"][key], "model": lens["model"], "params": lens["params"]}

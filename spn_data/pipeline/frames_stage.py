@@ -30,7 +30,7 @@ from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.sequence_masks import check_mask, find_masks, write_mask
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import damage_told, read_json, write_json
+from spn_data.storage.json_files import read_json, reporting_damage, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
@@ -350,7 +350,7 @@ def _reuse_frames(extend: Area, target: Path) -> tuple[list[Frames], dict[str, d
         link.parent.mkdir(exist_ok=True)
         if not link.exists():
             link_or_copy(path, link)
-    with damage_told(folder / CAMERAS, "a list of cameras"):
+    with reporting_damage(folder / CAMERAS, "a list of cameras"):
         return [frames], dict(read_json(folder / CAMERAS)["cameras"])
 
 

@@ -21,7 +21,7 @@ from spn_data.pipeline.geo_stage import (
 from spn_data.pipeline.model_stage import build_model
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.reconstruct import estimate_model_cost
-from spn_data.storage.json_files import damage_told, read_json
+from spn_data.storage.json_files import read_json, reporting_damage
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import TelemetrySummary
 
@@ -131,7 +131,7 @@ def add(
     geo = _geo_options(area, options)
     if area.has(GEO):
         path = area.folder(GEO) / GEO_FIT
-        with damage_told(path, "a georegistration"):
+        with reporting_damage(path, "a georegistration"):
             origin = GeoFit.from_json(read_json(path)).origin
         geo = replace(geo, fit=replace(geo.fit, origin=origin))
     options = replace(options, geo=geo)

@@ -36,7 +36,7 @@ from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
-from spn_data.storage.json_files import DAMAGE, damage_told, read_json
+from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
 from spn_data.storage.stage_record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -121,7 +121,7 @@ def _reuse_features(extend: Area, work: StageWork) -> tuple[str, ...]:
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
     """Collect the input of the reconstruction from stage 1-frames."""
     folder = area.folder(FRAMES)
-    with damage_told(folder / CAMERAS, "a list of cameras"):
+    with reporting_damage(folder / CAMERAS, "a list of cameras"):
         start = dict(read_json(folder / CAMERAS)["cameras"])
     masks = {p.stem: p for p in sorted((folder / MASKS).glob("*.png"))}
     return FramesToMap(

@@ -49,7 +49,7 @@ def read_json(path: Path) -> dict[str, Any]:
         If the file is missing, damaged, too large, or of a newer version.
     """
     value = load_json(path)
-    with damage_told(path):
+    with reporting_damage(path):
         check_version(path, value["version"])
     return value
 
@@ -62,7 +62,7 @@ def load_json(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     FormatError
         If the file is missing, damaged or too large, or holds something else.
     """
-    with damage_told(path):
+    with reporting_damage(path):
         if path.stat().st_size > max_bytes:
             raise ValueError(f"larger than {max_bytes / 1e6:.0f} MB")
         value = parse_json(path.read_text(encoding="utf-8"))
@@ -80,7 +80,7 @@ def parse_json(text: str) -> Any:
 
 
 @contextmanager
-def damage_told(path: Path, what: str = "") -> Iterator[None]:
+def reporting_damage(path: Path, what: str = "") -> Iterator[None]:
     """Turn what a damaged file's values raise within the block into a FormatError that names the file.
 
     Parameters

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import FormatError
-from spn_data.storage.json_files import damage_told, kind_of, read_json
+from spn_data.storage.json_files import kind_of, read_json, reporting_damage
 
 # Names that version 0.1 used in stage.json and split.json, and the current ones.
 _RENAMED_GROUPS = {"4-dense": "4-tracked"}
@@ -95,7 +95,7 @@ class StageRecord:
 def read_record(path: Path) -> StageRecord:
     """Read a stage.json; raise FormatError if it is missing, damaged, or of a newer version."""
     table = read_json(path)
-    with damage_told(path, "a record of a stage"):
+    with reporting_damage(path, "a record of a stage"):
         known = {each.name: each for each in fields(StageRecord)}
         for name, value in table.items():
             if name != "version" and name not in known:
@@ -119,7 +119,7 @@ def read_record(path: Path) -> StageRecord:
 
 
 class Counts(dict[str, Any]):
-    """The counts of a record that was read: a missing one is told with the file, as damage of it."""
+    """The counts of a record that was read: a missing one is reported as damage of its file."""
 
     path: Path | None = None
 

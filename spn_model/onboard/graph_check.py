@@ -1,4 +1,4 @@
-"""Check that an ONNX file refers to no other file, by walking its protobuf fields without the package onnx."""
+"""Check that an ONNX file refers to no other file, by walking its protobuf fields; `onnx` is not on board."""
 
 from __future__ import annotations
 
