@@ -97,7 +97,8 @@ def discover(
       long, the same size, codec and frame rate by `probe`, and either each part starts when the one before
       ends or all have the same creation time. Without creation times the files stay separate.
 
-    Links are not followed; proxies and hidden files are skipped. Both are listed in `ignored`.
+    Links are followed. Proxies, hidden files, broken links and links to what is read already are listed in
+    `ignored`.
 
     Parameters
     ----------
@@ -161,29 +162,38 @@ def safe_name(text: str, fallback: str = "sequence") -> str:
 
 
 def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
-    """Yield the regular files in a folder tree, sorted; links, hidden and special files go to `ignored`."""
+    """Yield the regular files in a folder tree, sorted; hidden and special files go to `ignored`.
+
+    Links are followed, for data sets under git-annex or DVC and on servers consist of them. What a link
+    leads to a second time is ignored, so that loops end and nothing is counted twice.
+    """
     count = 0
+    entered, taken = {os.path.realpath(folder)}, set[str]()
 
     def refuse(error: OSError) -> None:
         ignored.append((Path(error.filename), f"cannot be read: {error.strerror}"))
 
-    for place, folders, names in os.walk(folder, onerror=refuse):
+    for place, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
         here = Path(place)
-        for name in sorted(folders):
-            if (here / name).is_symlink():
-                ignored.append((here / name, "link: pass the folder that it points to instead"))
-            elif name.startswith("."):
+        # Folders before links to them, so that what is both is read under its own name.
+        for name in sorted(folders, key=lambda each: ((here / each).is_symlink(), each)):
+            real = os.path.realpath(here / name)
+            if name.startswith("."):
                 ignored.append((here / name, "hidden"))
+            elif real in entered:
+                ignored.append((here / name, "link to a folder that is read already"))
             elif (here / name / "stage.json").exists():
                 ignored.append((here / name, "made by this program"))
             elif len((here / name).relative_to(folder).parts) > _MAX_DEPTH:
                 ignored.append((here / name, f"more than {_MAX_DEPTH} folders deep"))
             else:
+                entered.add(real)
                 continue
             folders.remove(name)
         folders.sort()
-        for name in sorted(names):
+        for name in sorted(names, key=lambda each: ((here / each).is_symlink(), each)):
             path = here / name
+            real = os.path.realpath(path)
             count += 1
             if count > _MAX_FILES:
                 raise InputError(f"contains more than {_MAX_FILES:,} files", path=folder)
@@ -192,11 +202,14 @@ def _walk(folder: Path, ignored: list[tuple[Path, str]]) -> Iterable[Path]:
                 ignored.append(
                     (here / shown, "control characters or invalid UTF-8 in its name: rename it")
                 )
-            elif path.is_symlink():
-                ignored.append((path, "link: pass the file that it points to instead"))
+            elif path.is_symlink() and not path.exists():
+                ignored.append((path, "broken link: what it points to does not exist here"))
             elif not path.is_file():
                 ignored.append((path, "not a regular file"))
+            elif real in taken:
+                ignored.append((path, "link to a file that is read already"))
             else:
+                taken.add(real)
                 yield path
 
 
@@ -207,7 +220,7 @@ def _sibling_telemetry(video: Path) -> list[Path]:
         for p in video.parent.iterdir()
         if p.stem.lower() == video.stem.lower()
         and p.suffix.lower() in TELEMETRY_SUFFIXES
-        and not p.is_symlink()
+        and p.is_file()
     )
 
 
@@ -236,9 +249,11 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
 def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
     if not folder.is_dir():
         return f"is not a video or photo: unsupported suffix {folder.suffix or '(none)'}"
-    links = sum(why.startswith("link") for _, why in ignored)
+    links = sum(why.startswith("broken link") for _, why in ignored)
     found = f"; {len(ignored)} other files" if ignored else "; the folder is empty"
-    return "contains no video or photo" + found + (f", {links} of them links" if links else "")
+    return (
+        "contains no video or photo" + found + (f", {links} of them broken links" if links else "")
+    )
 
 
 def _by_folder(photos: list[Path]) -> dict[Path, tuple[Path, ...]]:

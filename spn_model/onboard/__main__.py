@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     The code is 1, with a one-line message, if bundle, camera or source cannot be used, and 0 otherwise.
     """
-    parser = argparse.ArgumentParser(prog="python -m spn_model.onboard", description=__doc__)
+    parser = argparse.ArgumentParser(prog="spn-onboard", description=__doc__)
     parser.add_argument("bundle", type=Path, help="bundle folder from `spn-model export`")
     parser.add_argument("sources", type=Path, nargs="+", help="images and videos")
     parser.add_argument(

@@ -142,17 +142,34 @@ def test_new_dji_names_with_a_time_are_joined(tmp_path: Path) -> None:
     assert source.sequence == "DJI_20240501100000_0001_D"
 
 
-def test_links_are_listed_not_followed(tmp_path: Path) -> None:
-    """A link to a file or folder elsewhere is ignored, with advice."""
-    touch(tmp_path, "elsewhere/secret.mp4", "video/a.mp4")
-    (tmp_path / "video" / "link.mp4").symlink_to(tmp_path / "elsewhere" / "secret.mp4")
-    (tmp_path / "video" / "more").symlink_to(tmp_path / "elsewhere")
+def test_links_are_followed(tmp_path: Path) -> None:
+    """Linked files and folders are read under the names of the links, as in a data set under git-annex."""
+    touch(tmp_path, "store/f3a9.mp4", "store/77c1.SRT", "other/b.mp4")
+    (tmp_path / "video").mkdir()
+    (tmp_path / "video" / "a.mp4").symlink_to("../store/f3a9.mp4")
+    (tmp_path / "video" / "a.SRT").symlink_to("../store/77c1.SRT")
+    (tmp_path / "video" / "more").symlink_to(tmp_path / "other")
     found = discover(tmp_path / "video")
-    assert [s.sequence for s in found.sources] == ["a"]
-    assert [(str(p), why.split(":")[0]) for p, why in found.ignored] == [
-        ("link.mp4", "link"),
-        ("more", "link"),
-    ]
+    assert [s.sequence for s in found.sources] == ["a", "b"]
+    assert [t.name for t in found.sources[0].telemetry] == ["a.SRT"]
+    assert found.ignored == ()
+
+
+def test_links_are_read_once_and_loops_end(tmp_path: Path) -> None:
+    """A link to what is read already, a loop and a broken link are listed; nothing is counted twice."""
+    touch(tmp_path, "a.mp4", "inner/b.mp4")
+    (tmp_path / "again.mp4").symlink_to("a.mp4")
+    (tmp_path / "gone.mp4").symlink_to("nowhere.mp4")
+    (tmp_path / "inner" / "loop").symlink_to(tmp_path)
+    (tmp_path / "twice").symlink_to("inner")
+    found = discover(tmp_path)
+    assert [s.sequence for s in found.sources] == ["a", "b"]
+    assert dict((str(p), why) for p, why in found.ignored) == {
+        "again.mp4": "link to a file that is read already",
+        "gone.mp4": "broken link: what it points to does not exist here",
+        "inner/loop": "link to a folder that is read already",
+        "twice": "link to a folder that is read already",
+    }
 
 
 def test_special_files_are_not_opened(tmp_path: Path) -> None:
@@ -179,12 +196,12 @@ def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
     """A missing or empty folder, only other files or links, and another kind of file are refused."""
     touch(tmp_path, "other/readme.txt", "other/flight.srt", "linked/notes.txt")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "linked" / "a.mp4").symlink_to(tmp_path / "other" / "readme.txt")
+    (tmp_path / "linked" / "a.mp4").symlink_to("nowhere.mp4")
     expected = {
         "missing": "does not exist",
         "empty": "contains no video or photo; the folder is empty",
         "other": "contains no video or photo; 2 other files",
-        "linked": "contains no video or photo; 2 other files, 1 of them links",
+        "linked": "contains no video or photo; 2 other files, 1 of them broken links",
         "other/readme.txt": "is not a video or photo: unsupported suffix .txt",
     }
     for name, message in expected.items():
