@@ -426,7 +426,7 @@ def resize_all(scene: Path, factor: float, names=NAMES) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "told"),
+    ("factor", "message"),
     [
         (0.5, "the image is 80x45, but the model's measurements in it span"),
         (1.5, "other images of 240x135: the model's measurements reach only"),
@@ -436,7 +436,7 @@ def resize_all(scene: Path, factor: float, names=NAMES) -> None:
 def test_images_of_another_size_than_the_models_are_refused(scene, tmp_path, factor, message):
     """A focal length of the model would be wrong by the factor, and half of the points lost."""
     resize_all(scene, factor)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         run(scene, tmp_path / "dataset.h5")
 
 
@@ -451,8 +451,10 @@ def test_an_image_of_another_shape_is_refused_by_name(scene, tmp_path):
     """Without a model to compare with, the message names both images and what to do."""
     (scene / "reconstruction.nvm").unlink()
     cv2.imwrite(str(scene / NAMES[2]), np.zeros((160, 90, 3), np.uint8))
-    told = rf"{NAMES[2]}: the image is 90x160, but {NAMES[0]} is 160x90: all images of .* crop them"
-    with pytest.raises(InputError, match=told):
+    message = (
+        rf"{NAMES[2]}: the image is 90x160, but {NAMES[0]} is 160x90: all images of .* crop them"
+    )
+    with pytest.raises(InputError, match=message):
         run(scene, tmp_path / "dataset.h5")
 
 
@@ -663,14 +665,14 @@ def test_cases_from_outside_are_reported(shared_cases, tmp_path, case, message):
 
 
 def test_a_model_in_another_world_is_named():
-    """A scale, a turn and a shift of the whole model are told from a mistake of conventions."""
+    """A scale, a turn and a shift of the whole model are distinguished from a mistake of conventions."""
     rng = np.random.default_rng(3)
     rotations = rotations_from_vectors(rng.normal(0, 1, (12, 3)))
     model = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
     listed_from_model = Similarity(
         2.5, rotations_from_vectors(np.array([[0.1, 0.2, 0.3]]))[0], np.array([7.0, 8, 9])
     )
-    told = name_disagreement(listed_from_model.apply_to_poses(model), model)
-    assert "1 unit of the model is 2.5 of the list" in told
+    message = name_disagreement(listed_from_model.apply_to_poses(model), model)
+    assert "1 unit of the model is 2.5 of the list" in message
     others = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)
     assert name_disagreement(others, model) == ""
