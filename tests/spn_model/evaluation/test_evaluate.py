@@ -1,4 +1,4 @@
-"""Networks are judged on what tests them, as they are, and only in their own world."""
+"""Tests of evaluation: networks are compared with labels of their own world, without alignment."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ ALONE = EvaluateOptions(baselines=False)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """No test may change it."""
+    """Return the path of a shared data set, which no test may change."""
     return write_judged(tmp_path_factory.mktemp("judged") / "dataset.h5")
 
 
 @pytest.fixture(scope="module")
 def beside(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> NetworkComparison:
-    """Two networks, a and b, beside all baselines."""
+    """Compare two networks, a and b, with all baselines."""
     folder = tmp_path_factory.mktemp("networks")
     networks = {n: write_network(folder / n, dataset, seed=k) for k, n in enumerate("ab")}
     return compare(dataset, networks, WORLD, silent, EvaluateOptions())
@@ -70,7 +70,7 @@ def group_of(found: NetworkComparison, name: str) -> EvaluatedGroup:
 
 
 def test_errors_are_those_of_what_the_network_says(dataset, tmp_path):
-    """Medians are of the model's own estimates against the labels of each group, every frame of it."""
+    """Median errors compare the model's own estimates with the labels of every frame in each group."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     found = judged(dataset, n=network)
     assert [g.frames.group for g in found.groups] == ["low", "medium", "validation", "train"]
@@ -88,7 +88,7 @@ def test_errors_are_those_of_what_the_network_says(dataset, tmp_path):
 
 
 def test_nothing_is_aligned(dataset, tmp_path):
-    """A network that says everything 5 m too far east is 5 m worse, and the signed error says so."""
+    """Shifting all estimates 5 m east increases the signed error by exactly 5 m east."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     before = group_of(judged(dataset, n=network), "medium").evaluations[0].errors
     assert isinstance(network.model, TinyModel)
@@ -98,7 +98,7 @@ def test_nothing_is_aligned(dataset, tmp_path):
 
 
 def test_training_images_are_a_fixed_sample(dataset, tmp_path):
-    """Of 12 training images 5 are judged, the same each time, spread from the first to the last."""
+    """Of 12 training images 5 are evaluated, always the same, evenly spread from first to last."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     found = judged(dataset, EvaluateOptions(baselines=False, training_images=5), n=network)
     frames = group_of(found, "train").frames
@@ -121,7 +121,7 @@ OTHER_WORLDS = {
 
 @pytest.mark.parametrize("why", OTHER_WORLDS)
 def test_another_world_is_refused(dataset, tmp_path, why):
-    """Errors against labels of another map would mean nothing: the line says what differs."""
+    """A data set of another map is rejected with a message that says what differs."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     other = write_judged(tmp_path / "other.h5", {"train": 2, "low": 1}, **OTHER_WORLDS[why])
     with pytest.raises(InputError, match=why):
@@ -130,7 +130,7 @@ def test_another_world_is_refused(dataset, tmp_path, why):
 
 @pytest.mark.parametrize("origin", [HIGHER, ABOVE_SEA])
 def test_another_height_is_another_world(dataset, tmp_path, origin):
-    """An origin that lies higher, or counts from something else, moves every pose."""
+    """An origin with another height or height reference is rejected."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     other = write_judged(tmp_path / "other.h5", {"train": 2, "low": 1}, origin=origin)
     with pytest.raises(InputError, match="its origin differs"):
@@ -138,7 +138,7 @@ def test_another_height_is_another_world(dataset, tmp_path, origin):
 
 
 def test_worlds_that_nothing_tells_apart_are_refused(tmp_path):
-    """Without any fingerprint of a map, only the very data set of the training will do."""
+    """Without map fingerprints, only the training data set itself is accepted."""
     plain = write_judged(tmp_path / "plain.h5", fingerprints={})
     network = write_network(tmp_path / "n.safetensors", plain)
     judged(plain, n=network)
@@ -148,7 +148,7 @@ def test_worlds_that_nothing_tells_apart_are_refused(tmp_path):
 
 
 def test_another_split_of_the_same_world_is_judged(dataset, tmp_path):
-    """What was registered or divided anew in the same map is a test of the same network."""
+    """A data set registered or split again in the same map is accepted."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     prints = {**INFO.fingerprints, "4-eval/new": "0f0f"}
     other = write_judged(tmp_path / "b.h5", {"train": 9, "medium": 5}, fingerprints=prints)
@@ -156,7 +156,7 @@ def test_another_split_of_the_same_world_is_judged(dataset, tmp_path):
 
 
 def test_another_camera_needs_a_network_that_takes_any(dataset, tmp_path, monkeypatch):
-    """A kind that knows one camera is refused images of another one; a kind that decodes with K is not."""
+    """Images of another camera are rejected unless the kind of model decodes with K."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     assert INFO.camera is not None
     lens = replace(INFO.camera, params=INFO.camera.params * [1.1, 1, 1])
@@ -168,7 +168,7 @@ def test_another_camera_needs_a_network_that_takes_any(dataset, tmp_path, monkey
 
 
 def test_empty_groups_are_told_and_all_empty_refused(tmp_path):
-    """A flight without a frame is left out and named; with no frame to judge by there is nothing to say."""
+    """An empty group is skipped with a note; if all groups are empty, evaluation fails."""
     path = write_judged(tmp_path / "a.h5", {"train": 6, "medium": 3})
     network = write_network(tmp_path / "n.safetensors", path)
     found = judged(path, n=network)
@@ -179,7 +179,7 @@ def test_empty_groups_are_told_and_all_empty_refused(tmp_path):
 
 
 def test_a_data_set_of_another_version_is_refused(dataset, tmp_path):
-    """A format that this program does not know is not guessed at."""
+    """A data set of an unknown format version is rejected."""
     import h5py
 
     network = write_network(tmp_path / "n.safetensors", dataset)
@@ -191,7 +191,7 @@ def test_a_data_set_of_another_version_is_refused(dataset, tmp_path):
 
 
 def test_baselines_stand_beside_networks_but_not_for_training_images(beside):
-    """Retrieval, oracle and mean pose of each group; a training image would find itself."""
+    """Each group has all baselines, but training images only the mean pose: retrieval would find itself."""
     medium = group_of(beside, "medium")
     assert [e.method for e in medium.evaluations] == ["a", "b", MEAN, VLAD, GEM, ORACLE]
     assert medium.retrieval in (VLAD, GEM)
@@ -201,7 +201,10 @@ def test_baselines_stand_beside_networks_but_not_for_training_images(beside):
 
 
 def test_what_looks_alike_is_found_once(dataset, tmp_path, monkeypatch):
-    """Rows are kept for the very data set; damaged or foreign ones are found anew, and no pose is kept."""
+    """Cached retrieval rows are reused only for the same data set.
+
+    Damaged rows or rows of another data set are recomputed, and no pose is cached.
+    """
     kept = tmp_path / "runs" / "kept.json"
     described: list[int] = []
 
@@ -232,7 +235,7 @@ def test_what_looks_alike_is_found_once(dataset, tmp_path, monkeypatch):
     found(dataset)
     assert len(described) == 6
     text = kept.read_text()
-    for wrong in ("12", "-2", '"x"'):  # rows that are none
+    for wrong in ("12", "-2", '"x"'):  # invalid rows
         kept.write_text(re.sub(r"(\[\s*)\d+,", rf"\g<1>{wrong},", text, count=1))
         found(dataset)
         assert len(described) == 6, wrong
@@ -245,7 +248,7 @@ def test_what_looks_alike_is_found_once(dataset, tmp_path, monkeypatch):
 
 
 def test_dropout_scatters_and_leaves_the_network_as_it_was(dataset, tmp_path):
-    """Samples differ, their covariance is theirs, the same seed gives the same, and dropout is off after."""
+    """Dropout samples scatter, depend only on the seed, and leave dropout disabled afterwards."""
     network = write_network(tmp_path / "n.safetensors", dataset, dropout=0.5)
     with Dataset(dataset) as data:
         of = data.groups["medium"]
@@ -265,7 +268,7 @@ def test_dropout_scatters_and_leaves_the_network_as_it_was(dataset, tmp_path):
 
 
 def test_dropout_stands_beside_its_network_where_there_is_any(dataset, tmp_path):
-    """Networks with dropout get a second row; of one without, a note says that there is nothing to sample."""
+    """A network with dropout gets a second row; one without gets a note that dropout was skipped."""
     some = write_network(tmp_path / "a.safetensors", dataset, dropout=0.5)
     none = write_network(tmp_path / "b.safetensors", dataset, dropout=0.0)
     assert has_dropout(some.model)
@@ -277,7 +280,7 @@ def test_dropout_stands_beside_its_network_where_there_is_any(dataset, tmp_path)
 
 
 def test_files_of_a_comparison(beside, tmp_path):
-    """Each run's folder tells of its own network and of baselines; figures are of groups that test it."""
+    """Each run's folder holds its own network and the baselines, with figures of held-out groups."""
     names = {"metrics": "metrics.json", "errors": "errors.csv", "drawings": "figures"}
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "old.svg").write_text("<svg")
@@ -302,7 +305,7 @@ def _columns(folder: Path) -> list[str]:
 
 
 def test_a_group_of_any_name_gets_files_inside_its_folder(dataset, tmp_path):
-    """Groups are named by the data set: no name of one leads out of the folder or over another's figures."""
+    """Group names from the data set cannot lead out of the folder or overwrite another group's figures."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     found = judged(dataset, n=network)
     low, medium = group_of(found, "low"), group_of(found, "medium")
@@ -324,7 +327,7 @@ def test_a_group_of_any_name_gets_files_inside_its_folder(dataset, tmp_path):
 
 
 def test_figures_hold_the_network_beside_the_better_retrieval(beside):
-    """Trajectories and histograms name the networks and what they must beat."""
+    """Trajectories and histograms show the network and the better retrieval baseline."""
     found = select_network(beside, "b")
     medium = group_of(found, "medium")
     figures = draw_figures(medium, found)
@@ -350,7 +353,7 @@ def write_log(path: Path, rows: list[dict[str, str]]) -> Path:
 
 
 def test_the_course_of_a_training_is_drawn(tmp_path):
-    """Loss, errors and stages over minutes; errors that are none are left out, not drawn as zero."""
+    """Loss, errors and stages are plotted over minutes; undefined errors are omitted, not drawn as zero."""
     log = read_log(write_log(tmp_path / "log.csv", LOG))
     assert log.facts() == {"minutes": 1.0, "images": 80}
     assert log.stages == (("head", 0.0), ("all", 0.5))
@@ -366,7 +369,7 @@ def test_the_course_of_a_training_is_drawn(tmp_path):
 
 @pytest.mark.parametrize("cell", ["train_s", "images", "loss"])
 def test_a_damaged_log_is_told_with_its_line(tmp_path, cell):
-    """What is no number is not drawn around."""
+    """A non-numeric cell in a training log raises an error that names the line."""
     path = write_log(tmp_path / "log.csv", [LOG[0], {**LOG[2], cell: "<svg>"}])
     with pytest.raises(InputError, match=r"log\.csv:3: is not a training log"):
         read_log(path)
@@ -378,7 +381,7 @@ def evaluated(area: Path, *words: str) -> Result:
 
 
 def place_run(area: Path, name: str, seed: int) -> None:
-    """A run as training leaves it."""
+    """Create a run folder as training leaves it."""
     dataset = area.parent / "own.h5"
     if not dataset.exists():
         write_judged(dataset)
@@ -389,7 +392,7 @@ def place_run(area: Path, name: str, seed: int) -> None:
 
 
 def test_several_runs_stand_in_one_table(tmp_path):
-    """Each run's folder gets its files, `compared` those of both, and the tables name everything."""
+    """Each run's folder gets its own files, `compared` those of both; tables name all methods."""
     area = tmp_path / "area"
     place_run(area, "first", 0)
     place_run(area, "second", 1)
@@ -405,11 +408,11 @@ def test_several_runs_stand_in_one_table(tmp_path):
         assert (area / "runs" / folder / "figures" / "training.svg").exists() != both
     assert load(area / "runs" / "first" / "checkpoint.safetensors").facts["images_shown"] == 40
     shown = CliRunner().invoke(data_main, ["status", "--area", str(area)])
-    assert "is not an area" in shown.output  # a folder with nothing but networks
+    assert "is not an area" in shown.output  # a folder that holds only networks
 
 
 def test_facts_of_a_run_are_documented(tmp_path):
-    """docs/evaluation.md names what metrics.json tells of a run, its network and its cost."""
+    """docs/evaluation.md documents all facts in metrics.json about a run, its network and its cost."""
     place_run(tmp_path / "area", "first", 0)
     words = ("--run", "first", "--no-baselines")
     assert evaluated(tmp_path / "area", str(tmp_path / "own.h5"), *words).exit_code == 0
@@ -426,7 +429,7 @@ def test_facts_of_a_run_are_documented(tmp_path):
 
 
 def test_a_run_that_is_not_there_is_told(tmp_path):
-    """The line names the folder and the command that makes it; `compared` is no run's name."""
+    """A missing run names the folder and the command that makes it; `compared` is not a valid run name."""
     ran = evaluated(tmp_path / "area", "--run", "nothing")
     assert ran.exit_code == 1
     assert "holds no trained network; run spn-model train --run nothing first" in ran.output
@@ -437,7 +440,7 @@ def test_a_run_that_is_not_there_is_told(tmp_path):
 
 
 def test_an_area_without_a_split_says_what_to_do(tmp_path):
-    """Without DATASET the area's own is taken, and where there is none the line names the command."""
+    """Without DATASET the area's own is used; if it is missing, the message names the command to run."""
     place_run(tmp_path / "area", "first", 0)
     ran = evaluated(tmp_path / "area", "--run", "first")
     assert ran.exit_code == 1
@@ -445,7 +448,7 @@ def test_an_area_without_a_split_says_what_to_do(tmp_path):
 
 
 def test_a_frame_without_a_pose_counts_as_infinitely_wrong(dataset, tmp_path, monkeypatch):
-    """Where the network finds none, medians are none too, and nothing is made up."""
+    """If the network finds no pose for any frame, median errors are infinite."""
     network = write_network(tmp_path / "n.safetensors", dataset)
     real = network.model.estimate
 

@@ -1,4 +1,4 @@
-"""What pose regressors aim at and how their errors count, against the formulas worked out by hand."""
+"""Tests of pose-regression targets and losses against formulas computed by hand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spn_model.networks.pose_targets import PoseTargets
 
 FAR = np.array(
     [450_000.0, -5_200_000.0, 120.0]
-)  # as map coordinates are, where float32 has steps of 0.5 m
+)  # typical map coordinates, at which float32 has steps of 0.5 m
 
 
 def random_poses(count: int, seed: int = 0, spread: float = 15.0) -> Poses:
@@ -41,7 +41,7 @@ def tensors(*arrays: object) -> list[torch.Tensor]:
 
 
 def test_poses_come_back_from_targets():
-    """Far from the origin too, positions come back to 10 micrometres and rotations to 1e-6."""
+    """Even far from the origin, decoded positions are exact to 10 micrometres and rotations to 1e-6."""
     poses = random_poses(50)
     targets = fitted(poses)
     back = targets.decode(*targets.encode(poses))
@@ -50,7 +50,7 @@ def test_poses_come_back_from_targets():
 
 
 def test_targets_are_centred_and_scaled_by_the_training_poses():
-    """Offsets of the training poses have mean 0, and a root mean square of `scale`; others do not count."""
+    """Offsets of training poses have mean 0 and an RMS of `scale`; other poses do not affect either."""
     poses = random_poses(200)
     targets = fitted(poses)
     offsets, _ = targets.encode(poses)
@@ -64,18 +64,18 @@ def test_targets_are_centred_and_scaled_by_the_training_poses():
 
 
 def test_one_place_has_no_spread_and_is_not_scaled():
-    """Where all training poses lie at one place, units are the world's."""
+    """If all training poses share one position, the scale is 1."""
     poses = random_poses(5, spread=0.0)
     assert float(fitted(poses).scale) == 1.0
 
 
 def test_a_rotation_has_one_target():
-    """q and -q have the same target, on the side of the mean orientation."""
+    """q and -q have the same target, in the hemisphere of the mean orientation."""
     around = rotations_from_vectors(
         [np.pi * 0.98, 0, 0] + 0.3 * np.random.default_rng(1).normal(size=(40, 3))
     )
     poses = Poses.from_rotations(np.zeros((40, 3)), around)
-    assert (poses.quats_wxyz[:, 1] < 0).any()  # w >= 0 alone would tear the group apart
+    assert (poses.quats_wxyz[:, 1] < 0).any()  # w >= 0 alone would split the group
     assert (poses.quats_wxyz[:, 1] > 0).any()
     targets = fitted(poses)
     _, quats = targets.encode(poses)
@@ -85,7 +85,7 @@ def test_a_rotation_has_one_target():
 
 
 def test_quaternions_are_read_out_whatever_their_length_and_sign():
-    """-3 q is the pose of q; a quaternion of no length, or a value that is no number, is no pose."""
+    """-3 q decodes to the pose of q; a zero quaternion or a non-finite value decodes to no pose."""
     poses = random_poses(4)
     targets = fitted(poses)
     offsets, quats = targets.encode(poses)
@@ -100,14 +100,17 @@ def test_quaternions_are_read_out_whatever_their_length_and_sign():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_papers_loss_is_as_by_hand(sign):
-    """|x - x*| = 5 m, and |q - q*| = 1 as q = (2, 0, 0, 0) is not normalised: 5 + 500."""
+    """With |x - x*| = 5 m and |q - q*| = 1 for the unnormalised q = (2, 0, 0, 0), the loss is 5 + 500."""
     x, q, true_x, true_q = tensors([[4, 6, 1]], [[2, 0, 0, 0]], [[1, 2, 1]], [[sign, 0, 0, 0]])
     assert beta_weighted_loss(x, q, true_x, true_q, 500.0).tolist() == pytest.approx([505.0])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_learned_loss_is_as_by_hand(sign):
-    """With s_x = 0.5 and s_q = -2: 7 exp(-0.5) + 0.5 + 0.3 exp(2) - 2; its own weights start at 0 and -3."""
+    """The learned loss at s_x = 0.5 and s_q = -2 is 7 exp(-0.5) + 0.5 + 0.3 exp(2) - 2.
+
+    Its initial weights are 0 and -3.
+    """
     weighting = LearnedWeighting().double()
     assert (weighting.s_x.item(), weighting.s_q.item()) == (0.0, -3.0)
     with torch.no_grad():
@@ -120,7 +123,7 @@ def test_the_learned_loss_is_as_by_hand(sign):
 
 
 def test_reprojection_is_as_the_camera_projects():
-    """The mean of |dx| + |dy| over the points that are seen, in pixels, as `Camera` projects them."""
+    """The loss is the mean |dx| + |dy| in pixels over visible points, as projected by `Camera`."""
     lens = Camera("PINHOLE", 640, 480, np.array([500.0, 520.0, 320.0, 240.0]))
     rng = np.random.default_rng(3)
     truth = Poses.from_rotations(
@@ -145,7 +148,7 @@ def test_reprojection_is_as_the_camera_projects():
 
 
 def test_reprojection_stays_finite():
-    """Points behind the estimated camera, padding, and images without points have finite gradients."""
+    """Gradients are finite for points behind the estimated camera, padding, and images without points."""
     x = torch.tensor([[0.0, 0, 20], [0, 0, 0], [0, 0, 0]], requires_grad=True)
     q = torch.tensor([[1.0, 0, 0, 0]] * 3, requires_grad=True)
     points = torch.zeros(3, 2, 3)
@@ -153,7 +156,7 @@ def test_reprojection_stays_finite():
     seen = torch.tensor([[True, False], [True, False], [False, False]])
     matrices = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]).expand(3, 3, 3)
     found = reprojection_loss(x, q, torch.zeros(3, 3), q.detach(), points, seen, matrices)
-    # The first camera has passed the point: it counts at a tenth of its depth, 1 m, 100 px from the middle.
+    # The point is behind the first camera: it counts at a tenth of its depth, 1 m, 100 px from the centre.
     assert found.tolist() == pytest.approx([90.0, 0.0, 0.0])
     found.sum().backward()
     assert torch.isfinite(x.grad).all()
@@ -161,7 +164,10 @@ def test_reprojection_stays_finite():
 
 
 def test_residuals_have_the_conventions_of_estimates():
-    """True minus estimated centre, and v with R_true = exp(v) R: from a tiny turn to one of 179 degrees."""
+    """Residuals are true minus estimated centre, and v with R_true = exp(v) R.
+
+    Rotation angles range from a tiny turn to 179 degrees.
+    """
     rng = np.random.default_rng(7)
     estimated = Poses(rng.normal(size=(30, 3)), canonical_quats(rng.normal(size=(30, 4))))
     axis = rng.normal(size=(30, 3))
@@ -181,7 +187,7 @@ def test_residuals_have_the_conventions_of_estimates():
 
 
 def test_the_likelihood_is_best_at_the_standard_deviation_of_errors():
-    """Of Laplacian errors of 0.3, stated deviations of 0.3 are likelier than 4 % more or less."""
+    """For Laplacian errors of 0.3, a stated deviation of 0.3 is likelier than one 4 % larger or smaller."""
     errors = torch.from_numpy(
         np.random.default_rng(2).laplace(scale=0.3 / 2**0.5, size=(40_000, 6))
     )

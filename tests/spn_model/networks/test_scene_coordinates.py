@@ -1,4 +1,4 @@
-"""Scene coordinates: the network's cells, its loss, and what it learns from."""
+"""Tests of the scene-coordinate network: cell grid, loss, and training targets."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LENS = Camera.from_horizontal_fov(*SIZE, 72.0)
 
 @pytest.mark.parametrize("size", [(480, 270), (216, 121), (63, 64), (65, 97)])
 def test_the_grid_is_that_of_the_network(size):
-    """grid_size tells the cells of any image; outputs are three coordinates and one log scale."""
+    """`grid_size` matches the network's output, which has three coordinates and a log scale per cell."""
     columns, rows = grid_size(*size)
     coordinates, log_scale = SceneCoordinates()(torch.zeros(2, 3, size[1], size[0]))
     assert coordinates.shape == (2, 3, rows, columns)
@@ -45,22 +45,22 @@ def test_the_grid_is_that_of_the_network(size):
 
 
 def test_a_small_image_is_refused():
-    """Below the smallest size there are no cells at stride 16."""
+    """Images below the smallest size, which have no cells at stride 16, are rejected."""
     with pytest.raises(ValueError, match="62 x 270 is smaller than 63"):
         grid_size(62, 270)
 
 
 def test_it_is_small():
-    """At most 5 MB in float32, everything that it needs included."""
+    """The whole state, buffers included, takes less than 5 MB in float32."""
     state = SceneCoordinates().state_dict()
     assert 4.3e6 < sum(4 * tensor.numel() for tensor in state.values()) < 5e6
 
 
 def test_cells_lie_where_they_are_said_to():
-    """What a cell sees is centred on its stated pixel, by both of its paths, at even and odd cells.
+    """The receptive field of a cell is centred on its stated pixel, along both paths, at even and odd cells.
 
-    With averages for maxima and equal positive weights the network is linear and symmetric: the centroid of
-    its gradient is its cell's centre.
+    With average pooling in place of max pooling and equal positive weights, the network is linear and
+    symmetric, so the centroid of its gradient is the cell's centre.
     """
     net = SceneCoordinates()
     for k in (2, 5, 8):
@@ -78,7 +78,7 @@ def test_cells_lie_where_they_are_said_to():
 
 
 def test_names_of_the_features_are_the_published_ones():
-    """SqueezeNet 1.1's parameters load by torchvision's names; all others are said to be added."""
+    """SqueezeNet 1.1 parameters use torchvision's names; all other parameters are listed as added."""
     net = SceneCoordinates()
     published = {name for name in net.state_dict() if name.startswith("features.")}
     assert {"features.0.weight", "features.12.expand3x3.bias"} <= published
@@ -89,7 +89,7 @@ def test_names_of_the_features_are_the_published_ones():
 
 
 def test_frozen_features_take_no_gradient():
-    """The first layers stay, the later ones and the head learn."""
+    """Frozen early layers get no gradient, while later layers and the head do."""
     net = SceneCoordinates()
     net.freeze_features(5)
     coordinates, log_scale = net(torch.rand(1, 3, 64, 64))
@@ -100,7 +100,7 @@ def test_frozen_features_take_no_gradient():
 
 
 def test_the_head_starts_from_features_of_size_one():
-    """After measuring, what the head receives is centred and of unit variance on the same images."""
+    """After `measure_features`, the head's input has zero mean and unit variance on the same images."""
     net = SceneCoordinates()
     images = torch.rand(3, 3, 96, 96)
     net.measure_features(images)
@@ -113,7 +113,7 @@ def test_the_head_starts_from_features_of_size_one():
 
 
 def test_coordinates_are_not_rounded_in_bfloat16():
-    """Under autocast coordinates keep digits that bfloat16 has not."""
+    """Under autocast, coordinates keep more digits than bfloat16 can represent."""
     net = SceneCoordinates()
     nn.init.normal_(net.out.weight, std=0.1)
     with torch.autocast("cpu", torch.bfloat16):
@@ -124,7 +124,7 @@ def test_coordinates_are_not_rounded_in_bfloat16():
 
 
 def test_the_scene_is_measured_by_medians():
-    """A point at the end of the world changes neither centre nor spread much."""
+    """One extreme outlier point hardly changes the scene's centre and spread."""
     net = SceneCoordinates()
     xyz = torch.randn(999, 3) + torch.tensor([5.0, 6.0, 7.0])
     net.set_scene(torch.cat([xyz, torch.full((1, 3), 1e6)]))
@@ -133,7 +133,7 @@ def test_the_scene_is_measured_by_medians():
 
 
 def test_the_loss_is_least_at_the_true_scale():
-    """For errors drawn from the distribution, their own scale has the greatest likelihood."""
+    """For errors drawn from the assumed distribution, the loss is lowest at the true scale."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(1, 3, 40, 50))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -148,7 +148,7 @@ def test_the_loss_is_least_at_the_true_scale():
 
 
 def test_cells_without_a_target_teach_nothing():
-    """Their coordinates have no gradient, whatever stands in the target."""
+    """Coordinates of cells without a target get no gradient, whatever values the target holds."""
     coordinates = torch.randn(1, 3, 4, 5, requires_grad=True)
     known = torch.zeros(1, 4, 5, dtype=torch.bool)
     known[0, 1, 2] = True
@@ -158,7 +158,7 @@ def test_cells_without_a_target_teach_nothing():
 
 
 def test_it_learns_one_image():
-    """Thirty steps on one small image halve the distance to its targets, and certainty follows."""
+    """Thirty steps on one small image halve the distance to its targets and reduce the predicted scale."""
     net = SceneCoordinates()
     image = torch.rand(1, 3, 96, 96)
     columns, rows = grid_size(96, 96)
@@ -184,7 +184,7 @@ def test_it_learns_one_image():
 
 
 def test_parts_of_the_scene_are_where_points_are():
-    """Four clumps of points share 48 middles, each of which lies in a clump; strays are in no part."""
+    """Four point clusters share 48 part centres, each within a cluster; outliers belong to no part."""
     generator = torch.Generator().manual_seed(0)
     corners = torch.tensor([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [30, 30, 0]])
     points = corners.repeat(500, 1) + torch.rand(2000, 3, generator=generator)
@@ -200,14 +200,14 @@ def test_parts_of_the_scene_are_where_points_are():
 
 
 def test_few_points_make_a_scene_too():
-    """Fewer points than parts leave parts without a point, and no number that is none."""
+    """With fewer points than parts, part centres are still finite."""
     net = SceneCoordinates()
     net.set_scene(torch.rand(5, 3))
     assert torch.isfinite(net.place).all()
 
 
 def test_a_cell_takes_the_point_nearest_to_its_middle():
-    """Of two points in a cell the nearer one counts; points outside all cells count nowhere."""
+    """Of two points in a cell the one nearer to its centre is used; points outside all cells are ignored."""
     pixels = np.array(
         [[10.9, 7.0], [7.6, 7.6], [-3.0, 5.0], [np.nan, np.nan], [15.5, 23.4], [900, 9]]
     )
@@ -227,7 +227,7 @@ def look_at_the_ground(pitch_deg: float) -> Poses:
 
 
 def ground_points(pose: Poses, count: int, seed: int = 0) -> FramePoints:
-    """Points of level ground at height 1 that a camera sees at random pixels."""
+    """Return points of level ground at height 1 m seen by a camera at random pixels."""
     pixels = np.random.default_rng(seed).uniform([0, 0], SIZE, (count, 2))
     rays = np.column_stack([LENS.unproject(pixels), np.ones(count)]) @ pose.rotations[0]
     xyz = pose.centers[0] + rays * ((1.0 - pose.centers[0, 2]) / rays[:, 2])[:, None]
@@ -235,11 +235,11 @@ def ground_points(pose: Poses, count: int, seed: int = 0) -> FramePoints:
 
 
 def test_flat_ground_between_points_is_exact():
-    """The surface of a plane, seen at an angle, lies on the plane to 1e-4 m, at any pixel's own ray."""
+    """The surface of a plane seen at an angle is exact to 1e-4 m along any pixel's own ray."""
     pose = look_at_the_ground(-50.0)
     seen = surface(ground_points(pose, 600), pose, LENS.matrix, SIZE, SurfaceOptions())
     rng = np.random.default_rng(1)
-    # Within a cell of the stored grid depth is constant: pixels at the cells' middles.
+    # Depth is constant within a cell of the stored grid, so use pixels at cell centres.
     pixels = np.floor(rng.uniform([40, 40], [440, 230], (300, 2)) / 2) * 2 + 1
     xyz = seen.xyz(pixels)
     assert np.isfinite(xyz).all()
@@ -249,7 +249,7 @@ def test_flat_ground_between_points_is_exact():
 
 
 def test_a_jump_in_depth_is_no_surface():
-    """Between a near and a far wall nothing is known, on either nearly everything is."""
+    """No surface spans the gap between a near and a far wall, while nearly all of each wall is covered."""
     pose = Poses.from_rotations([[0.0, 0, 0]], np.eye(3)[None])
     pixels = np.random.default_rng(0).uniform([0, 0], SIZE, (1500, 2))
     pixels = pixels[np.abs(pixels[:, 0] - 240) > 8]
@@ -268,7 +268,7 @@ def test_a_jump_in_depth_is_no_surface():
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_without_points_nothing_is_known(count):
-    """An image with fewer than three points has no surface, and no error."""
+    """An image with fewer than three points has no surface and raises no error."""
     pose = look_at_the_ground(-50.0)
     some = ground_points(pose, 3)
     few = FramePoints(some.ids[:count], some.pixels[:count], some.xyz[:count])
@@ -279,7 +279,7 @@ def test_without_points_nothing_is_known(count):
 
 
 def test_targets_of_a_virtual_camera_are_what_its_pixels_show():
-    """Cells of a turned and zoomed image get points that it sees exactly at their middles."""
+    """Targets of a rotated and zoomed image project exactly onto its cell centres."""
     pose = look_at_the_ground(-45.0)
     seen = surface(ground_points(pose, 800), pose, LENS.matrix, SIZE, SurfaceOptions())
     virtual = random_warp(np.random.default_rng(2), LENS.matrix, SIZE, WarpOptions(), zoom=0.8)
@@ -295,7 +295,7 @@ def test_targets_of_a_virtual_camera_are_what_its_pixels_show():
 
 
 def checkered(pose: Poses) -> np.ndarray:
-    """Smoothly chequered ground at height 1, as a camera sees it; one value a place."""
+    """Render smoothly chequered ground at height 1 m, with one value per ground position."""
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     rays = np.column_stack([LENS.unproject(pixels), np.ones(len(pixels))]) @ pose.rotations[0]
@@ -305,7 +305,7 @@ def checkered(pose: Poses) -> np.ndarray:
 
 
 def test_a_virtual_view_is_what_a_camera_there_would_see():
-    """Ground seen from 4 m higher and 2 m aside: image within 3 of 255 levels, surface on the ground."""
+    """A view warped 4 m up and 2 m aside is within 3 of 255 grey levels, its surface on the ground."""
     pose = look_at_the_ground(-50.0)
     seen = surface(ground_points(pose, 900), pose, LENS.matrix, SIZE, SurfaceOptions())
     there = Poses.from_rotations(
@@ -323,7 +323,7 @@ def test_a_virtual_view_is_what_a_camera_there_would_see():
 
 
 def test_a_near_wall_hides_what_is_behind():
-    """Where two surfaces fall on the same pixels, the nearer one is seen."""
+    """If two surfaces project to the same pixels, the nearer one is visible."""
     depth = np.full((135, 240), 10.0, np.float32)
     depth[:, :120] = 4.0
     here = Poses.from_rotations([[0.0, 0, 0]], np.eye(3)[None])
@@ -339,7 +339,7 @@ def test_a_near_wall_hides_what_is_behind():
 
 
 def test_virtual_cameras_rise_and_keep_their_view():
-    """Drawn places lie within the options, above the real one, and look at what it looked at."""
+    """Sampled positions respect the options, are not below the real camera, and keep its target in view."""
     pose = look_at_the_ground(-40.0)
     seen = surface(ground_points(pose, 600), pose, LENS.matrix, SIZE, SurfaceOptions())
     rng = np.random.default_rng(0)
