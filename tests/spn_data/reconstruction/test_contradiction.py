@@ -1,4 +1,4 @@
-"""Wrong models are told from right ones, on data with exact truth."""
+"""Detection of wrong models, on data with exact truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spn_data.reconstruction.correspondences import FramesToMap
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
-    """A database of 20 images and 300 points, all of which match, and the true scene."""
+    """Database of 20 images and 300 points, all of which match, and the true scene."""
     path = tmp_path_factory.mktemp("synthetic") / "database.db"
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
@@ -32,7 +32,7 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
 
 
 def turned(scene: Scene, rows: np.ndarray) -> Scene:
-    """With some cameras turned by 20 degrees about the origin, as one rigid part."""
+    """Return the scene with some cameras rotated by 20 degrees about the origin as one rigid part."""
     turn = rotations_from_vectors(np.array([[0.0, 0.0, np.deg2rad(20)]]))[0]
     centers, rotations = scene.poses.centers.copy(), scene.poses.rotations.copy()
     centers[rows], rotations[rows] = centers[rows] @ turn.T, rotations[rows] @ turn.T
@@ -49,7 +49,7 @@ def test_a_right_model_is_not_contradicted(synthetic: tuple[Path, Scene]) -> Non
 def test_pairs_across_two_parts_that_lie_wrongly_contradict_them(
     synthetic: tuple[Path, Scene],
 ) -> None:
-    """All pairs across, none within a part, most matches first."""
+    """Pairs across a wrongly placed part contradict the model, pairs within it do not; most matches first."""
     path, scene = synthetic
     part = np.arange(7)
     with MapDatabase.open(path) as database:
@@ -65,7 +65,7 @@ def test_pairs_across_two_parts_that_lie_wrongly_contradict_them(
 def test_pairs_with_few_matches_do_not_contradict(
     synthetic: tuple[Path, Scene], tmp_path: Path
 ) -> None:
-    """Chance matches of a wrong pair, as repeated windows give, say nothing against a right model."""
+    """Chance matches of a wrong pair, as on repeated windows, are no evidence against a correct model."""
     path, scene = synthetic
     (tmp_path / "database.db").write_bytes(path.read_bytes())
     rng = np.random.default_rng(0)
@@ -87,7 +87,7 @@ def test_pairs_with_few_matches_do_not_contradict(
 def test_a_known_focal_length_that_comes_out_far_off_speaks_against_a_model(
     synthetic: tuple[Path, Scene], factor: float, known: bool, told: int
 ) -> None:
-    """Longer or shorter; a guessed one may come out as it will."""
+    """A known focal length that comes out far off contradicts a model; a guessed one does not."""
     _, scene = synthetic
     (camera,) = scene.cameras.values()
     start = Camera("SIMPLE_PINHOLE", 100, 100, np.array([camera.focal_px[0] / factor, 50, 50]))

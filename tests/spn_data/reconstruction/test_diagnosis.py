@@ -1,4 +1,4 @@
-"""What became of frames, on a model of 20 synthetic images with one frame that nothing matches."""
+"""Reasons why frames were not registered, on 20 synthetic images plus frames that fail to match."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ def features(n: int) -> Features:
 
 @pytest.fixture(scope="module")
 def registrations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FrameRegistration]:
-    """Of the synthetic images, and of five more: few features, no match, two that match each other, and one
-    that matches the model."""
+    """Registrations of the synthetic images and of five more frames.
+
+    Of the five, one has few features, one has no match, two match only each other, and one matches the model.
+    """
     folder = tmp_path_factory.mktemp("diagnosis")
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(

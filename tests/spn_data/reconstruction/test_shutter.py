@@ -1,4 +1,4 @@
-"""Rolling shutter and stabilisation are found in residuals, with their size, and nowhere else."""
+"""Rolling shutter and stabilisation are detected and measured in residuals, without false alarms."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from tests.worlds.native_world import native_model
 
 @dataclass(frozen=True, kw_only=True)
 class Flaws:
-    """What is wrong with a camera that films a box of points along a simulated flight."""
+    """Imperfections of a camera that films a box of points along a simulated flight."""
 
     readout_s: float = 0.0
     zoom_jitter: float = 0.0
     zoom_drift: float = 0.0
     noise_px: float = 0.5
-    wrong_share: float = 0.02  # of the observations, by up to 4 px
+    wrong_share: float = 0.02  # share of observations that are outliers, by up to 4 px
 
 
 @dataclass(frozen=True, eq=False)
 class Filmed:
-    """A bundle-adjusted model with its truth; displacement_p95_px is the readout's true effect."""
+    """Bundle-adjusted model with its truth; displacement_p95_px is the true effect of the readout."""
 
     scene: Scene
     seen: MapObservations
@@ -58,7 +58,7 @@ class Filmed:
 
 
 def box_of_points(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Points on and up to 3 m before the walls and the ground of a court of 40 x 36 x 18 m."""
+    """Return points on and up to 3 m in front of the walls and the ground of a court of 40 x 36 x 18 m."""
     points = rng.uniform(-1, 1, (count, 3))
     face = rng.integers(0, 5, count)
     axis = np.minimum(face // 2, 2)
@@ -69,7 +69,7 @@ def box_of_points(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @cache
 def film(tmp: Path, seed: int, flaws: Flaws, frames: int = 38, iterations: int = 50) -> Filmed:
-    """Exact projections along a simulated flight, then COLMAP's bundle adjustment of them."""
+    """Project points exactly along a simulated flight, then run COLMAP's bundle adjustment on them."""
     rng = np.random.default_rng(seed)
     path = simulate_paths(preset("standard", seed=seed))["flight1"]
     time_s = 1.0 + 0.85 * np.arange(frames) + rng.uniform(-0.1, 0.1, frames)
@@ -120,7 +120,7 @@ def film(tmp: Path, seed: int, flaws: Flaws, frames: int = 38, iterations: int =
 
 
 def project(camera: Camera, poses: Poses, points: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of points (N, 3) by one pose or a pose each."""
+    """Return the pixels (N, 2) of points (N, 3) with one pose for all or one pose each."""
     return camera.project(np.einsum("nij,nj->ni", poses.rotations, points - poses.centers))
 
 
@@ -134,7 +134,7 @@ def tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_rolling_shutter_is_measured_through_what_bundle_adjustment_hid(
     tmp: Path, seed: int, readout_s: float
 ) -> None:
-    """Readout within 8 %, displacement within 20 %, and pose errors of the size that is told."""
+    """After bundle adjustment, readout is within 8 %, displacement within 20 %, pose errors as reported."""
     filmed = film(tmp, seed, Flaws(readout_s=readout_s))
     found = filmed.diagnose()
     assert found.rolls
@@ -156,7 +156,7 @@ def test_a_rolling_shutter_is_measured_through_what_bundle_adjustment_hid(
 
 @pytest.mark.slow
 def test_a_global_shutter_raises_no_alarm(tmp: Path) -> None:
-    """Over 20 seeds nothing is told, and the readout's error is what its sigma says."""
+    """Over 20 seeds a global shutter gives no warning, and the readout error agrees with its sigma."""
     found = [film(tmp, seed, Flaws(), 30, 12).diagnose() for seed in range(20)]
     assert [d.describe() for d in found] == [""] * 20
     scores = np.array([d.readout_s / d.readout_sigma_s for d in found])
@@ -165,7 +165,7 @@ def test_a_global_shutter_raises_no_alarm(tmp: Path) -> None:
 
 
 def test_zoom_jitter_is_told_as_stabilisation_and_not_as_a_shutter(tmp: Path) -> None:
-    """0.5 % of zoom in each frame is found within a third of its size."""
+    """Zoom jitter of 0.5 % per frame is reported as stabilisation, with its size within a third."""
     found = film(tmp, 2, Flaws(zoom_jitter=0.005)).diagnose()
     assert found.jitters == ("zoom",)
     assert not found.rolls
@@ -175,7 +175,7 @@ def test_zoom_jitter_is_told_as_stabilisation_and_not_as_a_shutter(tmp: Path) ->
 
 
 def test_a_drifting_focal_length_is_told(tmp: Path) -> None:
-    """2 % from first to last frame, of which bundle adjustment bends a part into the scene."""
+    """A focal length drifting by 2 % over the flight is reported, though partly absorbed as a bent scene."""
     found = film(tmp, 5, Flaws(zoom_drift=0.02)).diagnose()
     assert found.drifts
     assert not found.rolls
@@ -184,7 +184,7 @@ def test_a_drifting_focal_length_is_told(tmp: Path) -> None:
 
 
 def test_blocks_of_a_long_flight_agree_with_the_whole(tmp: Path) -> None:
-    """Linearised in three blocks, the readout is the same within its uncertainty."""
+    """Linearising a long flight in three blocks gives the same readout within its uncertainty."""
     filmed = film(tmp, 5, Flaws(readout_s=0.02), 38, 8)
     whole = filmed.diagnose()
     parts = filmed.diagnose(ShutterOptions(max_block_frames=13))
@@ -194,7 +194,7 @@ def test_blocks_of_a_long_flight_agree_with_the_whole(tmp: Path) -> None:
 
 
 def test_without_known_motion_the_shutter_is_undetermined(tmp: Path) -> None:
-    """Photos 10 s apart, or all of one time, give no readout, no warning and no NaN in JSON."""
+    """Photos 10 s apart, or all at one time, give no readout, no warning and no NaN in JSON."""
     filmed = film(tmp, 2, Flaws(zoom_jitter=0.005))
     for time_s in (10.0 * np.arange(38), np.zeros(38)):
         found = replace(filmed, time_s=time_s).diagnose()
@@ -205,7 +205,7 @@ def test_without_known_motion_the_shutter_is_undetermined(tmp: Path) -> None:
 
 
 def test_a_handful_of_frames_is_not_judged(tmp: Path) -> None:
-    """Fewer frames than `min_frames` give no diagnosis; unequal lengths are our own mistake."""
+    """Fewer frames than `min_frames` give no diagnosis, and arrays of unequal length raise an error."""
     filmed = film(tmp, 2, Flaws(zoom_jitter=0.005))
     sequences = np.array([f"part{k // 8}" for k in range(38)])
     assert diagnose_shutter(filmed.scene, filmed.seen, sequences, filmed.time_s) == ()
@@ -214,7 +214,7 @@ def test_a_handful_of_frames_is_not_judged(tmp: Path) -> None:
 
 
 def test_wild_and_unknown_residuals_do_not_change_the_finding(tmp: Path) -> None:
-    """1 % of residuals at 1e7 px and 10 % NaN leave the zoom where it was; none at all is no diagnosis."""
+    """1 % of residuals at 1e7 px and 10 % NaN do not change the zoom; all NaN gives no diagnosis."""
     filmed = film(tmp, 2, Flaws(zoom_jitter=0.005))
     residuals = filmed.seen.residuals_px.copy()
     residuals[::100] = 1e7
@@ -232,7 +232,7 @@ def test_wild_and_unknown_residuals_do_not_change_the_finding(tmp: Path) -> None
 
 
 def test_twists_are_the_velocity_of_a_still_point_in_the_camera() -> None:
-    """A screw motion: twist x point equals the numerical derivative of the point's coordinates."""
+    """For a screw motion, twist x point equals the numerical derivative of the point's coordinates."""
     rate, speed = np.array([0.1, 0.5, -0.2]), np.array([2.0, -1.0, 0.5])
 
     def poses(time_s: np.ndarray) -> Poses:
@@ -253,12 +253,12 @@ def test_twists_are_the_velocity_of_a_still_point_in_the_camera() -> None:
 
     velocity = (in_camera(time_s + 1e-5) - in_camera(time_s - 1e-5)) / 2e-5
     predicted = twists[:, :3] + np.cross(twists[:, 3:], in_camera(time_s))
-    # A cubic through points half a second apart follows the sine to some 1e-2.
+    # A cubic through points half a second apart approximates the sine to about 1e-2.
     np.testing.assert_allclose(predicted[known], velocity[known], atol=0.03)
 
 
 def test_projection_jacobians_are_the_derivatives_of_project() -> None:
-    """Against central differences, for all parameters of a lens with every distortion."""
+    """Projection Jacobians equal central differences for all parameters of a lens with every distortion."""
     params = np.array([900.0, 880.0, 640.0, 350.0, -0.08, 0.02, 0.003, -0.002])
     points = np.random.default_rng(0).uniform([-2, -1, 3], [2, 1, 6], (20, 3))
     by_point, by_lens = projection_jacobians(Camera("OPENCV", 1280, 720, params), points)
@@ -274,7 +274,7 @@ def test_projection_jacobians_are_the_derivatives_of_project() -> None:
 
 
 def test_scatter_beyond_noise_is_found_among_unequal_noises() -> None:
-    """Scatter of 4e-3 under noises of 1e-5 to 1e-3 is found, none where there is none."""
+    """Scatter of 4e-3 is detected under noise of 1e-5 to 1e-3, and none is reported if there is none."""
     rng = np.random.default_rng(3)
     noise = np.geomspace(1e-5, 1e-3, 60)
     quiet = noise * rng.standard_normal(60)
@@ -288,7 +288,7 @@ def test_scatter_beyond_noise_is_found_among_unequal_noises() -> None:
 
 
 def test_the_sentence_names_size_cause_and_remedy() -> None:
-    """Golden sentence; the readout beyond any sensor's is called so."""
+    """The message states size, cause and remedy, and flags a readout longer than that of any sensor."""
     found = ShutterDiagnosis(
         sequence="flight1", camera_id=1, frames=80, readout_s=0.0281, readout_sigma_s=0.0021,
         displacement_rms_px=2.2, displacement_p95_px=6.04, explained_share=0.4, pose_shift=0.05,

@@ -1,4 +1,4 @@
-"""`spn-data register`, end to end: evaluation sequences, and frames between, in a map that stays as it is."""
+"""End-to-end tests of `spn-data register`: evaluation sequences and tracked frames in a frozen map."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def register(area: Path, *arguments: object) -> Result:
 def registered(
     finished_area: Path, flight2: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """An area with an evaluation sequence, one frame a second and those between; not to be changed."""
+    """Area with a registered evaluation sequence, at one frame per second and in between; read-only."""
     area = tmp_path_factory.mktemp("registered") / "area"
     shutil.copytree(finished_area, area)
     register(area, flight2 / "flight2.mp4", "--name", "medium", *FAST, "--all-frames")
@@ -68,13 +68,13 @@ def area(registered: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def bare(finished_area: Path, tmp_path: Path) -> Path:
-    """An area without evaluation sequences."""
+    """Area without evaluation sequences."""
     return Path(shutil.copytree(finished_area, tmp_path / "area"))
 
 
 @pytest.fixture(scope="module")
 def other_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video that glides over blobs that are nowhere in the map."""
+    """Video of a place that is not in the map: a camera gliding over blobs."""
     file = tmp_path_factory.mktemp("other") / "elsewhere.mp4"
     rng = np.random.default_rng(3)
     ground = np.zeros((400, 700, 3), np.float32)
@@ -97,7 +97,7 @@ def poses_file(area: Path, name: str = "medium", group: str = EVALUATION) -> Pat
 
 
 def true_poses(labels: Labels, flight1: Path) -> Poses:
-    """Exact poses: flight2 is flight1 backwards, from its last frame on."""
+    """Return the exact poses; flight2 is flight1 played backwards, starting at its last frame."""
     true = read_truth(flight1.parent / "truth", "flight1").poses
     last = len(true) - 1
     backwards = labels.sequences != "flight1"
@@ -105,7 +105,7 @@ def true_poses(labels: Labels, flight1: Path) -> Poses:
 
 
 def errors(labelled: LabelledArea, labels: Labels, flight1: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Metres and degrees of registered frames, after the map's own similarity to the truth."""
+    """Return position errors (m) and rotation errors (degrees) after the map's similarity to the truth."""
     mapping = labelled.mapping.select(labelled.mapping.registered)
     world_from_map = Similarity.fit(mapping.poses.centers, true_poses(mapping, flight1).centers)
     found = labels.select(labels.registered)
@@ -115,7 +115,7 @@ def errors(labelled: LabelledArea, labels: Labels, flight1: Path) -> tuple[np.nd
 def test_an_evaluation_flight_gets_true_poses_with_covariances(
     registered: Path, flight1: Path
 ) -> None:
-    """All frames, by a lens that was not given; the frames between too; no label is wrong."""
+    """All frames of an evaluation flight, tracked ones too, get correct labels with an unknown lens."""
     labelled = read_labelled_area(Area(registered))
     labels = labelled.evaluation["medium"]
     chosen = labels.select(~labels.tracked)
@@ -136,7 +136,7 @@ def test_an_evaluation_flight_gets_true_poses_with_covariances(
 
 
 def test_the_map_is_not_touched(registered: Path, finished_area: Path) -> None:
-    """Every file of the map is byte for byte what it was; the stages record its hash before and after."""
+    """Registration leaves every map file unchanged, and stages record its hash before and after."""
     for stage in (MODEL, GEO):
         for path in (finished_area / stage).rglob("*"):
             same = registered / path.relative_to(finished_area)
@@ -151,7 +151,7 @@ def test_the_map_is_not_touched(registered: Path, finished_area: Path) -> None:
 
 
 def test_the_points_that_frames_see_are_where_their_poses_put_them(registered: Path) -> None:
-    """observations.npz, poses.csv and camera.json fit each other and the map."""
+    """observations.npz, poses.csv and camera.json agree with each other and with the map."""
     labelled = read_labelled_area(Area(registered))
     labels, seen = labelled.evaluation["medium"], labelled.evaluation_seen["medium"]
     for row in np.flatnonzero(labels.registered):
@@ -174,7 +174,7 @@ def test_the_same_again_is_left_alone(area: Path, flight2: Path) -> None:
 
 
 def test_another_place_fails_entirely_and_says_so(bare: Path, other_place: Path) -> None:
-    """No frame gets a pose, each has a reason, and the command ends well with a plain statement."""
+    """No frame of another place gets a pose, each has a reason, and the command still succeeds."""
     result = register(bare, other_place, *FAST, "--all-frames")
     assert "0 of 4 (0.0%) frames" in " ".join(result.stdout.split())
     labels = read_labels(poses_file(bare, "elsewhere"))
@@ -224,7 +224,7 @@ def test_other_options_need_overwrite_and_the_first_ones_give_the_first_result(
 def test_the_order_of_sequences_and_the_number_of_workers_change_nothing(
     area: Path, finished_area: Path, flight2: Path, tmp_path: Path
 ) -> None:
-    """`medium` before `fast` and after it: the same bytes."""
+    """Registering `medium` before or after `fast`, with any number of workers, gives the same bytes."""
     bare = Path(shutil.copytree(finished_area, tmp_path / "turned"))
     fast = (flight2 / "flight2.mp4", "--name", "fast", "--rate", "0.5")
     register(bare, *fast, "--threads", "2")
@@ -243,7 +243,7 @@ def test_the_order_of_sequences_and_the_number_of_workers_change_nothing(
 
 
 def test_what_is_part_of_the_map_is_refused(bare: Path, flight1: Path, flight2: Path) -> None:
-    """By its content, under any name; and no evaluation sequence takes a mapping sequence's name."""
+    """A mapping video is refused under any name, and so is a sequence that takes a mapping flight's name."""
     result = run("register", flight1, "--name", "fresh", "--area", bare)
     assert result.exit_code == 1
     assert "is part of the map, so its labels would not be an independent test" in result.stderr
@@ -295,7 +295,7 @@ def test_an_area_without_a_map_is_told_what_comes_first(flight2: Path, tmp_path:
 
 @pytest.mark.slow
 def test_frames_between_those_of_the_map_get_labels(flight1: Path, tmp_path: Path) -> None:
-    """--all-frames alone labels every sequence that stands, mapping flights too."""
+    """--all-frames alone labels the frames of every registered sequence, including mapping flights."""
     area = tmp_path / "area"
     options = ("--frames", "11", "--max-features", "1500", "--threads", "1", "--fov", "72")
     made = run("reconstruct", flight1, "--area", area, *options)
@@ -317,7 +317,7 @@ def test_frames_between_those_of_the_map_get_labels(flight1: Path, tmp_path: Pat
 def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
     area: Path, flight2: Path, tmp_path: Path
 ) -> None:
-    """The area remembers where it was; gone from there, --video says where it lies now."""
+    """If the recorded video is no longer where it was, --video gives its new location."""
     shutil.rmtree(area / TRACKED)
     facts = area / "area.toml"
     facts.write_text(facts.read_text().replace(str(flight2), str(tmp_path / "gone")))
@@ -333,7 +333,7 @@ def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
 def test_a_relative_video_is_found_from_any_folder_and_with_the_area_moved_along(
     bare: Path, flight2: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """area.toml holds its place from the area's own folder on."""
+    """area.toml stores the video's path relative to the area, so it resolves from any working directory."""
     both = tmp_path / "together"
     shutil.copytree(bare, both / "area")
     shutil.copytree(flight2, both / "second day")
@@ -357,7 +357,7 @@ def test_a_remembered_folder_without_videos_does_not_hide_the_one_named(
 def test_frames_between_follow_a_lens_that_was_kept(
     bare: Path, flight2: Path, tmp_path: Path
 ) -> None:
-    """--fixed-lens estimates nothing: the lens has no covariance, the frames have."""
+    """With --fixed-lens the lens is not estimated and has no covariance, but the frames do."""
     lens = tmp_path / "lens.json"
     lens.write_text(
         json.dumps(
@@ -380,7 +380,7 @@ def test_groups_of_the_split_are_no_names_of_sequences(bare: Path, flight2: Path
 
 
 def test_an_evaluation_flight_stays_out_of_the_map(registered: Path, flight2: Path) -> None:
-    """Whether the map is extended or made anew."""
+    """An evaluation flight stays out of the map, whether the map is extended or rebuilt."""
     for how in ("--add", "--overwrite"):
         result = run("reconstruct", flight2, how, "--area", registered)
         assert result.exit_code == 1
@@ -398,7 +398,7 @@ def test_a_mapping_flight_does_not_take_an_evaluation_sequence_s_name(
 
 
 def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
-    """Split sends to `register --all-frames`, which says what to remove; then it runs."""
+    """`split` refers to `register --all-frames`, which names the leftover folder and then runs."""
     shutil.rmtree(area / EVALUATION / "medium")
     refused = run("split", "--area", area)
     assert "4-tracked/medium is stale" in refused.stderr
@@ -420,7 +420,7 @@ def test_an_unknown_sequence_is_named(bare: Path) -> None:
 
 
 def test_labels_move_with_their_map(area: Path) -> None:
-    """Georegistered anew, by other heights and weights: poses go along, on disk too, and nothing is stale."""
+    """Georegistering with other heights and weights moves the labels, also on disk; nothing is stale."""
     before = read_labelled_area(Area(area))
     old = read_world_from_model(Area(area))
     made = run("georegister", "--area", area, "--gnss-sigma", "0.5", "3", "--overwrite")
@@ -448,7 +448,7 @@ def test_labels_move_with_their_map(area: Path) -> None:
 
 
 def test_labels_that_a_kill_kept_from_moving_are_right_all_the_same(area: Path) -> None:
-    """The map has moved and poses.csv has not: readers move them; the next `georegister` does on disk."""
+    """If the map moved but poses.csv did not, readers transform it and the next `georegister` rewrites it."""
     left = area.parent / "left"
     for group in (EVALUATION, TRACKED):
         shutil.copytree(area / group, left / group)
@@ -470,7 +470,7 @@ def test_labels_that_a_kill_kept_from_moving_are_right_all_the_same(area: Path) 
 def test_a_lens_that_is_held_is_written_as_it_was_given(
     bare: Path, flight1: Path, flight2: Path, tmp_path: Path
 ) -> None:
-    """--camera with --fixed-lens: the simulator's own lens, to the bit; labels at least as good."""
+    """--camera with --fixed-lens writes the given lens bit for bit, and labels are at least as accurate."""
     truth = read_json(flight1.parent / "truth" / "flight1_camera.json")
     (tmp_path / "lens.json").write_text(
         (flight1.parent / "truth" / "flight1_camera.json").read_text()
@@ -490,7 +490,7 @@ def test_a_lens_that_is_held_is_written_as_it_was_given(
 def test_a_killed_run_goes_on_to_the_same_labels(
     bare: Path, flight2: Path, registered: Path, step: str
 ) -> None:
-    """SIGKILL while features are found, or matched with the map: the next run starts from what is there."""
+    """A run killed during feature extraction or matching resumes and ends with the same labels."""
     command = [sys.executable, "-c", "from spn_cli.data import main; main()", "register"]
     command += [str(flight2 / "flight2.mp4"), "--name", "medium", "--area", str(bare), *FAST]
     log = bare.parent / "log"
@@ -514,7 +514,7 @@ def test_a_killed_run_goes_on_to_the_same_labels(
 
 
 def test_the_page_has_every_option_with_its_default() -> None:
-    """docs/registration.md has a row for each option of the command and no other."""
+    """docs/registration.md has one row for each option of the command, with its default, and no others."""
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", DOC.read_text(), re.MULTILINE))
     parameters = {
         p.opts[-1]: p for p in main.commands["register"].params if isinstance(p, click.Option)
@@ -526,7 +526,7 @@ def test_the_page_has_every_option_with_its_default() -> None:
 
 
 def test_the_page_has_every_check_with_its_default() -> None:
-    """And no figure of them is another one than the program's."""
+    """docs/registration.md lists every check with the default that the program uses."""
     text = DOC.read_text().split("## Checks")[1].split("### Reasons")[0]
     rows = dict(re.findall(r"^\| `(\w+)` \| ([0-9.]+) \|", text, re.MULTILINE))
     options = CheckOptions()
@@ -542,7 +542,7 @@ def test_the_page_has_every_check_with_its_default() -> None:
 
 
 def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
-    """Columns of poses.csv in their order, and all that registration.json and camera.json hold."""
+    """docs/registration.md lists the columns of poses.csv in order and all fields of the two JSON files."""
     text = DOC.read_text()
     part = text.split("### poses.csv")[1].split("### observations.npz")[0]
     cells = re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE)
@@ -559,7 +559,7 @@ def test_the_page_has_every_field_of_the_files(registered: Path) -> None:
 
 
 def test_a_lens_that_may_be_the_maps_own_is_compared_with_it() -> None:
-    """10 % apart on images of one size is told; the same lens, another one and another size are not."""
+    """A focal length 10 % from the map's at the same image size gives a note; other cases give none."""
     from spn_data.pipeline.evaluation_stage import lens_notes
 
     def lens(focal_px: float, width: int = 800) -> Camera:

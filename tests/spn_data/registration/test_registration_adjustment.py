@@ -1,4 +1,4 @@
-"""Least squares over a sequence in a frozen map: derivatives, and the minimum, against other ways to them."""
+"""Least-squares adjustment of a sequence in a frozen map: Jacobians and minimum against references."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def problem(
     noise_px: float = 0.0,
     every: int = 1,
 ) -> tuple[SequenceState, SequenceObservations]:
-    """The true state of a flight with this lens, and measurements; `own` points are not of the map."""
+    """Return the true state of a flight with this lens, and measurements; `own` points are not in the map."""
     made = flight(frames, noise_px=0.0)
     rng = np.random.default_rng(2)
     seen_twice = np.intersect1d(made.shows[0], made.shows[1])
@@ -62,7 +62,7 @@ def problem(
 
 
 def changed(state: SequenceState, change: np.ndarray, lens: tuple[str, ...]) -> SequenceState:
-    """The state moved by (6N + L + 3P,): poses, lens, own points, as the module defines them."""
+    """Return the state moved by (6N + L + 3P,): poses, lens, own points, in the module's parametrisation."""
     n = len(state.poses)
     moves = change[: POSE * n].reshape(n, POSE)
     params = state.camera.params.copy()
@@ -79,7 +79,7 @@ def changed(state: SequenceState, change: np.ndarray, lens: tuple[str, ...]) -> 
 
 
 def disturbed(state: SequenceState, seed: int = 4) -> SequenceState:
-    """A start some decimetres, degrees and per cent away."""
+    """Return a start that is decimetres, degrees and per cent off."""
     rng = np.random.default_rng(seed)
     lens = lens_parameters(state.camera)
     change = np.concatenate(
@@ -93,7 +93,7 @@ def disturbed(state: SequenceState, seed: int = 4) -> SequenceState:
 
 
 def full_jacobian(state: SequenceState, observations: SequenceObservations) -> np.ndarray:
-    """(2M, 6N + L + 3P) by central differences."""
+    """Return the Jacobian (2M, 6N + L + 3P) by central differences."""
     lens = lens_parameters(state.camera)
     unknowns = POSE * len(state.poses) + len(lens) + 3 * len(state.own_points)
     columns = []
@@ -111,7 +111,7 @@ def full_jacobian(state: SequenceState, observations: SequenceObservations) -> n
 def dense(
     state: SequenceState, observations: SequenceObservations, lens: tuple[str, ...]
 ) -> np.ndarray:
-    """The analytic derivatives in the order of `changed`."""
+    """Return the analytic Jacobian, dense, in the column order of `changed`."""
     found = linearize(state, observations, lens)
     n, m = len(state.poses), len(observations.frame)
     whole = np.zeros((m, 2, POSE * n + len(lens) + 3 * len(state.own_points)))
@@ -126,7 +126,7 @@ def dense(
 
 @pytest.mark.parametrize("camera", [LENS, OPENCV], ids=lambda c: c.model)
 def test_derivatives_are_those_of_finite_differences(camera: Camera) -> None:
-    """By poses, focal lengths, radial distortion and own points, with distortion and tangential terms."""
+    """Jacobians by pose, focal length, distortion and own points equal finite differences."""
     state, observations = problem(camera, frames=3, noise_px=1.0)
     told = dense(state, observations, lens_parameters(camera))
     assert np.abs(told - full_jacobian(state, observations)).max() < 1e-6 * np.abs(told).max()
@@ -144,7 +144,7 @@ def test_a_point_behind_the_camera_counts_as_far_and_pulls_at_nothing() -> None:
 
 
 def test_eliminating_own_points_changes_no_step() -> None:
-    """The reduced system's step for poses and lens, and the points' after it, are the whole system's."""
+    """Eliminating own points by the Schur complement gives the same step as the full normal equations."""
     state, observations = problem(noise_px=1.0)
     lens = lens_parameters(state.camera)
     weights = np.random.default_rng(1).uniform(0.2, 1, len(observations.frame))
@@ -166,7 +166,7 @@ def test_eliminating_own_points_changes_no_step() -> None:
 
 @pytest.mark.parametrize("camera", [LENS, OPENCV], ids=lambda c: c.model)
 def test_exact_measurements_lead_back_to_the_truth(camera: Camera) -> None:
-    """From a start decimetres, degrees and per cent away: poses, lens and own points, to a micrometre."""
+    """From a start decimetres, degrees and per cent off, exact data recover the truth to a micrometre."""
     true, observations = problem(camera)
     found = adjust(disturbed(true), observations, scale_px=1.0, lens=lens_parameters(camera))
     error_m, error_deg = pose_errors(found.poses, true.poses)
@@ -177,7 +177,7 @@ def test_exact_measurements_lead_back_to_the_truth(camera: Camera) -> None:
 
 
 def test_the_minimum_is_that_of_scipy() -> None:
-    """Noise and outliers under the same Cauchy loss: scipy's minimiser comes to the same state."""
+    """With noise, outliers and the same Cauchy loss, SciPy's minimiser reaches the same state."""
     true, observations = problem(frames=3, own=4, noise_px=0.7, every=4)
     pixels = observations.pixels.copy()
     pixels[::15] += [25.0, -10.0]
@@ -188,7 +188,7 @@ def test_the_minimum_is_that_of_scipy() -> None:
     start = linearize(true, observations, lens)
     weights = np.repeat(cauchy_weights(start.residuals_px, 1.0), 2)
     design = dense(true, observations, lens) * np.sqrt(weights)[:, None]
-    # In steps of one standard deviation, so that any minimiser gets there quickly.
+    # Steps are in units of one standard deviation so that any minimiser converges quickly.
     step = np.linalg.inv(np.linalg.cholesky(design.T @ design)).T
 
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -208,7 +208,7 @@ def test_the_minimum_is_that_of_scipy() -> None:
 
 
 def test_gross_errors_hardly_move_the_result() -> None:
-    """One measurement in ten off by 40 px costs centimetres, not the half metre of plain least squares."""
+    """With 10 % of measurements 40 px off, errors are centimetres, against 0.5 m for least squares."""
     true, observations = problem(noise_px=0.3)
     pixels = observations.pixels.copy()
     pixels[::10] += [40.0, 0.0]
@@ -229,7 +229,7 @@ def test_a_lens_that_is_held_stays_as_it_is() -> None:
 
 
 def test_a_minimum_is_left_alone() -> None:
-    """Adjusting again from the result changes nothing that matters."""
+    """Adjusting the result a second time changes nothing significant."""
     true, observations = problem(noise_px=0.5)
     lens = lens_parameters(true.camera)
     once = adjust(disturbed(true), observations, scale_px=1.0, lens=lens)

@@ -1,4 +1,4 @@
-"""Which poses become labels: every reason to refuse, and neighbours that confirm or contradict."""
+"""Checks that decide which poses become labels: every reason for refusal, and votes of neighbours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OPTIONS = RegisterOptions()
 
 
 def evidence(count: int = 3, pairs: dict[tuple[int, int], float] | None = None) -> Evidence:
-    """Frames of which all is well. pairs : agreement of neighbours; all agree if None."""
+    """Return evidence for sound frames; `pairs` is the agreement of neighbours, all agree if None."""
     if pairs is None:
         pairs = {(k, k + 1): 1.0 for k in range(count - 1)}
     keys = sorted(pairs)
@@ -52,7 +52,7 @@ def evidence(count: int = 3, pairs: dict[tuple[int, int], float] | None = None) 
 
 
 def with_frame(found: Evidence, row: int, **values: Any) -> Evidence:
-    """The evidence with other values for one frame."""
+    """Return the evidence with other values for one frame."""
     columns = {}
     for name, value in values.items():
         column = getattr(found, name).copy()
@@ -84,7 +84,7 @@ def test_frames_of_which_all_is_well_are_accepted() -> None:
     ],
 )
 def test_what_no_neighbour_can_make_good(values: dict[str, float], reason: str) -> None:
-    """Too few or crowded points, or a pose that they leave open, fail though all neighbours agree."""
+    """Too few or crowded points, or an undetermined pose, fail a frame even if all its neighbours agree."""
     verdict = judged(with_frame(evidence(), 1, **values))
     assert verdict.accepted.tolist() == [True, False, True]
     assert verdict.reason[1] == reason
@@ -101,7 +101,7 @@ NEED_SUPPORT = [
 def test_what_a_neighbour_can_make_good_fails_without_one(
     values: dict[str, int], reason: str
 ) -> None:
-    """Two poses that go with the image, or few of its own matches: refused where no neighbour speaks."""
+    """A frame with two possible poses or few matches of its own fails unless a neighbour confirms it."""
     alone = evidence(3, {(0, 2): 1.0})
     verdict = judged(with_frame(alone, 1, **values))
     assert verdict.accepted.tolist() == [True, False, True]
@@ -114,7 +114,7 @@ def test_a_neighbour_that_stands_makes_it_good(values: dict[str, int], reason: s
 
 
 def test_support_reaches_along_a_chain_but_must_begin_somewhere() -> None:
-    """Four weak frames hang on one that stands; without it they only confirm each other, and all fail."""
+    """Support passes along a chain of weak frames only if it starts at a frame that passes independently."""
     weak = evidence(5)
     for row in range(1, 5):
         weak = with_frame(weak, row, direct=5)
@@ -123,7 +123,7 @@ def test_support_reaches_along_a_chain_but_must_begin_somewhere() -> None:
 
 
 def test_a_frame_whose_neighbours_contradict_it_is_ambiguous_and_they_are_not() -> None:
-    """The majority holds: one against four fails, and takes none of them along."""
+    """A frame that four neighbours contradict is ambiguous, and those neighbours keep their poses."""
     pairs = {(i, j): 0.0 if 2 in (i, j) else 1.0 for i in range(5) for j in range(i + 1, 5)}
     verdict = judged(evidence(5, pairs))
     assert verdict.accepted.tolist() == [True, True, False, True, True]
@@ -131,7 +131,7 @@ def test_a_frame_whose_neighbours_contradict_it_is_ambiguous_and_they_are_not() 
 
 
 def test_where_no_majority_holds_all_fail() -> None:
-    """Two that contradict each other, and two camps of two."""
+    """Without a majority all fail: two frames that contradict each other, or two groups of two."""
     verdict = judged(evidence(2, {(0, 1): 0.1}))
     assert not verdict.accepted.any()
     assert verdict.reason == ("ambiguous: 1 of 1 neighbours contradict its pose",) * 2
@@ -167,7 +167,7 @@ def solved(
 
 
 def test_a_flight_along_the_facade_stands() -> None:
-    """Right matches: every frame is within centimetres, all neighbours agree, nothing rivals."""
+    """With correct matches every frame is centimetres off, all neighbours agree and no rival pose exists."""
     made = flight()
     _, solution, found = solved(made, made.matched())
     assert check_poses(solution.posed, found, CheckOptions()).accepted.all()
@@ -182,7 +182,7 @@ def test_a_flight_along_the_facade_stands() -> None:
 def test_matches_agree_up_to_the_limit_of_the_sampson_error(
     share_of_limit: float, agreement: float
 ) -> None:
-    """A match d pixels off the line in one of two images has a Sampson error of d / sqrt(2) pixels."""
+    """A match d pixels off the epipolar line in one of the images has a Sampson error of d / sqrt(2)."""
     made = flight(2, noise_px=0.0)
     off_px = share_of_limit * np.sqrt(2) * OPTIONS.max_error_px
     shifted = replace(made, pixels=[made.pixels[0], made.pixels[1] + [0.0, off_px]])
@@ -196,7 +196,7 @@ def test_matches_agree_up_to_the_limit_of_the_sampson_error(
 
 @pytest.mark.parametrize("columns", [1, -1])
 def test_a_frame_at_the_wrong_window_is_ambiguous(columns: int) -> None:
-    """Its own matches agree with a pose one window along the flight, where epipolar lines stay the same."""
+    """A frame placed one window off along the flight, where epipolar lines do not change, is ambiguous."""
     made = flight()
     sequence, solution, found = solved(made, made.matched({3: columns}))
     away = solution.poses.centers[3] - made.poses.centers[3]
@@ -209,7 +209,7 @@ def test_a_frame_at_the_wrong_window_is_ambiguous(columns: int) -> None:
 
 
 def test_a_frame_that_fits_two_windows_is_settled_by_its_neighbours_or_not_at_all() -> None:
-    """Half of its matches go to one window, half to the next: alone it fails, with neighbours it stands."""
+    """A frame whose matches split between two windows fails alone and is accepted with its neighbours."""
     made = flight()
     right, wrong = made.matched()[3], made.matched({3: 1})[3]
     both = np.concatenate([right[::2], wrong[1::2]])
@@ -228,7 +228,7 @@ def test_a_frame_that_fits_two_windows_is_settled_by_its_neighbours_or_not_at_al
 
 
 def test_a_frame_without_matches_is_carried_by_its_neighbours() -> None:
-    """It finds nothing of the map by itself; what its neighbours know of their common features places it."""
+    """A frame without matches to the map is placed by the features that it shares with its neighbours."""
     made = flight()
     putative = made.matched()
     putative[3] = np.zeros((0, 2), np.int64)
@@ -240,7 +240,7 @@ def test_a_frame_without_matches_is_carried_by_its_neighbours() -> None:
 
 
 def test_random_matches_give_no_label() -> None:
-    """Features matched with any points of the map, as of another place: every frame fails."""
+    """If features are matched with random map points, as in another place, every frame fails."""
     made = flight()
     rng = np.random.default_rng(1)
     putative = [
@@ -254,7 +254,7 @@ def test_random_matches_give_no_label() -> None:
 
 
 def test_a_second_pose_that_is_the_same_is_no_rival() -> None:
-    """Half of the features 9 px off, as leaves in the wind: their pose is turned by less than 2 degrees."""
+    """Half of the features are 9 px off; their pose differs by less than 2 degrees and is no rival."""
     made = flight(1)
     pixels = made.pixels[0].copy()
     pixels[::2, 0] += 9
@@ -270,7 +270,7 @@ def test_a_second_pose_that_is_the_same_is_no_rival() -> None:
 
 
 def test_a_lens_that_is_not_known_is_found() -> None:
-    """From a focal length of a narrow lens and no distortion; one that is held stays to the bit."""
+    """An unknown lens is estimated from a narrow lens without distortion; a fixed one stays bit for bit."""
     made = flight()
     start = replace(LENS, params=np.array([900.0, 160, 120, 0, 0]))
     sequence = made.sequence(made.matched())
@@ -283,7 +283,7 @@ def test_a_lens_that_is_not_known_is_found() -> None:
 
 
 def test_what_no_map_point_explains_becomes_a_point_of_the_sequence_where_it_is() -> None:
-    """Two thirds of the facade are not in the map: tracks of them are triangulated, and help the frames."""
+    """With two thirds of the facade unmapped, tracks there are triangulated and improve the frames."""
     made = flight()
     putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
     _, solution, _ = solved(made, putative)
@@ -298,7 +298,7 @@ def test_what_no_map_point_explains_becomes_a_point_of_the_sequence_where_it_is(
 
 
 def test_points_that_only_one_frame_sees_leave_with_the_others() -> None:
-    """Without frames 3 to 7, each own point that is left has two frames of the rest."""
+    """After removing frames 3 to 7, every remaining own point is seen in two remaining frames."""
     made = flight()
     putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
     _, solution, _ = solved(made, putative)
@@ -311,7 +311,7 @@ def test_points_that_only_one_frame_sees_leave_with_the_others() -> None:
 
 
 def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One fails at first, another once that one is gone: each keeps its own reason."""
+    """One frame fails at first, another after its removal, and each keeps its own reason."""
     rounds = iter([({3}, "first"), ({3, 5}, "second"), ({3, 5}, "third")])
 
     def scripted(posed: np.ndarray, *_: object) -> PoseVerdict:
@@ -329,7 +329,7 @@ def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatc
 
 
 class _Perfect:
-    """A map without errors."""
+    """Map without errors."""
 
     sigma_px = 0.3
 
@@ -350,7 +350,7 @@ def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyp
 
 
 def test_what_failed_pulls_at_nothing_that_stands() -> None:
-    """Two frames at the wrong window leave the least squares: the rest is as if they had not been there."""
+    """Two frames at the wrong window are removed from the adjustment and do not affect the others."""
     made = flight(10)
     found = accepted(made, made.matched({3: 1, 7: -1}))
     stands = [k not in (3, 7) for k in range(10)]
@@ -375,7 +375,7 @@ def test_where_nothing_stands_there_is_no_covariance() -> None:
 
 
 def test_a_frame_of_which_hardly_any_measurement_agrees_loses_its_pose() -> None:
-    """Moved far off before the least squares, nothing of it agrees any more, and the others stay."""
+    """A frame moved far off before the adjustment has no agreeing measurements and loses its pose alone."""
     made = flight()
     sequence, solution, _ = solved(made, made.matched())
     centers = solution.poses.centers.copy()

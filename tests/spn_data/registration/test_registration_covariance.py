@@ -1,4 +1,4 @@
-"""Stated covariances of evaluation frames against errors: noise of their own, of the lens, and of the map."""
+"""Stated covariances of evaluation frames against actual errors from measurements, lens and map."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TRIALS = 40
 
 
 def evaluation_poses() -> Poses:
-    """Frames inside the arc of the mapping frames, lower, looking at the same heap."""
+    """Return poses inside the arc of the mapping frames, lower, looking at the same point cloud."""
     angle = np.linspace(0.4, 1.2, FRAMES)
     centers = np.stack([10 * np.sin(angle), -10 * np.cos(angle), np.full(FRAMES, 2.0)], axis=1)
     heading = np.rad2deg(-angle)
@@ -46,9 +46,9 @@ def evaluation_poses() -> Poses:
 def observe(
     truth: Small, mapped: Small, rng: np.random.Generator, noise_px: float = NOISE_PX
 ) -> tuple[SequenceState, SequenceObservations, np.ndarray]:
-    """The adjusted state of a noisy sequence in a noisy map; and rows (M,) of the map's points.
+    """Return the adjusted state of a noisy sequence in a noisy map, and rows (M,) of the map's points.
 
-    Each frame finds four fifths of the map's points; the first points are taken for the sequence's own.
+    Each frame sees four fifths of the map's points; the first points are used as the sequence's own.
     """
     poses = evaluation_poses()
     cloud = truth.scene.points
@@ -81,7 +81,7 @@ def observe(
 
 
 def errors(truth: Small, mapped: Small, state: SequenceState) -> np.ndarray:
-    """(N, 6) truth minus found, in the map's frame."""
+    """Return truth minus estimate (N, 6) in the map's frame."""
     map_from_true = Similarity.fit(truth.scene.poses.centers, mapped.scene.poses.centers)
     true = map_from_true.apply_to_poses(evaluation_poses())
     turns = rotation_vectors(true.rotations @ np.swapaxes(state.poses.rotations, 1, 2))
@@ -89,7 +89,7 @@ def errors(truth: Small, mapped: Small, state: SequenceState) -> np.ndarray:
 
 
 def deviations(covariances: np.ndarray) -> np.ndarray:
-    """(N, 6)"""
+    """Return the standard deviations (N, 6)."""
     return np.sqrt(np.einsum("nii->ni", covariances))
 
 
@@ -116,7 +116,7 @@ def stated(
 
 
 def draw() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of all trials: scores (T,) with the map's errors, scores without them, z (T',) of the focal length."""
+    """Return scores (T,) with the map's errors, scores (T,) without, and z (T',) of the focal length."""
     truth = small()
     rng = np.random.default_rng(12)
     full, blind, focal = [], [], []
@@ -135,7 +135,7 @@ def draw() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class _Perfect:
-    """A map without errors."""
+    """Map without errors."""
 
     sigma_px = NOISE_PX
 
@@ -144,7 +144,7 @@ class _Perfect:
 
 
 def test_errors_are_as_large_as_stated() -> None:
-    """Lens, own points, noise and map together: e^T C^-1 e like chi-squared; without the map's part, not."""
+    """With lens, own points, noise and map, e^T C^-1 e follows chi-squared; without the map it does not."""
     full, blind, focal = draw()
     assert 0.7 < np.median(full) / CHI2_MEDIAN < 1.4
     assert (full > 22.5).mean() < 0.05
@@ -153,7 +153,7 @@ def test_errors_are_as_large_as_stated() -> None:
 
 
 def test_the_residuals_tell_the_noise() -> None:
-    """The noise is found in the residuals, and what the map adds is never negative."""
+    """The noise level is recovered from the residuals, and the map's contribution is never negative."""
     truth = small()
     mapped, map_covariance = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
@@ -165,7 +165,7 @@ def test_the_residuals_tell_the_noise() -> None:
 
 
 def test_measurements_that_err_alike_weigh_less() -> None:
-    """Each measured three times with one error: the design effect sees that they are not three."""
+    """Three measurements that share one error count as fewer than three, through the design effect."""
     truth = small()
     mapped, map_covariance = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1), 0.1)
@@ -190,7 +190,7 @@ def test_measurements_that_err_alike_weigh_less() -> None:
 
 
 def test_a_sequence_that_fits_the_map_badly_takes_the_map_for_bent() -> None:
-    """Three times the map's own residuals: the map's part grows by the square of three over 1.5."""
+    """If residuals are three times the map's, the map's contribution grows by (3 / 1.5) squared."""
     truth = small()
     mapped, map_covariance = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
@@ -203,7 +203,7 @@ def test_a_sequence_that_fits_the_map_badly_takes_the_map_for_bent() -> None:
 
 
 def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
-    """`frame_covariances` with the lens's own covariance: the same sum, but for what frames share."""
+    """`frame_covariances` with the lens covariance equals the sequence's, except for what frames share."""
     truth = small()
     mapped, map_covariance = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
@@ -217,7 +217,7 @@ def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
     alone = frame_covariances(
         state.poses, state.camera, frames, LensUncertainty(covariance=whole.lens), map_covariance
     )
-    assert (deviations(alone) > 0.9 * deviations(whole.poses)).all()  # errs to the safe side
+    assert (deviations(alone) > 0.9 * deviations(whole.poses)).all()  # errs on the safe side
     exact = stated(state, observations, rows, _Perfect())  # type: ignore[arg-type]
     alone = frame_covariances(
         state.poses,
@@ -232,7 +232,7 @@ def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
 
 
 def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
-    """Mapping frames located anew from their points alone: errors as stated, the lens's own included."""
+    """Mapping frames relocated from their points alone have the stated errors, those of the lens included."""
     truth = small()
     camera_id = 1
     scores = []
@@ -270,7 +270,7 @@ def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
 
 
 def test_few_measurements_tell_the_noise_without_bias() -> None:
-    """Ten points and six unknowns: the residuals are smaller than the noise, what is stated is not."""
+    """With ten points and six unknowns, the noise estimate is unbiased though residuals are smaller."""
     truth = small()
     rng = np.random.default_rng(8)
     poses = evaluation_poses()[:1]
@@ -294,7 +294,7 @@ def test_few_measurements_tell_the_noise_without_bias() -> None:
 
 
 class _LensOnly:
-    """A map whose points are exact, and whose lens has this covariance (8, 8)."""
+    """Map with exact points and a lens covariance (8, 8)."""
 
     sigma_px = NOISE_PX
 
@@ -307,7 +307,10 @@ class _LensOnly:
 
 
 def test_a_lens_of_the_map_counts_as_one_of_the_sequence_with_the_same_covariance() -> None:
-    """Focal length and two terms of distortion, as the map states them: fx, fy, cx, cy, k1, k2, p1, p2."""
+    """A lens covariance of the map has the same effect as an equal lens covariance of the sequence.
+
+    The map's parameters are fx, fy, cx, cy, k1, k2, p1, p2; focal length and two distortion terms vary.
+    """
     truth = small()
     mapped, _ = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))

@@ -1,4 +1,4 @@
-"""Tracks of features over the frames of a sequence, and the points that they give."""
+"""Feature tracks over the frames of a sequence, and their triangulated points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.worlds.registration_scene import LENS, Flight, flight
 
 
 def members(tracks: Tracks) -> list[list[tuple[int, int]]]:
-    """(frame, feature) of each track."""
+    """Return the (frame, feature) pairs of each track."""
     return [
         list(
             zip(
@@ -29,14 +29,14 @@ def pairs(*triples: tuple[int, int, list[list[int]]]) -> dict[tuple[int, int], n
 
 
 def test_matches_of_following_pairs_make_one_track() -> None:
-    """0-1 and 1-2 share a feature of frame 1; another pair is a track of its own."""
+    """Pairs 0-1 and 1-2 that share a feature of frame 1 form one track; another pair forms its own."""
     found = find_tracks(pairs((0, 1, [[5, 7], [0, 1]]), (1, 2, [[7, 3]])), [6, 8, 4])
     assert sorted(members(found)) == [[(0, 0), (1, 1)], [(0, 5), (1, 7), (2, 3)]]
     assert np.all(np.diff(found.track) >= 0)
 
 
 def test_a_track_that_meets_a_frame_twice_is_left_out() -> None:
-    """0:0-1:0 and 0:1-2:0 joined by 1:0-2:0 would be two spots of frame 0."""
+    """A track that would contain two features of one frame is dropped."""
     found = find_tracks(
         pairs((0, 1, [[0, 0], [2, 2]]), (1, 2, [[0, 0]]), (0, 2, [[1, 0]])), [3, 3, 3]
     )
@@ -51,7 +51,7 @@ def test_no_matches_make_no_tracks(matched: dict[tuple[int, int], np.ndarray]) -
 
 
 def test_tracks_of_a_flight_are_its_points() -> None:
-    """Right matches of a whole flight: each track is one point, in each frame that shows it."""
+    """With correct matches of a flight, each track is one point, in every frame that sees it."""
     made = flight(6)
     tracks = find_tracks(made.pairs, [len(p) for p in made.pixels])
     shown = np.array([made.shows[f][k] for f, k in zip(tracks.frame, tracks.feature, strict=True)])
@@ -61,7 +61,7 @@ def test_tracks_of_a_flight_are_its_points() -> None:
 
 
 def seen_at(made: Flight, pixels: np.ndarray, frames: list[int], **options: float) -> np.ndarray:
-    """The point (3,) of one track."""
+    """Return the point (3,) of one track."""
     limits = {"max_error_px": 4.0, "min_angle_deg": 1.5, **options}
     return triangulate(
         made.poses,
@@ -92,7 +92,10 @@ def test_exact_rays_meet_in_their_point() -> None:
 
 
 def test_noise_moves_a_point_as_far_as_its_angle_says() -> None:
-    """0.3 px at 280 px focal length and 8 m: a centimetre across, some centimetres in depth over 3 m."""
+    """0.3 px noise moves a point about a centimetre across and some centimetres in depth at 8 m.
+
+    The focal length is 280 px and the baseline 3 m.
+    """
     made = flight(6)
     rng = np.random.default_rng(3)
     frames = [1, 2, 3, 4]
@@ -125,7 +128,7 @@ def test_what_does_not_determine_a_point_gives_none(
 
 
 def test_rays_that_meet_behind_the_cameras_give_no_point() -> None:
-    """Two frames whose measurements are exchanged: their lines cross on the wrong side."""
+    """If the measurements of two frames are swapped, rays meet behind the cameras and give no point."""
     made = flight(6)
     frames = [1, 4]
     straight = Poses(made.poses.centers, np.tile(made.poses.quats_wxyz[:1], (6, 1)))
