@@ -1,4 +1,4 @@
-"""Bad input ends in one clear line and exit code 1, and nothing that stood is changed."""
+"""Bad input is reported in one clear line with exit code 1, and existing files do not change."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 
 
 def run(*arguments: object) -> Result:
-    """One call of spn-data; a traceback is raised here."""
+    """Run spn-data once; exceptions other than SystemExit are raised."""
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -38,7 +38,7 @@ def run(*arguments: object) -> Result:
 
 
 def refused(*arguments: object) -> str:
-    """The one line with which a call is refused."""
+    """Return the single error line of a `reconstruct` call that fails."""
     result = run("reconstruct", *arguments)
     assert result.exit_code == 1, result.output
     errors = [line for line in result.stderr.splitlines() if line.strip()]
@@ -47,15 +47,18 @@ def refused(*arguments: object) -> str:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files in a folder by relative path."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def frames_of(video: Path) -> list[np.ndarray]:
+    """Decode all frames of a video as BGR images."""
     with av.open(str(video)) as container:
         return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
 
 
 def write_video(path: Path, images: list[np.ndarray]) -> None:
+    """Encode BGR images as an H.264 video with 2 frames per second."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=2)
         stream.height, stream.width = images[0].shape[:2]
@@ -67,11 +70,12 @@ def write_video(path: Path, images: list[np.ndarray]) -> None:
 
 @pytest.fixture
 def copy_of_flight(flight1: Path, tmp_path: Path) -> Path:
-    """A folder of a video and its SRT that a test may damage."""
+    """A folder with a video and its SRT file that a test may damage."""
     return Path(shutil.copytree(flight1, tmp_path / "flight"))
 
 
 def cut(path: Path) -> None:
+    """Truncate a file to half its size."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
@@ -88,18 +92,21 @@ def cut(path: Path) -> None:
 def test_a_video_that_is_none_is_named(
     copy_of_flight: Path, tmp_path: Path, damage: Callable[[Path], None], message: str
 ) -> None:
+    """A missing, truncated, empty or invalid video is reported by name, and no area is created."""
     damage(copy_of_flight / "flight1.mp4")
     assert message in refused(copy_of_flight, "--area", tmp_path / "area")
     assert not (tmp_path / "area").exists(), "nothing was made, so that nothing stays"
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    """A source folder that does not exist is reported as such."""
     assert refused(tmp_path / "nowhere", "--area", tmp_path / "area").endswith("does not exist")
 
 
 def test_telemetry_of_another_length_is_refused_before_the_video_is_measured(
     copy_of_flight: Path, tmp_path: Path
 ) -> None:
+    """Telemetry much shorter than its video is rejected before an area is created."""
     srt = copy_of_flight / "flight1.SRT"
     srt.write_text("\n\n".join(srt.read_text().split("\n\n")[:5]) + "\n\n")
     message = refused(copy_of_flight, "--area", tmp_path / "area")
@@ -108,6 +115,7 @@ def test_telemetry_of_another_length_is_refused_before_the_video_is_measured(
 
 
 def test_all_frames_blurred_is_said(flight1: Path, tmp_path: Path) -> None:
+    """A video whose frames are all blurred is rejected with that reason."""
     (tmp_path / "v").mkdir()
     blurred = [cv2.GaussianBlur(f, (0, 0), 25) for f in frames_of(flight1 / "flight1.mp4")]
     write_video(tmp_path / "v" / "blurred.mp4", blurred)
@@ -116,6 +124,7 @@ def test_all_frames_blurred_is_said(flight1: Path, tmp_path: Path) -> None:
 
 
 def test_an_area_below_a_file_is_refused(flight1: Path, tmp_path: Path) -> None:
+    """An area whose parent is a file is rejected, and the file is kept."""
     (tmp_path / "file").write_text("mine")
     assert "cannot be created: Not a directory" in refused(
         flight1, "--area", tmp_path / "file" / "area"
@@ -126,6 +135,7 @@ def test_an_area_below_a_file_is_refused(flight1: Path, tmp_path: Path) -> None:
 def test_an_area_of_a_newer_version_is_refused_and_left_alone(
     finished_area: Path, flight1: Path, tmp_path: Path
 ) -> None:
+    """An area written by a newer version is rejected even with --overwrite, and not one byte changes."""
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
     path = area / MODEL / "stage.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "version": VERSION + 1}))
@@ -148,6 +158,7 @@ def test_an_area_of_a_newer_version_is_refused_and_left_alone(
 def test_a_changed_option_is_refused_by_name_and_changes_nothing(
     finished_area: Path, flight1: Path, option: tuple[str, ...], message: str
 ) -> None:
+    """A changed option is reported with its old and new value, and the area does not change."""
     before = contents(finished_area)
     found = refused(flight1, "--area", finished_area, *FAST, *option)
     assert message in found
@@ -171,6 +182,7 @@ def test_a_changed_option_is_refused_by_name_and_changes_nothing(
 def test_an_option_out_of_bounds_is_a_usage_error(
     flight1: Path, tmp_path: Path, option: tuple[str, ...]
 ) -> None:
+    """An option value out of range is a usage error (exit code 2)."""
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *option)
     assert result.exit_code == 2
     assert option[0] in result.stderr
@@ -178,11 +190,13 @@ def test_an_option_out_of_bounds_is_a_usage_error(
 
 
 def mask(path: Path, height: int, width: int, value: int) -> None:
+    """Write a mask of one grey value."""
     path.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(path), np.full((height, width), value, np.uint8))
 
 
 def test_masks_that_do_not_fit_are_refused_before_any_work(flight1: Path, tmp_path: Path) -> None:
+    """Missing, wrongly sized and entirely black masks are rejected before an area is created."""
     area = ("--area", tmp_path / "area")
     mask(tmp_path / "other" / "other.png", 180, 320, 255)
     assert "contains no mask: none of flight1.png" in refused(
@@ -198,7 +212,7 @@ def test_masks_that_do_not_fit_are_refused_before_any_work(flight1: Path, tmp_pa
 
 
 def test_names_are_never_used_as_paths_or_markup(flight1: Path, tmp_path: Path) -> None:
-    """Brackets, quotes, dashes, case, control characters and other alphabets in the names of photos."""
+    """Photo names with markup, quotes, control characters or Unicode, or equal but for case, are safe."""
     names = [
         "a.jpg",
         "A.jpg",
@@ -226,12 +240,13 @@ def test_names_are_never_used_as_paths_or_markup(flight1: Path, tmp_path: Path) 
 
 
 def test_only_one_process_works_on_an_area(flight1: Path, finished_area: Path) -> None:
+    """A second process is refused while an area is locked."""
     with Area(finished_area).locked():
         assert "in use by another spn-data" in refused(flight1, "--area", finished_area, *FAST)
 
 
 def test_a_damaged_database_is_named(flight1: Path, finished_area: Path, tmp_path: Path) -> None:
-    """Half-done matching whose database was overwritten with something else."""
+    """A corrupt database of unfinished matching is reported; once it is deleted, the run succeeds."""
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
     shutil.rmtree(area / "3-geo")
     partial = Area(area).partial(MODEL)
@@ -245,11 +260,12 @@ def test_a_damaged_database_is_named(flight1: Path, finished_area: Path, tmp_pat
 
 
 def limited(bytes_a_file: int) -> Callable[[], None]:
+    """Return a function that limits the size of files written by a child process."""
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_a_file, bytes_a_file))
 
 
 def test_frames_that_cannot_be_written_are_one_line(flight1: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for a disk that refuses; then it goes on."""
+    """A failed write of a frame is one error line; a file size limit simulates the failing disk."""
     command = [sys.executable, "-c", "from spn_cli.data import main; main()", "reconstruct"]
     arguments = [str(flight1), "--area", str(tmp_path / "area"), *FAST]
     result = subprocess.run(
@@ -269,6 +285,7 @@ def test_frames_that_cannot_be_written_are_one_line(flight1: Path, tmp_path: Pat
 def test_garbage_lines_are_passed_over_and_no_fix_at_all_leaves_the_model_without_metres(
     copy_of_flight: Path, tmp_path: Path
 ) -> None:
+    """Malformed SRT records are skipped and counted; without any GNSS fix the model is not georeferenced."""
     srt = copy_of_flight / "flight1.SRT"
     records = srt.read_text().split("\n\n")
     records[3] = "4\ngarbage here"
@@ -285,7 +302,7 @@ def test_garbage_lines_are_passed_over_and_no_fix_at_all_leaves_the_model_withou
 
 
 def test_a_copy_that_fills_the_disk_names_the_file_that_was_not_written() -> None:
-    """Not the one that it was read from."""
+    """The error of a copy that fills the disk names the target file, not the source."""
 
     @click.group(cls=Group)
     def program() -> None:
@@ -301,6 +318,8 @@ def test_a_copy_that_fills_the_disk_names_the_file_that_was_not_written() -> Non
 
 
 def test_a_disk_that_may_not_be_written_to_is_not_said_to_be_full() -> None:
+    """The error for a read-only file system does not advise freeing space."""
+
     @click.group(cls=Group)
     def program() -> None:
         pass

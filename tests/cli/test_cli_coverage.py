@@ -1,4 +1,4 @@
-"""`spn-data coverage` on an area: what it prints and writes, and what it refuses."""
+"""`spn-data coverage`: printed output, written files and rejected input."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
-    """An evaluation sequence as a stage of the area; frames that failed get no pose."""
+    """Write an evaluation sequence as a stage of the area; failed frames get no pose."""
     n = len(poses)
     centers, quats = poses.centers.copy(), poses.quats_wxyz.copy()
     failed = np.array(status) == "failed"
@@ -72,12 +72,13 @@ def register(area: Area, name: str, poses: Poses, status: list[str]) -> None:
 
 @pytest.fixture(scope="module")
 def labelled(finished_area: Path) -> LabelledArea:
+    """The labels of the finished area."""
     return read_labelled_area(Area(finished_area))
 
 
 @pytest.fixture
 def area(finished_area: Path, labelled: LabelledArea, tmp_path: Path) -> Path:
-    """The finished area with a sequence `near` 1 m above mapping frames, one of its frames failed."""
+    """A copy of the finished area with a sequence `near` 1 m above mapping frames, one of them failed."""
     folder = tmp_path / "area"
     shutil.copytree(finished_area, folder)
     poses = labelled.mapping.poses[labelled.mapping.registered][:6]
@@ -87,19 +88,20 @@ def area(finished_area: Path, labelled: LabelledArea, tmp_path: Path) -> Path:
 
 
 def run(*words: str | Path, exit_code: int = 0) -> str:
-    """What `spn-data coverage` prints, in one line of single blanks."""
+    """Return the output of `spn-data coverage` with whitespace collapsed."""
     result = CliRunner().invoke(main, ["coverage", *map(str, words)])
     assert result.exit_code == exit_code, result.output
     return " ".join(result.output.split())
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def test_evaluation_sequences_are_told_and_written(area):
-    """Six frames 1 m above mapping frames: five high at 1 m and 0 degrees, one failed, in table and files."""
+    """Output and files show high coverage for five frames 1 m above mapping frames, and one failed frame."""
     shown = run("--area", area)
     assert "frames 6, 1 of them failed" in shown
     assert "high coverage 5 (100%); <= 2 m and <= 15 deg" in shown
@@ -121,7 +123,7 @@ def test_evaluation_sequences_are_told_and_written(area):
 
 
 def test_places_to_fly_again_close_the_gaps(area, labelled, tmp_path):
-    """The file written reads back as waypoints, which as mapping frames make every frame high."""
+    """With the waypoints written by --fly-again as mapping frames, every frame has high coverage."""
     base = labelled.mapping.poses[labelled.mapping.registered][:6]
     away = Poses(base.centers + np.array([0.0, 0.0, 12.0]), base.quats_wxyz)
     register(Area(area), "away", away, ["registered"] * 6)
@@ -140,7 +142,7 @@ def test_places_to_fly_again_close_the_gaps(area, labelled, tmp_path):
 
 
 def test_a_plan_is_covered_instead(area, tmp_path):
-    """Waypoints are told by the lines of their file, and leave what is known of sequences alone."""
+    """Planned waypoints are named by their line numbers; the coverage of the sequences is unchanged."""
     run("--area", area)
     before = (area / "coverage" / "coverage.json").read_bytes()
     plan = tmp_path / "plan.csv"
@@ -158,7 +160,7 @@ def test_a_plan_is_covered_instead(area, tmp_path):
 
 
 def test_a_camera_of_waypoints_may_be_given(area, labelled, tmp_path):
-    """A narrow camera, as a file or by its field of view, is that of waypoints that name none."""
+    """Waypoints without a camera use the one from --camera or --fov; both give the same view shares."""
     pose = labelled.mapping.poses[labelled.mapping.registered][:1]
     x, y, z = pose.centers[0]
     plan = tmp_path / "plan.csv"
@@ -178,7 +180,7 @@ def test_a_camera_of_waypoints_may_be_given(area, labelled, tmp_path):
 
 
 def test_limits_are_options(area):
-    """Stricter limits give worse strata and stand in coverage.json."""
+    """Stricter limits lower the strata and are recorded in coverage.json."""
     shown = run("--area", area, "--high", "0.2", "5", "--medium", "1.5", "6")
     assert "medium coverage 5 (100%); <= 1.5 m and <= 6 deg" in shown
     options = read_coverage(Area(area))["options"]
@@ -186,7 +188,7 @@ def test_limits_are_options(area):
 
 
 def test_another_map_or_sequence_makes_it_stale(area, labelled):
-    """What was written names what it was made from, so that it is known when that has changed."""
+    """Stored coverage is stale once an evaluation sequence is added or redone."""
     run("--area", area)
     found = read_coverage(Area(area))
     assert stale_because(Area(area), found) is None
@@ -199,7 +201,7 @@ def test_another_map_or_sequence_makes_it_stale(area, labelled):
 
 
 def test_without_metres_there_are_units_of_the_model(area):
-    """Without 3-geo, lengths are no metres: no strata, no heights, no places to fly to, and it says so."""
+    """Without 3-geo, lengths are in model units, and there are no strata, heights or waypoints."""
     shutil.rmtree(area / GEO)
     shown = run("--area", area, "--fly-again", area / "again.csv")
     assert "model units" in shown
@@ -226,12 +228,12 @@ def test_without_metres_there_are_units_of_the_model(area):
     ],
 )
 def test_options_that_do_not_fit_are_refused(area, words, message):
-    """Options without a meaning are errors of usage."""
+    """Inconsistent options are usage errors (exit code 2)."""
     assert message in run("--area", area, *words, exit_code=2)
 
 
 def test_what_can_not_be_done_is_one_line(area, finished_area, tmp_path):
-    """No sequence, no plan, an unknown camera, a file that is there: each is an error of one line."""
+    """Missing input, an unknown camera and an existing or protected output file are reported as errors."""
     shown = run("--area", finished_area, exit_code=1)
     assert "no evaluation sequence is registered; add one with spn-data register VIDEO" in shown
     assert "1-frames is missing" in run("--area", tmp_path / "none", exit_code=1)
@@ -256,7 +258,7 @@ def test_what_can_not_be_done_is_one_line(area, finished_area, tmp_path):
 
 
 def test_every_option_is_documented():
-    """docs/coverage.md has a row for each option of the command and no other, with its default."""
+    """docs/coverage.md lists exactly the options of the command, with their defaults."""
     text = (ROOT / "docs" / "coverage.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
     flags = {p.opts[-1]: p for p in main.commands["coverage"].params if isinstance(p, click.Option)}
@@ -270,7 +272,7 @@ def test_every_option_is_documented():
 
 
 def test_columns_and_fields_are_documented(area):
-    """docs/coverage.md names every column of the CSV and every field of coverage.json."""
+    """docs/coverage.md names every CSV column and every field of coverage.json."""
     run("--area", area)
     text = (ROOT / "docs" / "coverage.md").read_text(encoding="utf-8").split("## Files")[1]
     listed = re.findall(r"`([a-z_0-9]+)`", text)

@@ -1,4 +1,4 @@
-"""`spn-data georegister` with other options, and what a later `reconstruct` makes of them."""
+"""`spn-data georegister` with changed options, their effect on `reconstruct`, and camera files."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ def run(*arguments: object) -> Result:
 
 @pytest.fixture
 def area(finished_area: Path, tmp_path: Path) -> Path:
+    """A copy of the finished area that a test may change."""
     return Path(shutil.copytree(finished_area, tmp_path / "area"))
 
 
 def test_other_options_need_overwrite_and_move_only_the_third_stage(area: Path) -> None:
-    """A take-off 100 m above sea level lifts the origin, and leaves the map as it is."""
+    """A new take-off altitude needs --overwrite and changes the origin but not the model."""
     before = Area(area).record(MODEL)
     options = ("--takeoff-alt", "100", "--height-reference", "amsl")
     refused = run("georegister", "--area", area, *options)
@@ -54,6 +55,7 @@ def test_other_options_need_overwrite_and_move_only_the_third_stage(area: Path) 
 def test_reconstruct_keeps_a_georegistration_that_was_made_with_other_options(
     area: Path, flight1: Path
 ) -> None:
+    """`reconstruct` keeps a georegistration made by `georegister` with different options."""
     made = run("georegister", "--area", area, "--gnss-sigma", "0.5", "1", "--overwrite")
     assert made.exit_code == 0, made.output
     again = run("reconstruct", flight1, "--area", area, *FAST)
@@ -63,12 +65,14 @@ def test_reconstruct_keeps_a_georegistration_that_was_made_with_other_options(
 
 
 def test_a_take_off_height_without_its_reference_is_a_usage_error(area: Path) -> None:
+    """--takeoff-alt requires --height-reference."""
     result = run("georegister", "--area", area, "--takeoff-alt", "100")
     assert result.exit_code == 2
     assert "--height-reference" in result.stderr
 
 
 def test_options_come_back_from_the_record_as_they_were() -> None:
+    """Options survive the round trip through the JSON stage record."""
     options = GeoStageOptions(
         fit=GeoregisterOptions(
             gnss_sigma_m=(1.0, 2.0),
@@ -85,13 +89,14 @@ def test_options_come_back_from_the_record_as_they_were() -> None:
 
 
 def test_options_that_cannot_be_read_are_a_format_error() -> None:
+    """Invalid options in a stage record raise FormatError."""
     record = StageRecord(stage=GEO, options={"fit": {"heights": "deep"}}, inputs={}, upstream={})
     with pytest.raises(FormatError, match="3-geo: its options cannot be read"):
         recorded_options(record)
 
 
 def test_a_calibrated_camera_is_started_from(flight1: Path, tmp_path: Path) -> None:
-    """The simulator's own camera file, at twice the size, given for all sequences."""
+    """The camera from --camera, given at twice the image size, is scaled and used as the initial camera."""
     truth = json.loads((flight1.parent / "truth" / "flight1_camera.json").read_text())
     doubled = camera_from_json(truth).scaled(640, 360)
     file = tmp_path / "camera.json"
@@ -107,6 +112,7 @@ def test_a_calibrated_camera_is_started_from(flight1: Path, tmp_path: Path) -> N
 
 
 def test_a_camera_of_another_shape_is_refused(flight1: Path, tmp_path: Path) -> None:
+    """A camera with another aspect ratio than the images is rejected."""
     file = tmp_path / "camera.json"
     file.write_text(json.dumps(camera_to_json(Camera.from_horizontal_fov(400, 300, 70))))
     result = run("reconstruct", flight1, "--area", tmp_path / "area", "--camera", file)
@@ -127,12 +133,14 @@ def test_a_camera_of_another_shape_is_refused(flight1: Path, tmp_path: Path) -> 
     ],
 )
 def test_a_file_that_holds_no_camera_is_refused(tmp_path: Path, text: str) -> None:
+    """A file without a valid camera raises InputError."""
     (tmp_path / "camera.json").write_text(text)
     with pytest.raises(InputError, match=r"camera\.json: does not contain a camera"):
         read_camera(tmp_path / "camera.json")
 
 
 def test_a_camera_comes_back_from_its_file(tmp_path: Path) -> None:
+    """A camera survives the round trip through its file."""
     camera = Camera.from_horizontal_fov(800, 600, 70, (0.1, -0.2, 0.01, 0.02))
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(camera)))
     again = read_camera(tmp_path / "camera.json")

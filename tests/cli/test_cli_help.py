@@ -1,4 +1,4 @@
-"""Help of the commands, and the command lines of the docs: all there, and all of them would run."""
+"""Command help and documentation are complete, and every documented command line parses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GEO_PARAMETERS = set(inspect.signature(options.geo_options).parameters)
 
 
 def model_commands(group: click.Group = model_main) -> dict[str, click.Command]:
-    """Commands of spn-model and of its groups, by their words."""
+    """Return the commands of spn-model and its groups by name."""
     found: dict[str, click.Command] = {}
     for name, command in group.commands.items():
         found[name] = command
@@ -32,7 +32,7 @@ def model_commands(group: click.Group = model_main) -> dict[str, click.Command]:
 
 
 def command_for(words: list[str], program: click.Group = main) -> click.Command:
-    """Resolve and parse the words after a program's name, run nothing. Raises click's usage errors."""
+    """Resolve and parse the words after a program's name without running it; raise click's usage errors."""
     while words and words[0] in ("-v", "--verbose"):
         words = words[1:]
     if words in (["--help"], ["--version"]):
@@ -49,7 +49,7 @@ def command_for(words: list[str], program: click.Group = main) -> click.Command:
 
 
 def command_lines(text: str, program: str = "spn-data") -> list[tuple[str, bool]]:
-    """(words after the program, whether they are a whole line): of fenced lines, and of inline code."""
+    """Return command lines in fenced blocks (with True) and inline code (with False), without the program."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     fenced = "\n".join(block for language, block in blocks if language in ("", "sh"))
     found = re.findall(rf"^(?:\S*/)?{program}( .*)$", fenced, re.MULTILINE)
@@ -59,7 +59,7 @@ def command_lines(text: str, program: str = "spn-data") -> list[tuple[str, bool]
 
 
 def test_the_commands_are_those_of_this_version():
-    """A command that comes or goes is noticed here, and then told in the README."""
+    """spn-data has exactly these commands; a change here also needs a change of the README."""
     assert COMMANDS == [
         "audit",
         "coverage",
@@ -76,7 +76,7 @@ def test_the_commands_are_those_of_this_version():
 
 
 def test_help_lists_the_commands_in_the_order_of_work():
-    """`spn-data --help` begins with what a user does first."""
+    """`spn-data --help` lists the commands in the order of the workflow."""
     shown = CliRunner().invoke(main, ["--help"])
     assert shown.exit_code == 0
     listed = re.findall(r"^  (\w+) {2,}\S", shown.output.split("Commands:")[1], re.MULTILINE)
@@ -97,7 +97,7 @@ def test_help_lists_the_commands_in_the_order_of_work():
 
 @pytest.mark.parametrize("group", [main, model_main])
 def test_version_is_that_of_the_package(group):
-    """--version tells what is installed."""
+    """--version prints the installed version."""
     shown = CliRunner().invoke(group, ["--version"])
     assert shown.exit_code == 0
     assert version("squeezeposenet-toolkit") in shown.output
@@ -105,7 +105,7 @@ def test_version_is_that_of_the_package(group):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_ends_with_examples_that_parse(name):
-    """Every command's help has an example, and the example is a command that click accepts."""
+    """Every command's help has examples, and click accepts them."""
     text = main.commands[name].help
     assert text is not None
     examples = re.findall(r"^\s+spn-data (.+)$", text.split("Example:")[1], re.MULTILINE)
@@ -116,7 +116,7 @@ def test_help_ends_with_examples_that_parse(name):
 
 @pytest.mark.parametrize("name", sorted(model_commands()))
 def test_help_of_the_model_commands_is_whole(name):
-    """One sentence first, examples that click accepts at the end, and a page that shows the command."""
+    """Help of an spn-model command has a summary and valid examples, and the docs show the command."""
     command = model_commands()[name]
     text = command.help or ""
     first = text.split("\n\n")[0]
@@ -130,9 +130,9 @@ def test_help_of_the_model_commands_is_whole(name):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_model_commands_in_the_docs_parse(page):
-    """Every spn-model command that README and docs show is one that click accepts.
+    """click accepts every spn-model command in README and docs.
 
-    `\u2026`, `A|B` and words in capitals stand for something: only command and options are checked then.
+    In lines with placeholders (`\u2026`, `A|B`, capitals), only the command and its options are checked.
     """
     known = model_commands()
     for line, whole in command_lines(page.read_text(encoding="utf-8"), "spn-model"):
@@ -156,7 +156,7 @@ def test_model_commands_in_the_docs_parse(page):
     ids=[*main.commands, *model_commands()],
 )
 def test_every_option_has_help(command):
-    """No option is left without a sentence."""
+    """Every option has a help text."""
     for parameter in command.params:
         if isinstance(parameter, click.Option):
             assert parameter.help, parameter.name
@@ -165,7 +165,7 @@ def test_every_option_has_help(command):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_fits_a_sentence(name):
-    """The first line of a command's help is one sentence."""
+    """The first line of every command's help is one sentence."""
     first = (main.commands[name].help or "").split("\n\n")[0]
     assert first.endswith(".")
     assert len(first) < 120
@@ -183,18 +183,18 @@ def test_every_command_fits_a_sentence(name):
     ],
 )
 def test_the_check_itself_refuses_what_click_refuses(words):
-    """A wrong line in the docs would be found: parsing alone refuses it."""
+    """Parsing alone rejects an invalid command line, so the checks of the docs can fail."""
     with pytest.raises(click.UsageError):
         command_for(words)
 
 
 def test_a_wrong_option_exits_with_2():
-    """click's own usage errors keep click's exit code."""
+    """Usage errors exit with code 2."""
     assert CliRunner().invoke(main, ["reconstruct", "video", "--frames", "1"]).exit_code == 2
 
 
 def test_an_error_of_the_users_data_is_one_line_and_exits_with_1(tmp_path):
-    """An empty folder is told in one line that names it."""
+    """An empty folder is reported in one line that names it, with exit code 1."""
     folder = tmp_path / "empty"
     folder.mkdir()
     ran = CliRunner().invoke(main, ["reconstruct", str(folder), "--area", str(tmp_path / "area")])
@@ -205,7 +205,7 @@ def test_an_error_of_the_users_data_is_one_line_and_exits_with_1(tmp_path):
 
 
 def test_command_lines_are_found():
-    """Fenced and inline commands are seen, prose is not."""
+    """`command_lines` finds fenced and inline commands and ignores prose."""
     text = "Use `spn-data status` or\n```sh\n.venv/bin/spn-data --help\n```\nspn-data is a name.\n"
     assert command_lines(text) == [("--help", True), ("status", False)]
     assert sum(len(command_lines(page.read_text(encoding="utf-8"))) for page in PAGES) > 10
@@ -213,9 +213,9 @@ def test_command_lines_are_found():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_in_the_docs_parse(page):
-    """Every command that README and docs show is one that click accepts, with its options and values.
+    """click accepts every spn-data command in README and docs, with its options and values.
 
-    `\u2026`, `A|B` and words in capitals stand for something: only command and options are checked then.
+    In lines with placeholders (`\u2026`, `A|B`, capitals), only the command and its options are checked.
     """
     for line, whole in command_lines(page.read_text(encoding="utf-8")):
         words = shlex.split(line)
@@ -235,7 +235,7 @@ def test_commands_in_the_docs_parse(page):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_is_in_the_readme(name):
-    """A stranger meets every command in the README or, for the simulator, in the page that it links."""
+    """The README shows every command; `simulate` is in docs/simulator.md."""
     page = "docs/simulator.md" if name == "simulate" else "README.md"
     lines = command_lines((ROOT / page).read_text(encoding="utf-8"))
     assert any(name in line.split() for line, _ in lines)
@@ -243,7 +243,7 @@ def test_every_command_is_in_the_readme(name):
 
 @pytest.mark.parametrize("name", ["reconstruct", "georegister"])
 def test_every_option_is_documented(name):
-    """docs/reconstruct.md has a row for every option, with the default that help shows."""
+    """docs/reconstruct.md lists every option with the default shown in the help."""
     text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
     for parameter in main.commands[name].params:
@@ -260,7 +260,7 @@ def test_every_option_is_documented(name):
 
 
 def test_no_option_is_documented_that_is_not_there():
-    """docs/reconstruct.md has no row for an option that reconstruct lacks."""
+    """docs/reconstruct.md lists no option that `reconstruct` lacks."""
     text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
     rows = set(re.findall(r"^\| `(--[a-z-]+)` ", text, re.MULTILINE))
     assert rows == {
@@ -269,7 +269,7 @@ def test_no_option_is_documented_that_is_not_there():
 
 
 def test_every_option_of_simulate_is_documented():
-    """docs/simulator.md names every option of simulate."""
+    """docs/simulator.md names every option of `simulate`."""
     text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
     missing = [
         parameter.opts[-1]

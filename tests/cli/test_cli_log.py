@@ -1,4 +1,4 @@
-"""Log messages of the libraries: shown by `-v`, and nothing of them without it."""
+"""Log messages of the libraries are shown with `-v` only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spn_data.work.timing import Stopwatch
 
 @click.command()
 def work() -> None:
-    """Take one step of a stage, as the pipeline does, and log as a module of spn_model does."""
+    """Run one step of a stage like the pipeline, and log like a module of spn_model."""
     with Stopwatch().step("features"):
         click.echo("result")
     logging.getLogger("spn_model.training").info("on cpu")
@@ -25,7 +25,7 @@ def work() -> None:
 def test_verbose_shows_what_the_libraries_log(
     program: click.Group, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On standard error, with the module's name; the next command without `-v` is silent again."""
+    """`-v` logs to standard error with module names; the next command without it logs nothing."""
     monkeypatch.setitem(program.commands, "work", work)
     loud = CliRunner().invoke(program, ["-v", "work"])
     assert loud.stdout == "result\n"

@@ -1,4 +1,4 @@
-"""`spn-data reconstruct` on a short simulated flight: made, left alone, extended, and shown by status."""
+"""`spn-data reconstruct` and `status` on a short simulated flight: create, rerun, extend, resume."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 
 
 def run(*arguments: object) -> Result:
-    """One call of spn-data; a traceback is raised here."""
+    """Run spn-data once; exceptions other than SystemExit are raised."""
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -36,10 +36,12 @@ def run(*arguments: object) -> Result:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files in a folder by relative path."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def _interruption() -> ModuleType:
+    """Import benchmarks/interruption.py."""
     path = Path(__file__).resolve().parents[2] / "benchmarks" / "interruption.py"
     spec = importlib.util.spec_from_file_location("interruption_for_add", path)
     assert spec is not None
@@ -52,12 +54,14 @@ def _interruption() -> ModuleType:
 
 @pytest.fixture
 def area(finished_area: Path, tmp_path: Path) -> Path:
+    """A copy of the finished area that a test may change."""
     return Path(shutil.copytree(finished_area, tmp_path / "area"))
 
 
 def test_run_again_unchanged_says_so_and_changes_no_byte(
     finished_area: Path, flight1: Path
 ) -> None:
+    """An unchanged rerun reports each stage as unchanged and modifies no file."""
     before = contents(finished_area)
     result = run("reconstruct", flight1, "--area", finished_area, *FAST)
     assert result.exit_code == 0
@@ -67,13 +71,14 @@ def test_run_again_unchanged_says_so_and_changes_no_byte(
 
 
 def test_more_threads_are_no_change(finished_area: Path, flight1: Path) -> None:
+    """A different number of threads does not count as a changed option."""
     result = run("reconstruct", flight1, "--area", finished_area, *FAST, "--threads", "2")
     assert result.exit_code == 0
     assert "2-model: unchanged" in result.stdout
 
 
 def test_an_area_in_the_folder_of_its_own_videos_is_no_input(flight1: Path, tmp_path: Path) -> None:
-    """`cd video; spn-data reconstruct .` twice."""
+    """An area in the folder of its videos is not read as input (`spn-data reconstruct .` twice)."""
     here = Path(shutil.copytree(flight1, tmp_path / "here"))
     assert run("reconstruct", here, "--area", here, *FAST).exit_code == 0
     again = run("reconstruct", here, "--area", here, *FAST)
@@ -84,7 +89,7 @@ def test_an_area_in_the_folder_of_its_own_videos_is_no_input(flight1: Path, tmp_
 def test_a_refused_georegistration_leaves_the_model_and_nothing_unfinished(
     area: Path, flight1: Path
 ) -> None:
-    """Fixes said to be 1 km uncertain determine nothing; another sigma then needs no --overwrite."""
+    """Fixes with 1 km sigma cannot georegister the model; a retry with another sigma needs no --overwrite."""
     shutil.rmtree(area / GEO)
     wild = ("--gnss-sigma", "1000", "1000", "--ignore-gimbal")
     result = run("reconstruct", flight1, "--area", area, *FAST, *wild)
@@ -96,6 +101,7 @@ def test_a_refused_georegistration_leaves_the_model_and_nothing_unfinished(
 
 
 def rows(database: Path, sql: str) -> list[tuple[object, ...]]:
+    """Query an SQLite database."""
     with sqlite3.connect(database) as connection:
         found = connection.execute(sql).fetchall()
     connection.close()
@@ -105,7 +111,7 @@ def rows(database: Path, sql: str) -> list[tuple[object, ...]]:
 def test_add_extends_an_area_and_keeps_what_it_had(
     area: Path, finished_area: Path, flight2: Path
 ) -> None:
-    """Features and matches are taken over, the origin is exactly the same, old frames keep their names."""
+    """With --add, features, matches, origin and frame names are kept, and only new frames are processed."""
     result = run("reconstruct", flight2, "--area", area, "--add", *FAST)
     assert result.exit_code == 0, result.output
     old, new = Area(finished_area), Area(area)
@@ -139,7 +145,7 @@ def test_add_extends_an_area_and_keeps_what_it_had(
 def test_a_sequence_of_a_name_that_exists_gets_another(
     area: Path, flight2: Path, tmp_path: Path
 ) -> None:
-    """The second flight, its video called like the first one's; what is in the area is passed over."""
+    """An added video with the name of an existing sequence becomes a new sequence with a suffix."""
     more = tmp_path / "more"
     more.mkdir()
     for path in flight2.iterdir():
@@ -154,6 +160,7 @@ def test_a_sequence_of_a_name_that_exists_gets_another(
 def test_adding_with_other_options_says_that_features_are_made_anew(
     area: Path, flight2: Path
 ) -> None:
+    """Adding with changed feature options recomputes features and matches, and the output says so."""
     result = run("reconstruct", flight2, "--area", area, "--add", *FAST, "--max-features", "700")
     assert result.exit_code == 0, result.output
     told = " ".join(result.stdout.split())
@@ -165,7 +172,7 @@ def test_adding_with_other_options_says_that_features_are_made_anew(
 
 @pytest.mark.slow
 def test_a_kill_while_adding_leaves_the_old_area_whole(area: Path, flight2: Path) -> None:
-    """Its bytes stay, status shows the addition, and the same command goes on."""
+    """After a kill during --add the old area is unchanged, status shows the addition, a rerun finishes."""
     interruption = _interruption()
     before = contents(area)
     options = ["--add", "--max-features", "800", "--fov", "72"]
@@ -185,6 +192,7 @@ def test_a_kill_while_adding_leaves_the_old_area_whole(area: Path, flight2: Path
 
 
 def test_status_of_no_area_is_an_error(tmp_path: Path) -> None:
+    """`status` of a missing area is an error and creates nothing."""
     result = run("status", "--area", tmp_path / "none")
     assert result.exit_code == 1
     assert "none is not an area; create one with spn-data reconstruct VIDEO --area" in result.stderr
@@ -192,6 +200,7 @@ def test_status_of_no_area_is_an_error(tmp_path: Path) -> None:
 
 
 def test_status_shows_what_is_complete_unfinished_missing_and_stale(area: Path) -> None:
+    """`status` distinguishes complete, unfinished, missing and stale stages."""
     complete = run("status", "--area", area).stdout
     assert complete.count(" complete ") == 3
     counts = Area(area).record(MODEL).counts
@@ -209,7 +218,7 @@ def test_status_shows_what_is_complete_unfinished_missing_and_stale(area: Path) 
 
 
 def test_a_focal_length_far_from_what_was_given_is_told(flight1: Path, tmp_path: Path) -> None:
-    """A lens of 72 degrees given as one of 60: the model finds 72, and says that it is another."""
+    """A 72-degree lens given as 60 degrees is estimated as about 72, with a note on the difference."""
     options = ("--max-features", "800", "--threads", "1", "--fov", "60")
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *options)
     assert result.exit_code == 0, result.output
@@ -221,6 +230,7 @@ def test_a_focal_length_far_from_what_was_given_is_told(flight1: Path, tmp_path:
 
 
 def test_no_surprise_is_told_of_a_focal_length_that_was_given_rightly(finished_area: Path) -> None:
+    """A correct initial focal length gives no note."""
     notes = Area(finished_area).record(MODEL).notes
     assert not any("focal length" in note for note in notes)
 
@@ -252,7 +262,7 @@ def test_a_model_that_is_contradicted_is_made_again(
     words: str,
     stays: bool,
 ) -> None:
-    """The first time, as a wrong one would be, or each time: all attempts are made then, and it is told."""
+    """A model judged wrong is reconstructed again, until it is accepted or all attempts fail, with notes."""
     answers = [[wrong]] * 3 if stays else [[wrong], []]
     monkeypatch.setattr(spn_data.reconstruction.reconstruct, judge, lambda *_: answers.pop(0))
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
@@ -269,7 +279,7 @@ _MISPLACED = "flight1/000008.jpg"
 
 @pytest.fixture
 def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """A frame is found to be misplaced in the first model; what the real judgement says of each model."""
+    """Deregister one frame of the first model as misplaced; the list collects the real judgements."""
     judged: list[list[str]] = []
     drop: Callable[..., list[str]] = spn_data.reconstruction.reconstruct.drop_misplaced
 
@@ -291,6 +301,7 @@ def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
     flight1: Path, tmp_path: Path, misplaced: list[list[str]]
 ) -> None:
+    """A frame removed as misplaced is registered again in the final model."""
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
     assert result.exit_code == 0, result.output
     assert misplaced == [[], []]
@@ -304,7 +315,7 @@ def test_a_frame_that_lies_wrongly_is_taken_out_and_finds_its_place(
 def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_poses(
     flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By then the database holds more matches than the first model was made of."""
+    """A run stopped when the database has more matches than the first model used ends with the same poses."""
     match = spn_data.reconstruction.reconstruct.match_missing
     matched = []
 

@@ -1,4 +1,4 @@
-"""`spn-data report` on a real area: what is on the disk is what the page shows, stale stages included."""
+"""`spn-data report` on a real area: the page shows the stored results and leaves out stale stages."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from tests.worlds.report_data import unpack
 
 
 def run(area: Path, *options: str) -> Result:
+    """Run `spn-data report` on an area."""
     return CliRunner().invoke(main, ["report", "--area", str(area), *options])
 
 
 def given(page: Path) -> dict:
-    """What the page's script is given."""
+    """Return the data embedded in the page for its script."""
     (text,) = re.findall(
         r'<script type="application/json" id="data">(.*?)</script>', page.read_text("ascii")
     )
@@ -31,14 +32,14 @@ def given(page: Path) -> dict:
 
 @pytest.fixture
 def area(finished_area: Path, tmp_path: Path) -> Path:
-    """A copy that may be changed, without its database and images."""
+    """A copy of the area that a test may change, without database and images."""
     copy = tmp_path / "area"
     shutil.copytree(finished_area, copy, ignore=shutil.ignore_patterns("*.jpg", "*.db"))
     return copy
 
 
 def test_the_page_holds_what_the_area_holds(area):
-    """All candidates of frames.csv, with the poses of the model and the residuals of geo.json."""
+    """The page has all candidates of frames.csv, the poses of the model and the residuals of geo.json."""
     before = sorted(path for path in area.rglob("*") if path.is_file())
     ran = run(area)
     assert ran.exit_code == 0, ran.output
@@ -63,14 +64,14 @@ def test_the_page_holds_what_the_area_holds(area):
 
 
 def test_the_command_tells_the_verdict(area):
-    """What the page says first is said on the terminal too, with the next step."""
+    """The verdict of the page and the next step are also printed."""
     ran = run(area)
     assert "Not ready to train: 1 thing to do first: see" in ran.output
     assert "Next: Split the frames: spn-data split" in ran.output
 
 
 def test_a_stale_stage_is_named_and_left_out(area):
-    """After the model was made anew, the old place in the world is not shown as if it still held."""
+    """After the model has been redone, the stale georegistration is named and not shown."""
     path = area / "2-model" / "stage.json"
     record = json.loads(path.read_text())
     record["counts"]["points"] += 1
@@ -84,7 +85,7 @@ def test_a_stale_stage_is_named_and_left_out(area):
 
 
 def test_an_area_without_a_model_has_a_report(area):
-    """Chosen frames alone make a page that says what is next."""
+    """An area with frames only still has a report, which names the next step."""
     shutil.rmtree(area / "3-geo")
     shutil.rmtree(area / "2-model")
     ran = run(area)
@@ -94,7 +95,7 @@ def test_an_area_without_a_model_has_a_report(area):
 
 
 def test_a_folder_that_is_no_area_is_refused(tmp_path):
-    """Without frames there is nothing to report; the line says what to run."""
+    """A folder without frames is rejected in one line that names the command to run."""
     folder = tmp_path / "area"
     ran = run(folder)
     assert ran.exit_code == 1
@@ -105,7 +106,7 @@ def test_a_folder_that_is_no_area_is_refused(tmp_path):
 
 
 def test_damaged_residuals_are_an_error(area):
-    """Residuals that are not those of the frames are refused, not shown with the wrong frames."""
+    """Residuals that do not match the frames are an error."""
     path = area / "3-geo" / "geo.json"
     value = json.loads(path.read_text())
     value["frames"] = value["frames"][1:]

@@ -1,4 +1,4 @@
-"""A rolling shutter in the video is told with the model."""
+"""A rolling shutter found in a video is noted in the record of the model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spn_data.simulate import preset, simulate
 
 @pytest.mark.slow
 def test_a_rolling_shutter_is_told_with_the_model(tmp_path: Path) -> None:
-    """A readout of 50 ms, rendered; small images and few frames make it come out a little short."""
+    """A rendered readout of 50 ms is noted; small images and few frames make the estimate a little short."""
     options = replace(
         preset("standard", seed=3),
         width=480,

@@ -1,4 +1,4 @@
-"""`spn-data split` and `spn-data audit` on a reconstructed flight that has no evaluation sequence."""
+"""`spn-data split` and `spn-data audit` on a reconstructed flight without an evaluation sequence."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(*arguments: object) -> Result:
 
 @pytest.fixture(scope="module")
 def split_area(finished_area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flight, split with nothing but the defaults; no test may change it."""
+    """The flight, split with the default options; no test may change it."""
     area = tmp_path_factory.mktemp("split") / "area"
     shutil.copytree(finished_area, area)
     result = run("split", "--area", area)
@@ -53,14 +53,14 @@ def area(split_area: Path, tmp_path: Path) -> Path:
 
 
 def rewrite(path: Path, change: object) -> None:
-    """Change a JSON file of the area by a function of its value."""
+    """Modify a JSON file of the area with a function of its value."""
     value = read_json(path)
     change(value)  # type: ignore[operator]
     write_json(path, value)
 
 
 def test_a_flight_is_split_with_no_other_step(split_area: Path) -> None:
-    """reconstruct, split: three groups, and everything that shows them says that the test is optimistic."""
+    """A reconstructed flight splits into three groups, and every output marks the test as optimistic."""
     folder = split_area / SPLIT
     split = read_split(folder / "split.json")
     assert split.groups() == ("train", "validation", "test")
@@ -74,7 +74,7 @@ def test_a_flight_is_split_with_no_other_step(split_area: Path) -> None:
 
 
 def test_every_frame_has_its_own_image_and_exact_pose(split_area: Path) -> None:
-    """Images are those of the frames in the canonical camera; poses are the labels' to the last bit."""
+    """Images show the right frame in the canonical camera; poses are bitwise equal to the labels."""
     labelled = read_labelled_area(Area(split_area))
     with Dataset(split_area / SPLIT / "dataset.h5") as dataset:
         camera = dataset.info.camera
@@ -95,7 +95,7 @@ def test_every_frame_has_its_own_image_and_exact_pose(split_area: Path) -> None:
 
 
 def test_points_lie_where_the_pose_projects_them(split_area: Path) -> None:
-    """Points in dataset.h5 project to their pixels within a few, by the frame's own K and pose alone."""
+    """The reprojection error of points in dataset.h5 is small with the intrinsics and pose of the frame."""
     with Dataset(split_area / SPLIT / "dataset.h5") as dataset:
         for group in dataset.groups.values():
             errors = []
@@ -109,7 +109,7 @@ def test_points_lie_where_the_pose_projects_them(split_area: Path) -> None:
 
 
 def test_the_cambridge_folder_is_complete(split_area: Path) -> None:
-    """Each image that a list names is there at full size; the model's points project to their offsets."""
+    """Every listed image exists at full size, and the points of the NVM model project to their pixels."""
     folder = split_area / SPLIT / "cambridge"
     split = read_split(split_area / SPLIT / "split.json")
     names: list[str] = []
@@ -150,7 +150,7 @@ def test_run_again_it_is_left_as_it_is(split_area: Path) -> None:
 
 
 def test_other_options_need_overwrite_and_change_what_they_say(area: Path) -> None:
-    """Native cameras at a width of 160, no cambridge folder, a gap of 1 s."""
+    """Changed options (native cameras, width 160, no cambridge, 1 s gap) need --overwrite and take effect."""
     options = ("--native", "--size", 160, "--cambridge", "none", "--gap", 1)
     refused = run("split", "--area", area, *options)
     assert refused.exit_code == 1
@@ -169,7 +169,7 @@ def test_other_options_need_overwrite_and_change_what_they_say(area: Path) -> No
 def test_a_policy_that_leaves_a_group_empty_is_one_line_and_leaves_nothing(
     area: Path, policy: str
 ) -> None:
-    """A flight of 9 s has no room for 30 s of gap."""
+    """A 30 s gap in a 9 s flight is rejected in one line, and the existing split is kept."""
     before = (area / SPLIT / "split.json").read_text()
     result = run("split", "--area", area, "--validation", policy, "--gap", 30, "--overwrite")
     assert result.exit_code == 1
@@ -182,7 +182,7 @@ def test_a_policy_that_leaves_a_group_empty_is_one_line_and_leaves_nothing(
 def test_an_interrupted_split_goes_on_and_comes_out_the_same(
     finished_area: Path, split_area: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C between two images: no stage stands, no half file lies about, the same command finishes."""
+    """Ctrl-C between two images leaves no stage and no partial file; a rerun gives the same split."""
     from spn_data.pipeline import split_stage as stage
 
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
@@ -236,7 +236,7 @@ def guard_frame(folder: Path) -> str:
 
 
 def leak_guard_frame(area: Path) -> None:
-    """A frame of the guard trains."""
+    """Move a frame of the guard gap to the training group."""
     name = guard_frame(area / SPLIT)
 
     def move(value: dict[str, dict[str, list[str]]]) -> None:
@@ -247,19 +247,19 @@ def leak_guard_frame(area: Path) -> None:
 
 
 def mark_test_points(area: Path) -> None:
-    """Points of the test group are marked for training."""
+    """Mark the points of the test group as usable for training."""
     with h5py.File(area / SPLIT / "dataset.h5", "r+") as file:
         file["test/points"].attrs["for_training"] = 1
 
 
 def move_a_pose(area: Path) -> None:
-    """A pose in the data set is no longer the label's."""
+    """Change a pose in dataset.h5, so that it differs from its label."""
     with h5py.File(area / SPLIT / "dataset.h5", "r+") as file:
         file["train/centers"][0] += 0.01
 
 
 def swap_a_point(area: Path) -> None:
-    """A training frame is given a point that only held-out frames see."""
+    """Give a training frame a point that only held-out frames observe."""
     labelled = read_labelled_area(Area(area))
     split = read_split(area / SPLIT / "split.json")
     trained = split.groups_of(labelled.mapping.names) == TRAIN
@@ -271,7 +271,7 @@ def swap_a_point(area: Path) -> None:
 
 
 def edit_a_list(area: Path) -> None:
-    """A position in a list differs in the last printed digit."""
+    """Change the last printed digit of a position in a Cambridge list."""
     path = area / SPLIT / "cambridge" / "dataset_train.txt"
     lines = path.read_text().splitlines()
     cells = lines[3].split()
@@ -281,13 +281,13 @@ def edit_a_list(area: Path) -> None:
 
 
 def cut_the_data_set(area: Path) -> None:
-    """dataset.h5 is not whole."""
+    """Truncate dataset.h5."""
     path = area / SPLIT / "dataset.h5"
     path.write_bytes(path.read_bytes()[:5000])
 
 
 def remake_the_model(area: Path) -> None:
-    """The model was made anew since."""
+    """Make the split stale, as if the model had been redone since."""
     rewrite(area / FRAMES / "stage.json", lambda value: value["counts"].update(candidates=99))
     for stage in (MODEL, "3-geo"):
         now = {
@@ -310,7 +310,7 @@ def remake_the_model(area: Path) -> None:
     ],
 )
 def test_what_was_planted_fails_the_audit(area: Path, plant: object, check: str) -> None:
-    """Exit code 1, and the check that failed in the last line."""
+    """Each planted fault fails the audit with exit code 1, and the error names the check."""
     plant(area)  # type: ignore[operator]
     result = run("audit", "--area", area, "--all")
     assert result.exit_code == 1, result.output
@@ -319,7 +319,7 @@ def test_what_was_planted_fails_the_audit(area: Path, plant: object, check: str)
 
 
 def test_a_split_whose_audit_failed_is_told_again(area: Path) -> None:
-    """The stored findings are shown, and the exit code is 1, also where nothing is made anew."""
+    """A rerun of `split` shows the stored findings of a failed audit and exits with code 1."""
     rewrite(
         area / SPLIT / "audit.json",
         lambda value: value["findings"][0].update(verdict="fail", evidence=["one/two.jpg"]),
@@ -330,7 +330,7 @@ def test_a_split_whose_audit_failed_is_told_again(area: Path) -> None:
 
 
 def test_an_area_without_metres_is_split_in_time(finished_area: Path, tmp_path: Path) -> None:
-    """Without 3-geo, units are the model's, there are no strata, and space is refused with the remedy."""
+    """Without 3-geo, units are those of the model, strata are empty, and a split by space is rejected."""
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
     shutil.rmtree(area / "3-geo")
     refused = run("split", "--area", area, "--validation", "space")
@@ -345,7 +345,7 @@ def test_an_area_without_metres_is_split_in_time(finished_area: Path, tmp_path: 
 
 
 def test_masked_pixels_are_not_valid(finished_area: Path, tmp_path: Path) -> None:
-    """A mask that is black on its left half makes the left half of the image invalid."""
+    """A mask that is black in its left half makes the left half of the images invalid."""
     area = Path(shutil.copytree(finished_area, tmp_path / "area"))
     mask = np.full((180, 320), 255, np.uint8)
     mask[:, :160] = 0
@@ -361,7 +361,7 @@ def test_masked_pixels_are_not_valid(finished_area: Path, tmp_path: Path) -> Non
 
 
 def test_every_option_is_documented_with_its_default() -> None:
-    """docs/split.md has a row for each option of split, and names those of audit."""
+    """docs/split.md lists every option of `split` with its default, and names those of `audit`."""
     text = DOC.read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
     options = [p for p in main.commands["split"].params if isinstance(p, click.Option)]
@@ -376,7 +376,7 @@ def test_every_option_is_documented_with_its_default() -> None:
 
 
 def test_defaults_of_the_command_are_those_of_the_option_classes() -> None:
-    """Help, docs and library agree on what happens without options."""
+    """The defaults of the command equal those of the option classes of the library."""
     given = {p.name: p.default for p in main.commands["split"].params}
     for field in fields(SplitOptions):
         if field.name != "tracked":
@@ -386,7 +386,7 @@ def test_defaults_of_the_command_are_those_of_the_option_classes() -> None:
 
 
 def test_checks_and_fields_are_documented(split_area: Path) -> None:
-    """docs/split.md names every check that an audit makes, and every field of split.json."""
+    """docs/split.md names every check of the audit and every field of split.json."""
     text = DOC.read_text(encoding="utf-8")
     findings = read_json(split_area / SPLIT / "audit.json")["findings"]
     listed = re.findall(r"^\| `([^`]+)` \|", text.split("## The audit")[1], re.MULTILINE)

@@ -34,7 +34,7 @@ def run(*arguments: object) -> Result:
 def registered_area(
     finished_area: Path, flight2: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """The area with the second flight registered at one frame a second, the others tracked."""
+    """The area with the second flight registered at 1 fps and its other frames tracked."""
     area = tmp_path_factory.mktemp("evaluated") / "area"
     shutil.copytree(finished_area, area)
     options = ("--name", "medium", "--rate", 1, "--all-frames", "--any-telemetry", "--threads", 1)
@@ -45,7 +45,7 @@ def registered_area(
 
 @pytest.fixture(scope="module")
 def split_area(registered_area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same, split with nothing but the defaults; no test may change it."""
+    """The same area, split with the default options; no test may change it."""
     area = Path(shutil.copytree(registered_area, tmp_path_factory.mktemp("split") / "area"))
     result = run("split", "--area", area)
     assert result.exit_code == 0, result.output
@@ -55,17 +55,19 @@ def split_area(registered_area: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def area(split_area: Path, tmp_path: Path) -> Path:
+    """A copy of the split area that a test may change."""
     return Path(shutil.copytree(split_area, tmp_path / "area"))
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Modify a JSON file of the area with a function of its value."""
     value = read_json(path)
     change(value)
     write_json(path, value)
 
 
 def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path) -> None:
-    """Chosen and tracked frames, points not for training, none of it in the map's groups; not optimistic."""
+    """The evaluation sequence, with its tracked frames, is the only test group, and it is not optimistic."""
     split = read_split(split_area / SPLIT / "split.json")
     assert split.groups() == ("train", "validation", "medium")
     assert not split.optimistic
@@ -86,7 +88,7 @@ def test_the_evaluation_sequence_is_a_test_set_of_its_own_name(split_area: Path)
 
 
 def test_dense_images_are_those_of_the_video(split_area: Path, flight2: Path) -> None:
-    """The stored image of a tracked frame resembles its neighbours in time more than distant ones."""
+    """The stored image of a tracked frame resembles its neighbour in time more than a distant one."""
     with Dataset(split_area / SPLIT / "dataset.h5") as dataset:
         medium = dataset.groups["medium"]
         order = np.argsort(medium.time_s)
@@ -102,7 +104,7 @@ def test_dense_images_are_those_of_the_video(split_area: Path, flight2: Path) ->
 def test_the_test_list_holds_the_sequence_and_the_model_no_measurement_of_it(
     split_area: Path,
 ) -> None:
-    """dataset_test.txt lists chosen frames only; with --cambridge all, the tracked ones too."""
+    """dataset_test.txt lists the chosen frames; the NVM model has their poses but no measurements."""
     folder = split_area / SPLIT / "cambridge"
     listed = read_cambridge(folder / "dataset_test.txt")
     labels = read_labels(split_area / EVALUATION / "medium" / "poses.csv")
@@ -114,6 +116,7 @@ def test_the_test_list_holds_the_sequence_and_the_model_no_measurement_of_it(
 
 
 def test_dense_frames_may_stand_in_all_lists_or_nowhere(area: Path) -> None:
+    """Tracked frames are in the test list with --cambridge all, and in no group with --no-tracked."""
     every = run("split", "--area", area, "--cambridge", "all", "--overwrite")
     assert every.exit_code == 0, every.output
     listed = read_cambridge(area / SPLIT / "cambridge" / "dataset_test.txt")
@@ -125,14 +128,14 @@ def test_dense_frames_may_stand_in_all_lists_or_nowhere(area: Path) -> None:
 
 
 def test_a_copy_of_the_mapping_flight_is_noticed(split_area: Path) -> None:
-    """The second flight is the first one flown backwards, image by image: no fingerprint tells, poses do."""
+    """A flight with the poses of the mapping flight is noticed, although no image fingerprint matches."""
     result = run("audit", "--area", split_area, "--all")
     assert result.exit_code == 0
     assert "cut or re-encoded" in " ".join(result.output.split())
 
 
 def map_the_evaluation_video(area: Path) -> None:
-    """The evaluation video was a source of the map."""
+    """Make the evaluation video look like a source of the map."""
     mapped = next(iter(Area(area).record(FRAMES).inputs.values()))
     rewrite(
         area / EVALUATION / "medium" / "stage.json",
@@ -141,7 +144,7 @@ def map_the_evaluation_video(area: Path) -> None:
 
 
 def change_the_map(area: Path) -> None:
-    """One byte of a point's colour differs."""
+    """Flip a bit in the colour of a point of the map."""
     path = area / MODEL / "points3D.bin"
     data = bytearray(path.read_bytes())
     data[8 + 8 + 24] ^= 1
@@ -149,7 +152,7 @@ def change_the_map(area: Path) -> None:
 
 
 def forge_a_hash(area: Path) -> None:
-    """The map was another one after the registration."""
+    """Record a different map after the registration."""
     rewrite(
         area / EVALUATION / "medium" / "registration.json",
         lambda value: value.update(map_after="0" * 64),
@@ -157,7 +160,7 @@ def forge_a_hash(area: Path) -> None:
 
 
 def lose_a_label(area: Path) -> None:
-    """A frame of the test set has no pose any more."""
+    """Remove the pose of a frame of the test set."""
     path = area / EVALUATION / "medium" / "poses.csv"
     labels = read_labels(path)
     labels.status[0], labels.reason[0] = LabelStatus.FAILED, "lost"
@@ -177,6 +180,7 @@ def lose_a_label(area: Path) -> None:
 def test_what_was_planted_fails_the_audit(
     area: Path, plant: Callable[[Path], None], check: str
 ) -> None:
+    """Each planted fault fails exactly the expected check of the audit."""
     plant(area)
     for stage in ("4-tracked/medium", SPLIT):  # what a forger would mend too
         now = {s: Area(area).record(s).fingerprint() for s in Area(area).record(stage).upstream}
@@ -187,7 +191,7 @@ def test_what_was_planted_fails_the_audit(
 
 
 def as_version_0_1_left_it(area: Path) -> None:
-    """Rename and remove what a later version names otherwise or writes in addition."""
+    """Convert an area to the names and files of version 0.1."""
     (area / "4-tracked").rename(area / "4-dense")
     for name in ("poses.csv", "observations.npz"):
         (area / MODEL / name).unlink()
@@ -212,7 +216,7 @@ def as_version_0_1_left_it(area: Path) -> None:
 
 
 def test_an_area_of_version_0_1_is_read_and_left_as_it_is(area: Path) -> None:
-    """With 4-dense and without stored mapping labels, commands see the same frames and redo nothing."""
+    """An area of version 0.1 (4-dense, no stored mapping labels) gives the same frames and is not redone."""
     before = read_labelled_area(Area(area))
     as_version_0_1_left_it(area)
     assert read_json(area / SPLIT / "stage.json")["upstream"].keys() >= {"4-dense/medium"}

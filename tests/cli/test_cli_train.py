@@ -1,4 +1,4 @@
-"""`spn-model train`: a run's folder, going on, refusing what would be lost."""
+"""`spn-model train`: run folder, resuming, and refusal to overwrite."""
 
 from __future__ import annotations
 
@@ -51,13 +51,14 @@ def place(tmp_path: Path) -> Path:
 
 
 def trained(place: Path, *words: str) -> Result:
+    """Run `spn-model train` with the tiny recipe on the CPU."""
     given = ["--area", str(place / "area"), "--recipe", str(place / "tiny.toml"), "--device", "cpu"]
     fixed = ["--threads", "1", "--precision", "float32", "--validations", "2", *words]
     return CliRunner().invoke(main, ["train", str(place / "dataset.h5"), *given, *fixed])
 
 
 def test_a_run_has_all_that_it_takes_to_repeat_it(place):
-    """Checkpoint, log and configuration lie in runs/<recipe>; the table of errors ends the output."""
+    """runs/<recipe> contains checkpoint, log and configuration; the output ends with a table of errors."""
     ran = trained(place, "--seed", "3")
     assert ran.exit_code == 0, ran.output
     folder = place / "area" / "runs" / "tiny"
@@ -81,7 +82,7 @@ def test_a_run_has_all_that_it_takes_to_repeat_it(place):
 
 
 def test_a_finished_run_is_left_as_it_is(place):
-    """The same command shows the table again and writes nothing; --overwrite of the same too."""
+    """The same command, with or without --overwrite, prints the table again and writes nothing."""
     trained(place)
     checkpoint = place / "area" / "runs" / "tiny" / "checkpoint.safetensors"
     before = checkpoint.stat().st_mtime_ns
@@ -103,7 +104,7 @@ def test_a_finished_run_is_left_as_it_is(place):
     ],
 )
 def test_another_option_over_a_run_is_refused(place, words, told):
-    """It says what differs; --overwrite trains again, another --run keeps it."""
+    """A changed option is refused with the difference; --overwrite or another --run trains."""
     assert trained(place).exit_code == 0
     refused = trained(place, *words)
     assert refused.exit_code == 1
@@ -116,7 +117,7 @@ def test_another_option_over_a_run_is_refused(place, words, told):
 
 
 def test_another_data_set_over_a_run_is_refused(place):
-    """Frames that changed would make another network."""
+    """A run is not continued with a different dataset."""
     assert trained(place).exit_code == 0
     write_field(place / "dataset.h5", 13, 3)
     refused = trained(place)
@@ -125,7 +126,7 @@ def test_another_data_set_over_a_run_is_refused(place):
 
 
 def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
-    """The step is finished, the end says how to go on, and weights are those of one piece."""
+    """After Ctrl-C the same command resumes, and the weights equal those of an uninterrupted run."""
     whole = trained(place, "--run", "whole", "--images", "1600")
     assert whole.exit_code == 0
     folder = place / "area" / "runs" / "cut"
@@ -160,7 +161,7 @@ def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
 
 
 def test_a_full_disk_is_one_line(place, monkeypatch):
-    """The file that could not be written is named, and that the same command resumes."""
+    """A full disk is reported with the advice to free space and resume."""
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -174,7 +175,7 @@ def test_a_full_disk_is_one_line(place, monkeypatch):
 
 
 def test_what_nothing_can_be_trained_with_leaves_no_run(place):
-    """A recipe that is none, a device that is not there, a bad name, a stage's unknown option."""
+    """An unknown recipe, device or stage option and a bad run name are rejected and leave no run."""
     (place / "bad.toml").write_text(TOML.replace("frozen = true", "frosen = true"))
     for words, told in (
         (("--recipe", "nothing"), "unknown recipe 'nothing'"),
@@ -193,14 +194,14 @@ def test_what_nothing_can_be_trained_with_leaves_no_run(place):
 
 
 def test_an_area_without_a_split_is_refused(place):
-    """The line says which command makes it."""
+    """An area without a split is rejected; the message names the command to run."""
     ran = CliRunner().invoke(main, ["train", "--area", str(place / "area")])
     assert ran.exit_code == 1
     assert "5-split is missing; run spn-data split first" in ran.output
 
 
 def test_options_are_documented_with_their_defaults():
-    """docs/training.md has a row for every option and no other."""
+    """docs/training.md lists exactly the options of the command, with their defaults."""
     page = Path(__file__).resolve().parents[2] / "docs" / "training.md"
     rows = dict(re.findall(r"^\| `(--[a-z]+)` \|([^|]*)\|", page.read_text(), re.MULTILINE))
     options = {p.opts[-1]: p for p in train.params if isinstance(p, click.Option)}
@@ -211,7 +212,7 @@ def test_options_are_documented_with_their_defaults():
 
 
 def test_columns_of_the_log_are_documented():
-    """docs/training.md names every column of log.csv and no other."""
+    """docs/training.md lists exactly the columns of log.csv."""
     page = Path(__file__).resolve().parents[2] / "docs" / "training.md"
     part = page.read_text().split("Columns of `log.csv`")[1].split("## Recipes")[0]
     cells = "".join(re.findall(r"^\| (`[^|]+) \|", part, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""Ctrl-C, and kill -9 at any moment: nothing is left behind, and the next run goes on to the same result."""
+"""Ctrl-C, SIGTERM and SIGKILL at any time leave no process behind, and a rerun gives the same result."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ OPTIONS = ["--max-features", "800", "--fov", "72"]
 
 
 def _load_benchmark() -> ModuleType:
+    """Import benchmarks/interruption.py."""
     path = Path(__file__).resolve().parents[2] / "benchmarks" / "interruption.py"
     spec = importlib.util.spec_from_file_location("interruption", path)
     assert spec is not None
@@ -44,12 +45,12 @@ def area(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def start(flight1: Path, area: Path) -> Start:
-    """Starts or restarts the reconstruction of the short flight."""
+    """Return a function that starts or resumes the reconstruction of the short flight."""
     return lambda: interruption.Run([flight1], area, OPTIONS)
 
 
 def first(output: str, step: str) -> int:
-    """How much of a step is done when it is told for the first time."""
+    """Return the count in the first progress line of a step."""
     line = next(line for line in output.splitlines() if line.startswith(f"{step}: "))
     return int(line.split()[1])
 
@@ -57,7 +58,7 @@ def first(output: str, step: str) -> int:
 def test_ctrl_c_in_each_step_ends_at_once_and_the_next_run_goes_on(
     start: Start, area: Path, finished_area: Path
 ) -> None:
-    """SIGINT to the whole process group, as a terminal sends it: exit code 130, one line, no survivor."""
+    """SIGINT to the process group, in any step, exits within 5 s with code 130; the next run resumes."""
     outputs = []
     for step in ("analysis", "frames", "features", "matching", "mapping"):
         run = start()
@@ -84,6 +85,7 @@ def test_ctrl_c_in_each_step_ends_at_once_and_the_next_run_goes_on(
 def test_a_kill_outside_mapping_changes_no_pose(
     start: Start, area: Path, finished_area: Path, step: str
 ) -> None:
+    """A kill in a step other than mapping leaves no worker, and the resumed run gives identical poses."""
     run = start()
     run.wait_for(step)
     assert run.kill() == 0, "workers outlived the process"
@@ -97,6 +99,7 @@ def test_a_kill_outside_mapping_changes_no_pose(
 def test_a_kill_while_mapping_changes_poses_by_less_than_a_centimetre(
     start: Start, area: Path, finished_area: Path
 ) -> None:
+    """After a kill during mapping, the resumed run keeps the matches and changes poses by less than 1 cm."""
     run = start()
     run.wait_for("mapping")
     assert run.kill() == 0, "the mapper outlived the process"
@@ -110,7 +113,7 @@ def test_a_kill_while_mapping_changes_poses_by_less_than_a_centimetre(
 
 
 def member(run: Any, command: str) -> int:
-    """The process below a run whose command line holds a text."""
+    """Return the id of the child process of a run whose command line contains a text."""
     deadline = time.monotonic() + 20
     while time.monotonic() < deadline:
         for pid in run.family():
@@ -128,6 +131,7 @@ def member(run: Any, command: str) -> int:
 def test_a_killed_worker_is_replaced_within_the_run(
     start: Start, area: Path, finished_area: Path
 ) -> None:
+    """A killed feature worker is replaced, and the poses are identical."""
     run = start()
     run.wait_for("features")
     os.kill(member(run, "spawn_main"), signal.SIGKILL)
@@ -139,6 +143,7 @@ def test_a_killed_worker_is_replaced_within_the_run(
 def test_a_killed_mapper_is_told_in_one_line_and_the_next_run_finishes(
     start: Start, area: Path, finished_area: Path
 ) -> None:
+    """A killed mapping process is reported in one line, and the next run finishes."""
     run = start()
     os.kill(member(run, "spn_data.colmap.mapping"), signal.SIGKILL)
     assert run.process.wait(30) == 1
@@ -153,7 +158,7 @@ def test_a_killed_mapper_is_told_in_one_line_and_the_next_run_finishes(
 def test_a_kill_while_scratch_files_are_removed_loses_nothing(
     finished_area: Path, flight1: Path, area: Path
 ) -> None:
-    """A stage whose record stands is complete, though it still has its partial name."""
+    """A stage with a record is complete even if it still has its partial name and scratch files."""
     shutil.copytree(finished_area, area)
     shutil.rmtree(area / GEO)
     record = Area(area).record(MODEL)
@@ -172,7 +177,7 @@ def test_a_kill_while_scratch_files_are_removed_loses_nothing(
 def test_a_model_that_a_full_disk_cut_short_is_an_error(
     finished_area: Path, tmp_path: Path
 ) -> None:
-    """COLMAP itself writes on without a word; a limit on the size of files stands for the disk."""
+    """A truncated model, which COLMAP does not report, is an error; a file size limit simulates the disk."""
     script = (
         "import resource, sys; from pathlib import Path\n"
         "from spn_data.colmap.model import write_transformed\n"
@@ -188,7 +193,7 @@ def test_a_model_that_a_full_disk_cut_short_is_an_error(
 
 @pytest.mark.slow
 def test_kills_at_random_moments(flight1: Path, flight2: Path, tmp_path: Path) -> None:
-    """Eight moments drawn over a run of two flights."""
+    """Kills at eight random times in a run of two flights leave nothing behind and hardly change poses."""
     _, _, kills = interruption.measure(
         [flight1, flight2], tmp_path, OPTIONS, kills=8, seed=1, victim="main"
     )
@@ -202,7 +207,7 @@ def test_kills_at_random_moments(flight1: Path, flight2: Path, tmp_path: Path) -
 
 
 def test_sigterm_is_treated_as_ctrl_c(start: Start) -> None:
-    """SIGTERM to the command alone: exit code 143, the same line, no native stack trace, no survivor."""
+    """SIGTERM to the command alone exits with code 143, the same line and no native stack trace."""
     run = start()
     run.wait_for("features")
     family = run.family()

@@ -1,4 +1,4 @@
-"""The whole way on real drone data."""
+"""Reconstruction and georegistration of real drone data."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from spn_data.area.names import GEO, MODEL
 
 
 def reconstruct(source: Path, area: Path) -> Area:
+    """Reconstruct an area with the default options."""
     result = CliRunner().invoke(main, ["reconstruct", str(source), "--area", str(area)])
     assert result.exit_code == 0, result.output
     return Area(area)
@@ -23,7 +24,7 @@ def reconstruct(source: Path, area: Path) -> Area:
 def test_photos_of_a_beach_become_one_georeferenced_model(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """18 photos 40 m above the ground, with gimbal angles; the one with least texture needs more features."""
+    """All 18 photos from 40 m with gimbal angles register; the one with least texture needs more features."""
     area = reconstruct(shared_data / "photos-dji-xmp", tmp_path / "area")
     model, geo = area.record(MODEL).counts, area.record(GEO).counts
     assert model["registered"] == model["frames"] == 18
@@ -43,7 +44,7 @@ def test_photos_of_a_beach_become_one_georeferenced_model(
 def test_a_real_flight_video_without_readable_telemetry_becomes_one_model(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """13 s straight along a coast: so weak a geometry that free intrinsics drift off."""
+    """A 13 s video straight along a coast, too weak a geometry for free intrinsics, gives one model."""
     area = reconstruct(shared_data / "video" / "gopro-karma.mp4", tmp_path / "area")
     counts = area.record(MODEL).counts
     assert counts["frames"] >= 25
