@@ -1,4 +1,4 @@
-"""Fixtures that more than one test module uses."""
+"""Fixtures shared by several test modules."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHARED_CASES = SHARED_DATA.parent / "cases"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of real drone data, which lies beside a checkout and is not part of the project."""
+    """Return the folder of real drone data, which is kept outside the repository."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real drone data is not at {SHARED_DATA}")
     return SHARED_DATA
@@ -22,7 +22,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_cases() -> Path:
-    """Folder of inputs that went wrong once, which lies beside a checkout and is not part of the project."""
+    """Return the folder of inputs that once caused failures, which is kept outside the repository."""
     if not SHARED_CASES.is_dir():
         pytest.skip(f"the inputs that went wrong once are not at {SHARED_CASES}")
     return SHARED_CASES
@@ -30,7 +30,7 @@ def shared_cases() -> Path:
 
 @pytest.fixture(scope="module")
 def tiny_kind() -> Iterator[None]:
-    """Recipes and checkpoints know the small network of `tests.worlds.training_world`."""
+    """Register the small network of `tests.worlds.training_world` for recipes and checkpoints."""
     from spn_model.models.registry import KINDS
     from tests.worlds.training_world import register_tiny
 
@@ -42,7 +42,7 @@ def tiny_kind() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of the coloured field of `tests.worlds.training_world`."""
+    """Write a data set of the coloured field of `tests.worlds.training_world`."""
     from tests.worlds.training_world import write_field
 
     return write_field(tmp_path_factory.mktemp("field") / "dataset.h5")
@@ -50,7 +50,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """More threads only wait for each other in networks this small; weights are drawn by one seed."""
+    """Use one thread, which is fastest for networks this small, and seed the weights."""
     import torch
 
     before = torch.get_num_threads()
@@ -62,7 +62,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def flight1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of one simulated flight of 9 s at 320 x 180: flight1.mp4 and flight1.SRT."""
+    """Return the folder of one simulated flight of 9 s at 320 x 180: flight1.mp4 and flight1.SRT."""
     from spn_data.simulate import preset, simulate
 
     options = replace(
@@ -81,7 +81,7 @@ def flight1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def flight2(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of flight2.mp4 and flight2.SRT: most of the first flight, flown backwards."""
+    """Return the folder of flight2.mp4 and flight2.SRT: most of the first flight, flown backwards."""
     import av
 
     folder = tmp_path_factory.mktemp("backwards")
@@ -104,7 +104,7 @@ def flight2(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished_area(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole area of the first short flight; no test may change it."""
+    """Return a complete area reconstructed from the short flight; tests must not change it."""
     from click.testing import CliRunner
     from spn_cli.data import main
 

@@ -1,4 +1,4 @@
-"""Stages of an area appear atomically, and no data of the user is lost."""
+"""Tests that stages of an area appear atomically and that no user data is lost."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def content(area: Area, stage: str) -> str:
 
 
 def test_a_stage_appears_only_when_it_is_finished(tmp_path: Path) -> None:
+    """A stage folder appears only after `finish`, which also removes the partial folder."""
     area = Area(tmp_path)
     work = area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
     assert isinstance(work, StageWork)
@@ -40,6 +41,7 @@ def test_a_stage_appears_only_when_it_is_finished(tmp_path: Path) -> None:
 
 
 def test_interrupted_work_made_of_the_same_goes_on(tmp_path: Path) -> None:
+    """Work interrupted with the same options and inputs is resumed with its files."""
     work = Area(tmp_path).begin(FRAMES, {"n": 1}, {"a": "1"}, overwrite=False)
     assert isinstance(work, StageWork)
     assert not work.resumed
@@ -51,6 +53,7 @@ def test_interrupted_work_made_of_the_same_goes_on(tmp_path: Path) -> None:
 
 
 def test_interrupted_work_of_other_options_is_not_thrown_away(tmp_path: Path) -> None:
+    """Partial work made with other options is discarded only with overwrite."""
     area = Area(tmp_path)
     begun = area.begin(FRAMES, {"n": 1}, {}, overwrite=False)
     assert isinstance(begun, StageWork)
@@ -63,12 +66,14 @@ def test_interrupted_work_of_other_options_is_not_thrown_away(tmp_path: Path) ->
 
 
 def test_an_unchanged_stage_is_not_made_again(tmp_path: Path) -> None:
+    """Beginning a finished stage with the same options returns its existing record."""
     area = Area(tmp_path)
     made = make(area, FRAMES, "first", n=1)
     assert area.begin(FRAMES, {"n": 1}, {}, overwrite=False) == made
 
 
 def test_a_finished_stage_is_overwritten_only_on_demand(tmp_path: Path) -> None:
+    """A finished stage made with other options is replaced only with overwrite."""
     area = Area(tmp_path)
     make(area, FRAMES, "first", n=1)
     with pytest.raises(StageError, match="n = 1, now 2; use --overwrite"):
@@ -79,6 +84,7 @@ def test_a_finished_stage_is_overwritten_only_on_demand(tmp_path: Path) -> None:
 
 
 def test_changed_input_is_named(tmp_path: Path) -> None:
+    """The error names the input file that was changed or added."""
     area = Area(tmp_path)
     work = area.begin(FRAMES, {}, {"a.mp4": "1", "b.mp4": "2"}, overwrite=False)
     assert isinstance(work, StageWork)
@@ -90,6 +96,7 @@ def test_changed_input_is_named(tmp_path: Path) -> None:
 
 
 def test_a_stage_made_from_an_earlier_one_is_stale(tmp_path: Path) -> None:
+    """Redoing a stage makes the stages that depend on it stale."""
     area = Area(tmp_path)
     make(area, FRAMES, "frames")
     make(area, MODEL, "model")
@@ -101,6 +108,7 @@ def test_a_stage_made_from_an_earlier_one_is_stale(tmp_path: Path) -> None:
 
 
 def test_a_kill_between_the_two_renames_loses_neither_version(tmp_path: Path) -> None:
+    """The old version is restored after a kill between the two renames of a replacement."""
     area = Area(tmp_path)
     make(area, FRAMES, "first")
     area.folder(FRAMES).rename(tmp_path / f".old-{FRAMES}")
@@ -127,12 +135,14 @@ def test_the_next_version_replaces_all_stages_or_none(tmp_path: Path, killed_aft
 
 
 def test_an_area_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    """An area.toml written by a newer version is refused."""
     (tmp_path / "area.toml").write_text(f"version = {VERSION + 1}\nsources = []\n")
     with pytest.raises(FormatError, match=r"area\.toml: made by a newer version"):
         Area(tmp_path)
 
 
 def test_a_stage_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    """A stage.json written by a newer version is refused."""
     area = Area(tmp_path)
     make(area, FRAMES, "frames")
     path = area.folder(FRAMES) / "stage.json"
@@ -142,11 +152,13 @@ def test_a_stage_of_a_newer_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_facts_come_back_as_they_were_written(tmp_path: Path) -> None:
+    """Facts with quotes and backslashes survive a round trip through area.toml."""
     Area(tmp_path).write_facts(Facts(sources=('a "quoted" folder', "b\\c")))
     assert Area(tmp_path).facts.sources == ('a "quoted" folder', "b\\c")
 
 
 def test_two_processes_do_not_change_one_area(tmp_path: Path) -> None:
+    """A locked area cannot be locked a second time."""
     with (
         Area(tmp_path).locked(),
         pytest.raises(StageError, match="in use by another"),
@@ -156,12 +168,14 @@ def test_two_processes_do_not_change_one_area(tmp_path: Path) -> None:
 
 
 def test_an_area_where_a_file_stands_is_refused_in_one_line(tmp_path: Path) -> None:
+    """An area path that is an existing file is refused."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StageError, match="cannot be created"), Area(tmp_path / "file").locked():
         pass
 
 
 def test_a_fingerprint_sees_a_change_in_the_middle_of_a_long_file(tmp_path: Path) -> None:
+    """Changing one byte in the middle of a 5 MB file changes its fingerprint."""
     path = tmp_path / "video"
     data = bytearray(5_000_000)
     path.write_bytes(data)

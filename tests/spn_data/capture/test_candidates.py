@@ -1,4 +1,4 @@
-"""Measuring, choosing and extracting frames, also when interrupted, changed or out of disk space."""
+"""Tests of measuring, choosing and extracting frames, including interruptions and full disks."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def write_flight(
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Source:
-    """Create two GoPro chapters of 30 and 20 frames."""
+    """Create a recording of two GoPro chapters of 30 and 20 frames."""
     folder = tmp_path_factory.mktemp("flight")
     write_flight(folder / "GX010001.MP4", 30)
     write_flight(folder / "GX020001.MP4", 20, first=30)
@@ -79,7 +79,7 @@ def frames_from(source: Source, options: SelectionOptions = OPTIONS) -> Frames:
 
 
 def test_chapters_are_one_sequence_on_one_clock(flight: Source) -> None:
-    """Frame names and times continue after the first file; the file's own frame index restarts."""
+    """Names and times continue across chapters, while the frame index of each file restarts."""
     candidates = analyse(flight)
     assert candidates.part_start_s == (0.0, 3.0)
     frames = build_frames(candidates, choose(candidates.measured, OPTIONS))
@@ -88,14 +88,14 @@ def test_chapters_are_one_sequence_on_one_clock(flight: Source) -> None:
     assert (frames.sources[30], frames.video_frame[30]) == ("GX020001.MP4", 0)
     assert set(frames.cameras) == {"GX010001"}
     assert not np.isin(np.flatnonzero(frames.chosen[:30]) % 7, 3).any()  # the blurred ones
-    # 6 px of 320 a frame: near 0.1 of the width after 5.
+    # At 6 px of 320 per frame, the image moves by about 0.1 of the width in 5 frames.
     assert 50 / 8 <= frames.chosen.sum() <= 50 / 4
     chosen = np.flatnonzero(frames.chosen)
     np.testing.assert_allclose(frames.motion_px[chosen][1:], 6 * np.diff(chosen), atol=0.7)
 
 
 def test_chosen_frames_are_the_videos_own(flight: Source, tmp_path: Path) -> None:
-    """Each file shows its frame at full size, to 3 grey levels RMS (JPEG); skipped frames have no file."""
+    """Each extracted JPEG matches its frame at full size within 5 grey levels RMS; others are not written."""
     frames = frames_from(flight)
     heard: list[int] = []
     count = extract_chosen(flight, frames, tmp_path / "out", progress=heard.append)
@@ -112,7 +112,7 @@ def test_chosen_frames_are_the_videos_own(flight: Source, tmp_path: Path) -> Non
 
 
 def test_an_interrupted_extraction_goes_on(flight: Source, tmp_path: Path) -> None:
-    """Existing files are kept, leftovers of a killed run do not matter, and missing files are written."""
+    """A resumed extraction keeps existing files, ignores partial ones and writes the missing ones."""
     frames = frames_from(flight)
     total = extract_chosen(flight, frames, tmp_path)
     names = sorted(p.name for p in tmp_path.iterdir())
@@ -129,7 +129,7 @@ def test_an_interrupted_extraction_goes_on(flight: Source, tmp_path: Path) -> No
 
 
 def test_measurements_are_kept_until_the_video_changes(flight: Source, tmp_path: Path) -> None:
-    """The second run decodes nothing; a touched video or a damaged cache is measured again."""
+    """Cached measurements are reused until the video is touched or the cache is damaged."""
     for part in flight.parts:
         shutil.copy(part, tmp_path)
     [source] = discover(tmp_path).sources
@@ -151,7 +151,7 @@ def test_measurements_are_kept_until_the_video_changes(flight: Source, tmp_path:
 
 
 def test_a_video_that_was_replaced_is_told(flight: Source, tmp_path: Path) -> None:
-    """A video that is shorter or of another size than when it was measured is refused."""
+    """A video that became shorter or changed size since it was measured is refused."""
     frames = frames_from(flight)
     for size, count in (((320, 240), 12), ((160, 120), 30)):
         folder = tmp_path / f"{size[0]}"
@@ -166,7 +166,7 @@ def test_a_video_that_was_replaced_is_told(flight: Source, tmp_path: Path) -> No
 
 
 def test_zoom_and_size_make_other_cameras(flight: Source, tmp_path: Path) -> None:
-    """Zooming from 24 to 48 mm and back gives two cameras; a chapter of another size gives one more."""
+    """Zooming from 24 to 48 mm and back gives two cameras; a chapter of another size, one more."""
     candidates = analyse(flight)
     choice = choose(candidates.measured, OPTIONS)
     focal = np.full(50, 24.0)
@@ -182,7 +182,7 @@ def test_zoom_and_size_make_other_cameras(flight: Source, tmp_path: Path) -> Non
 
 
 def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
-    """Real photos are copied, a turned one is turned, a PNG converted, an unreadable one reported."""
+    """Photos are copied, rotated or converted to JPEG as needed; unreadable ones are reported."""
     folder = tmp_path / "survey"
     folder.mkdir()
     real = sorted((shared_data / "photos-two-passes").glob("*.JPG"))[:3]
@@ -215,7 +215,7 @@ def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
     assert with_fix.has_fix.tolist() == [True, True, True, True, False, False]
     assert extract_chosen(source, frames, tmp_path / "out") == 5
     assert (tmp_path / "out" / real[0].with_suffix(".jpg").name).read_bytes() == data
-    # As a program sees it that knows no EXIF.
+    # Read it as a program would that ignores EXIF.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     turned = cv2.imread(str(tmp_path / "out" / "X-turned.jpg"), flags)
     assert turned is not None
@@ -225,7 +225,7 @@ def test_photos_become_frames(shared_data: Path, tmp_path: Path) -> None:
 
 
 def test_photos_of_which_none_is_readable_are_rows_too(tmp_path: Path) -> None:
-    """Unreadable photos have neither time nor telemetry and are refused by the caller's check."""
+    """Photos that are all unreadable still give rows, with time zero."""
     for name in ("a.jpg", "b.jpg"):
         (tmp_path / name).write_text("no photo")
     [source] = discover(tmp_path).sources
@@ -235,7 +235,7 @@ def test_photos_of_which_none_is_readable_are_rows_too(tmp_path: Path) -> None:
 
 
 def test_costs_are_estimated_before(flight: Source, tmp_path: Path) -> None:
-    """The disk estimate is within a factor of three of the files written; a target scales it."""
+    """The disk estimate is within a factor of three of the files written and scales with the target."""
     cost = estimate_cost([flight])
     assert cost.candidates == 50
     assert cost.chosen == round(5 * 1.3)
@@ -248,7 +248,7 @@ def test_costs_are_estimated_before(flight: Source, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_told_before_starting(tmp_path: Path) -> None:
-    """More space than any disk has is refused; the folder need not exist yet."""
+    """Too little disk space is refused in advance, even if the folder does not exist yet."""
     with pytest.raises(
         InputError, match=r"the frames need about 1000000000\.00 GB but only .* GB are free"
     ):
@@ -257,7 +257,7 @@ def test_a_full_disk_is_told_before_starting(tmp_path: Path) -> None:
 
 
 def test_the_blur_of_a_real_flight_video_is_relative(shared_data: Path) -> None:
-    """The 12 s GoPro Karma clip gives about one frame per second, no duplicates, no gap above 4 s."""
+    """The 12 s GoPro Karma clip gives about one frame per second, without gaps above 4 s."""
     found = discover(shared_data / "video").sources
     frames = frames_from(next(s for s in found if s.sequence == "gopro-karma"))
     times = frames.time_s[frames.chosen]

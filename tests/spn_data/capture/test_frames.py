@@ -1,4 +1,4 @@
-"""frames.csv: exact writing, strict reading, and names that cannot leave the folder."""
+"""Tests of frames.csv: exact writing, strict reading, and names that cannot leave the folder."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def assert_same(a: Frames, b: Frames) -> None:
 
 
 def test_what_is_written_is_read_exactly(tmp_path: Path) -> None:
-    """All columns are bit-identical, unknown values included; writing again gives the same bytes."""
+    """All columns are read back bit-identical, unknown values included; rewriting gives the same bytes."""
     path = tmp_path / "frames.csv"
     write_frames(path, example())
     back = read_frames(path)
@@ -77,7 +77,7 @@ def test_the_file_is_what_the_documentation_says(tmp_path: Path) -> None:
 
 
 def test_no_frames_can_be_written_and_read(tmp_path: Path) -> None:
-    """A table without rows keeps its column types."""
+    """A table without rows keeps the shapes of its columns."""
     write_frames(tmp_path / "frames.csv", example().select(np.zeros(4, bool)))
     empty = read_frames(tmp_path / "frames.csv")
     assert len(empty) == 0
@@ -109,7 +109,7 @@ def test_no_frames_can_be_written_and_read(tmp_path: Path) -> None:
 def test_a_wrong_cell_is_told_with_its_line(
     tmp_path: Path, column: str, cell: str, message: str
 ) -> None:
-    """The message names the file, line 3 and the problem."""
+    """The error for an invalid cell names the file, line 3 and the problem."""
     path = tmp_path / "frames.csv"
     write_frames(path, example())
     with path.open(newline="", encoding="utf-8") as file:
@@ -124,7 +124,7 @@ def test_a_wrong_cell_is_told_with_its_line(
 
 
 def test_what_is_not_a_frames_csv_is_refused(tmp_path: Path) -> None:
-    """A missing or binary file, another header, a short row and an open quote are refused."""
+    """Missing or binary files, a wrong header, short rows and unclosed quotes are refused."""
     path = tmp_path / "frames.csv"
     with pytest.raises(InputError, match="can't be read: No such file"):
         read_frames(path)
@@ -145,7 +145,7 @@ def test_what_is_not_a_frames_csv_is_refused(tmp_path: Path) -> None:
 
 
 def test_names_are_checked_before_they_become_paths() -> None:
-    """Names have plain characters, one folder and no dots that lead elsewhere."""
+    """Frame names with special characters, extra folders or leading dots are refused."""
     check_name("DJI_0001/000012.jpg")
     for name in (
         "a.jpg",
@@ -162,7 +162,7 @@ def test_names_are_checked_before_they_become_paths() -> None:
 
 
 def test_rows_are_selected_joined_and_given_telemetry() -> None:
-    """Values stay with their rows; telemetry must have one row per frame."""
+    """Selecting and concatenating keep rows intact; telemetry must have one row per frame."""
     frames = example()
     both = Frames.concatenate([frames.select(frames.chosen), frames.select(~frames.chosen)])
     assert both.names.tolist() == [frames.names[i] for i in (0, 2, 1, 3)]

@@ -1,4 +1,4 @@
-"""Photos: upright decoding in 8 bits, unreadable ones among good ones, and masks."""
+"""Tests of photos: upright decoding to 8 bits, unreadable files among good ones, and masks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def save(path: Path, array: np.ndarray, orientation: int = 1) -> Path:
     return path
 
 
-# EXIF orientation -> size upright, and where the stored upper-left corner goes (right, lower).
+# EXIF orientation -> upright size, and the corner where the stored upper-left one ends up (right, lower).
 UPRIGHT = {
     1: ((64, 48), (0, 0)),
     2: ((64, 48), (1, 0)),
@@ -45,7 +45,7 @@ UPRIGHT = {
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("orientation", sorted(UPRIGHT))
 def test_photos_stand_upright(tmp_path: Path, orientation: int, suffix: str) -> None:
-    """All eight EXIF orientations are applied in three formats, in colour, grey and header."""
+    """All eight EXIF orientations are applied in three formats: in colour, in grey and in the header."""
     path = save(tmp_path / f"a{suffix}", marked_photo(), orientation)
     (width, height), (right, lower) = UPRIGHT[orientation]
     image = decode_photo(path)
@@ -59,7 +59,7 @@ def test_photos_stand_upright(tmp_path: Path, orientation: int, suffix: str) -> 
 
 
 def test_one_unreadable_photo_does_not_stop_the_others(tmp_path: Path) -> None:
-    """Text, an empty file and a damaged header are reported; a truncated photo fails when decoded."""
+    """Non-photos and empty files are reported when reading headers; truncated photos, when decoding."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (200, 300, 3), dtype=np.uint8)
     good = [save(tmp_path / f"{name}.jpg", noise) for name in "abc"]
@@ -80,7 +80,7 @@ def test_one_unreadable_photo_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
-    """16 bits lose their lower byte; floating point has no known range and is refused."""
+    """16-bit values keep their upper byte; floating-point images have no known range and are refused."""
     deep = np.full((10, 20), 0x8F12, np.uint16)
     Image.fromarray(deep).save(tmp_path / "deep.png")
     assert decode_photo(tmp_path / "deep.png")[0, 0].tolist() == [0x8F] * 3
@@ -90,7 +90,7 @@ def test_deep_photos_are_scaled_to_8_bits(tmp_path: Path) -> None:
 
 
 def few_values(path: Path, *, channels: int = 1, high: int = 4095) -> Path:
-    """Write a 16-bit image that uses the values from 0 to `high`."""
+    """Write a 16-bit image whose values range from 0 to `high`."""
     values = np.linspace(0, high, 64 * 48 * channels).astype(np.uint16)
     shape = (48, 64, channels) if channels > 1 else (48, 64)
     assert cv2.imwrite(str(path), values.reshape(shape))
@@ -100,7 +100,7 @@ def few_values(path: Path, *, channels: int = 1, high: int = 4095) -> Path:
 @pytest.mark.parametrize("name", ["band.png", "band.tif"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_few_of_16_bits_are_refused(tmp_path: Path, name: str, channels: int) -> None:
-    """12 bits in 16 would be few grey levels: the message gives the range used, for photos and previews."""
+    """12-bit data in 16-bit files is refused with its range, for full decoding and previews."""
     path = few_values(tmp_path / name, channels=channels)
     for decoder in (decode_photo, lambda p: decode_photo_gray(p, max_width=100)):
         with pytest.raises(
@@ -124,7 +124,7 @@ def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
 
 
 def test_lenses_are_told_apart(shared_data: Path) -> None:
-    """The two passes share one lens and size; the other set has another."""
+    """Photos of one lens and size share a lens key, which differs from that of another set."""
     first = sorted((shared_data / "photos-two-passes").glob("*.JPG"))[:3]
     second = sorted((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))[:2]
     lens = read_headers([*first, *second]).lens
@@ -133,14 +133,14 @@ def test_lenses_are_told_apart(shared_data: Path) -> None:
 
 
 def test_grey_is_reduced_for_measuring(shared_data: Path) -> None:
-    """Photos are reduced to at most the requested width and never enlarged."""
+    """Grey photos are reduced to the requested width and never enlarged."""
     path = min((shared_data / "photos-dji-xmp").glob("*.[jJ]*"))
     assert decode_photo_gray(path, max_width=640).shape == (360, 640)
     assert decode_photo_gray(path, max_width=9000).shape == (1125, 2000)
 
 
 def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
-    """White is usable; the same aspect ratio is resized without blending, another one is refused."""
+    """A mask of the same aspect ratio is resized without blending; any other is refused."""
     mask = np.zeros((90, 160), np.uint8)
     mask[:45] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -156,14 +156,14 @@ def test_a_mask_fits_by_shape(tmp_path: Path) -> None:
 
 
 def test_a_black_mask_is_refused(tmp_path: Path) -> None:
-    """An all-black mask, such as an inverted one, is refused instead of masking everything."""
+    """An entirely black mask (such as an inverted one) is refused."""
     Image.fromarray(np.zeros((90, 160), np.uint8)).save(tmp_path / "mask.png")
     with pytest.raises(InputError, match="entirely black; usable pixels must be white"):
         load_mask(tmp_path / "mask.png", 160, 90)
 
 
 def test_thermal_and_12_bit_photos_are_refused(shared_cases: Path) -> None:
-    """Photos of which 3 to 16 grey levels would be left are refused with the range that they use."""
+    """Photos that would keep only 3 to 16 grey levels are refused with the range they use."""
     folder = shared_cases / "input" / "12-sixteen-bits-few-used"
     for name in ("gray12in16.png", "thermal14.tif"):
         with pytest.raises(InputError, match=r"uses only values"):

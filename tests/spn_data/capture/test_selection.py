@@ -1,4 +1,4 @@
-"""Frame selection: sharper than the neighbours, far enough apart, and no gaps."""
+"""Tests of frame selection: sharper than the neighbours, far enough apart, and without gaps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WIDTH = 1280
 def measured(
     step: np.ndarray, sharpness: np.ndarray | None = None, *, fps: float = 10.0
 ) -> Measurements:
-    """Create N frames; the image shifts sideways by `step` (N,), in fractions of the width, before each."""
+    """Create N frames; before each, the image shifts sideways by `step` (N,) in fractions of the width."""
     n = len(step)
     motion = np.tile(np.eye(2, 3), (n, 1, 1))
     motion[:, 0, 2] = step
@@ -50,7 +50,7 @@ def measured(
 
 
 def texture(seed: int = 3, width: int = 900, height: int = 500) -> np.ndarray:
-    """Create grey noise of several scales: detail everywhere, as on grass or brick."""
+    """Create grey noise of several scales, with detail everywhere as on grass or brick."""
     rng = np.random.default_rng(seed)
     total = np.zeros((height, width))
     for cell, weight in ((2, 20), (6, 40), (20, 60)):
@@ -66,24 +66,24 @@ def images_of(grays: list[np.ndarray], *, fps: float = 10.0) -> list[GrayImage]:
 
 
 def test_steady_motion_gives_frames_at_the_wanted_spacing() -> None:
-    """At 1.25 % of the width per frame, one in eight is chosen; motion is in full-size pixels."""
+    """Steady motion gives even spacing, and motion is reported in full-size pixels."""
     choice = choose(measured(np.full(400, 0.0125)), DEFAULT)
     spacing = np.diff(np.flatnonzero(choice.chosen))
-    # Equally sharp frames: the first of the window, 0.65 of the wanted 0.1.
+    # Of equally sharp frames the first in the window is chosen, at 0.65 of the wanted 0.1.
     assert set(spacing[1:].tolist()) == {6}
     assert choice.motion_px[choice.chosen][2] == pytest.approx(6 * 0.0125 * WIDTH)
     assert choice.reason[choice.chosen][2] == "chosen: sharpest of 5 in its window"
 
 
 def test_random_sharpness_spaces_frames_as_wanted_on_average() -> None:
-    """The sharpest of a symmetric window is in its middle on average: 8 frames, within one."""
+    """Random sharpness gives the wanted spacing on average: 8 frames within 0.6."""
     rng = np.random.default_rng(1)
     choice = choose(measured(np.full(2000, 0.0125), 10 + rng.random(2000)), DEFAULT)
     assert np.diff(np.flatnonzero(choice.chosen)).mean() == pytest.approx(8, abs=0.6)
 
 
 def test_blurred_frames_are_avoided_and_say_so() -> None:
-    """Every fifth frame has half its neighbours' sharpness, and none of them is chosen."""
+    """Frames with half the sharpness of their neighbours are never chosen, and the reason says so."""
     sharpness = np.full(300, 10.0)
     sharpness[::5] = 5.0
     choice = choose(measured(np.full(300, 0.02), sharpness), DEFAULT)
@@ -104,7 +104,7 @@ def test_a_sharp_frame_a_little_further_is_preferred_to_a_blurred_one() -> None:
 
 
 def test_sharpness_is_judged_beside_neighbours_not_in_total() -> None:
-    """A stretch over lawn at a fifth of the walls' sharpness does not count as blurred."""
+    """A stretch with a fifth of the sharpness, such as lawn after walls, does not count as blurred."""
     sharpness = np.where(np.arange(300) < 150, 20.0, 4.0)
     data = measured(np.full(300, 0.0125), sharpness)
     relative = relative_sharpness(data, 1.0)
@@ -114,7 +114,7 @@ def test_sharpness_is_judged_beside_neighbours_not_in_total() -> None:
 
 
 def test_a_blurred_passage_still_gives_its_best_frames() -> None:
-    """Through two seconds of blur the spacing is kept, and the reason says why."""
+    """Two seconds of blur still give frames at the usual spacing, and the reason says why."""
     sharpness = np.full(200, 10.0)
     sharpness[100:108] = 3.0
     sharpness[104] = 4.0
@@ -129,7 +129,7 @@ def test_a_blurred_passage_still_gives_its_best_frames() -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_no_passage_is_ever_empty(seed: int) -> None:
-    """Chosen frames are never more than max_spacing apart, whatever the motion, blur, breaks and damage."""
+    """Gaps never exceed max_spacing, whatever the motion, blur, breaks and damage."""
     rng = np.random.default_rng(seed)
     n = 600
     step = rng.gamma(0.3, 0.03, n) * np.repeat(rng.integers(0, 2, n // 50), 50)
@@ -146,7 +146,7 @@ def test_no_passage_is_ever_empty(seed: int) -> None:
 
 
 def test_hovering_gives_few_frames() -> None:
-    """An image that only vibrates gives one frame in at most four seconds, not one per vibration."""
+    """An image that only vibrates gives one frame per 2.4 to 4 seconds."""
     rng = np.random.default_rng(2)
     place = rng.normal(0, 0.01, 600)
     choice = choose(measured(np.diff(place, prepend=place[0])), DEFAULT)
@@ -155,7 +155,7 @@ def test_hovering_gives_few_frames() -> None:
 
 
 def test_distance_by_telemetry_adds_frames_where_the_image_stands_still() -> None:
-    """Frames of a circle at 2 m/s are 3 m apart near the ground and 10 m from 100 m up."""
+    """Telemetry adds frames if the drone moves but the image does not: every 3 m near the ground."""
     data = measured(np.zeros(400))
     track = np.column_stack([0.2 * np.arange(400), np.zeros(400), np.full(400, 5.0)])
     low = choose(data, DEFAULT, position_m=track)
@@ -169,7 +169,7 @@ def test_distance_by_telemetry_adds_frames_where_the_image_stands_still() -> Non
 
 
 def test_motions_are_chained_in_order_of_time() -> None:
-    """Two shifts of 0.2, the second during a turn of the camera by 90 degrees, add up to 0.4 of the width."""
+    """Two shifts of 0.2, the second during a 90-degree turn of the camera, add up to 0.4 of the width."""
     frames = measured(np.array([0, 0.2, 0, 0, 0]))
     frames.motion[2] = [[0, -1, 0], [1, 0, 0]]
     frames.motion[3, 1, 2] = 0.2
@@ -180,7 +180,7 @@ def test_motions_are_chained_in_order_of_time() -> None:
 
 
 def test_a_break_of_the_image_gives_a_frame_after_it() -> None:
-    """After a cut the motion is unknown, so the next frame is due at once and has no motion."""
+    """After a cut the motion is unknown, so a frame is chosen soon after and has no motion."""
     data = measured(np.zeros(60))
     data.motion[30] = np.nan
     choice = choose(data, DEFAULT)
@@ -190,7 +190,7 @@ def test_a_break_of_the_image_gives_a_frame_after_it() -> None:
 
 
 def test_damaged_frames_are_taken_only_where_there_is_nothing_else() -> None:
-    """The frames after a lost packet rank below blurred ones."""
+    """Frames damaged by lost packets are chosen only if no other frames are available."""
     data = measured(np.full(200, 0.0125))
     data.damaged[50:53] = True
     data.damaged[100:160] = True
@@ -203,7 +203,7 @@ def test_damaged_frames_are_taken_only_where_there_is_nothing_else() -> None:
 
 
 def test_unreadable_frames_have_their_own_status() -> None:
-    """Unreadable frames keep their problem as the reason and are left out of the selection."""
+    """Unreadable frames keep their problem as the reason and are excluded from the selection."""
     data = measured(np.full(40, 0.0125))
     data.problem[7] = "it is truncated"
     data.sharpness[7] = np.nan
@@ -215,7 +215,7 @@ def test_unreadable_frames_have_their_own_status() -> None:
 
 @pytest.mark.parametrize("target", [20, 75, 300])
 def test_a_target_count_is_met_over_all_sources(target: int) -> None:
-    """Two flights together meet the target within 5 %, each with its share."""
+    """Two flights together meet the target count within 5 %, each in proportion to its length."""
     rng = np.random.default_rng(4)
     flights = [measured(rng.gamma(2, 0.006, n), 10 + rng.random(n)) for n in (750, 600)]
     choices = choose_all([(f, None) for f in flights], replace(DEFAULT, target_count=target))
@@ -225,14 +225,14 @@ def test_a_target_count_is_met_over_all_sources(target: int) -> None:
 
 
 def test_a_target_out_of_reach_keeps_the_shortest_spacing() -> None:
-    """A target of 10,000 frames per minute gives as many as the spacing of 0.3 s allows."""
+    """A target of 10,000 frames per minute is limited by the minimum spacing of 0.3 s."""
     data = measured(np.full(600, 0.02))
     [choice] = choose_all([(data, None)], replace(DEFAULT, target_count=10_000))
     assert choice.chosen.sum() == pytest.approx(600 / 3, abs=2)
 
 
 def test_a_video_with_little_motion_gives_enough_frames_and_leaves_the_other_as_it_is() -> None:
-    """A one-minute clip moves by a fifth of its width, the other flight by twelve widths."""
+    """A nearly static clip gets the minimum count without changing the choice for another flight."""
     still, moving = measured(np.full(600, 0.2 / 600)), measured(np.full(600, 0.02))
     assert choose(still, DEFAULT).chosen.sum() < DEFAULT.min_count - 5
     denser, same = choose_all([(still, None), (moving, None)], DEFAULT)
@@ -241,7 +241,7 @@ def test_a_video_with_little_motion_gives_enough_frames_and_leaves_the_other_as_
 
 
 def test_photos_are_all_chosen_but_repeats() -> None:
-    """A repeated photo from one place is skipped; the same view from elsewhere is not."""
+    """A repeated photo is skipped unless telemetry shows that it was taken from elsewhere."""
     data = measured(np.array([0, 0.2, 0.001, 0.2, 0.001]))
     data.problem[3], data.sharpness[3] = "it is truncated", np.nan
     data.motion[3] = np.eye(2, 3)
@@ -254,7 +254,7 @@ def test_photos_are_all_chosen_but_repeats() -> None:
 
 
 def test_sharpness_falls_with_blur_and_along_one_direction_alone() -> None:
-    """Sharpness decreases from sharp to motion blur of 7 px along x to Gaussian blur; noise counts little."""
+    """Motion blur along x and Gaussian blur reduce sharpness, as does detail in one direction only."""
     image = texture()
     sharp = image_sharpness(image)
     motion = image_sharpness(cv2.blur(image, (7, 1)))
@@ -270,7 +270,7 @@ def test_sharpness_falls_with_blur_and_along_one_direction_alone() -> None:
 
 
 def test_measured_motion_is_the_true_one() -> None:
-    """The motion of a shifted, rotated and scaled texture is recovered."""
+    """The measured motion of a shifted, rotated and scaled texture is the true one."""
     big = texture(width=1100, height=800)
     center = np.array([550, 400])
     state = [
@@ -292,13 +292,13 @@ def test_measured_motion_is_the_true_one() -> None:
     motion = measure(images_of(grays)).motion
     np.testing.assert_allclose(motion[1:4, 0, 2] * 640, [7, -4, 12], atol=0.3)
     np.testing.assert_allclose(motion[1:4, 1, 2] * 640, 0, atol=0.3)
-    # OpenCV turns counter-clockwise with y down: the sine is at the upper right.
+    # OpenCV rotates counter-clockwise with y down, so the upper right element is the sine.
     np.testing.assert_allclose(np.rad2deg(motion[4, 0, 1]), 3, atol=0.1)
     np.testing.assert_allclose(np.diag(motion[5, :, :2]), 1.05, atol=0.003)
 
 
 def test_motion_is_carried_past_a_frame_that_cannot_be_followed() -> None:
-    """The step after one white frame covers both shifts of 6 px; a new scene is a break."""
+    """The step after one white frame covers both shifts of 6 px; a new scene gives one break."""
     big = texture()
     grays = [np.ascontiguousarray(big[:360, 6 * i : 6 * i + 640]) for i in range(12)]
     grays[5] = np.full((360, 640), 255, np.uint8)
@@ -311,7 +311,7 @@ def test_motion_is_carried_past_a_frame_that_cannot_be_followed() -> None:
 
 
 def test_a_change_of_shape_breaks_the_motion() -> None:
-    """A change of aspect ratio is another camera: nothing is tracked across it."""
+    """A change of aspect ratio means another camera, so motion across it is unknown."""
     image = texture()
     motion = measure(images_of([image[:360, :640], image[:480, :640], image[:480, :640]])).motion
     assert np.isnan(motion[1]).all()
@@ -320,7 +320,7 @@ def test_a_change_of_shape_breaks_the_motion() -> None:
 
 @pytest.mark.parametrize("kind", ["black", "constant", "defocused"])
 def test_a_source_without_any_sharp_frame_is_refused(kind: str) -> None:
-    """Black, constant and defocused images are refused with one line."""
+    """Black, constant and defocused videos are refused with a one-line reason."""
     image = {
         "black": np.zeros((360, 640), np.uint8),
         "constant": np.full((360, 640), 140, np.uint8),
@@ -332,7 +332,7 @@ def test_a_source_without_any_sharp_frame_is_refused(kind: str) -> None:
 
 
 def test_a_source_with_some_sharp_frames_is_used() -> None:
-    """Two sharp frames of ten are enough; if none is readable, the first reason is reported."""
+    """Two sharp frames of ten are enough; if none is readable, the first problem is reported."""
     image = texture()[:360, :640]
     data = measure(images_of([cv2.GaussianBlur(image, (0, 0), 20)] * 8 + [image] * 2))
     check_usable(data, DEFAULT, "flight.mp4")

@@ -1,4 +1,4 @@
-"""Discovery in a folder: sequences, parts of one flight, their telemetry, and what is ignored."""
+"""Tests of input discovery: sequences, parts of one flight, their telemetry, and ignored files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_clip(path: Path, created: datetime | None, *, seconds: int = 20, width
 
 
 def test_an_sd_card_is_sorted_into_sequences(tmp_path: Path) -> None:
-    """Videos get their telemetry, photos are grouped by folder; other files are listed."""
+    """Videos are matched with telemetry, photos are grouped by folder, and ignored files are listed."""
     touch(
         tmp_path,
         *("DCIM/100MEDIA/DJI_0001.MP4", "DCIM/100MEDIA/DJI_0001.SRT", "DCIM/100MEDIA/DJI_0001.LRF"),
@@ -80,7 +80,7 @@ def test_an_sd_card_is_sorted_into_sequences(tmp_path: Path) -> None:
 
 
 def test_a_single_video_is_a_folder_of_one(tmp_path: Path) -> None:
-    """A single video is found with its telemetry and nothing else of its folder."""
+    """A path to one video gives that video and its telemetry, but no other file of the folder."""
     touch(tmp_path, "a.mp4", "a.srt", "A.CSV", "b.mp4", "b.srt")
     [source] = discover(tmp_path / "a.mp4").sources
     assert (source.sequence, names_of(source)) == ("a", ["a.mp4"])
@@ -88,7 +88,7 @@ def test_a_single_video_is_a_folder_of_one(tmp_path: Path) -> None:
 
 
 def test_gopro_chapters_are_one_sequence(tmp_path: Path) -> None:
-    """GX010042 is chapter 1 of recording 42; a missing chapter splits it; older names start with GOPR."""
+    """GoPro chapters of one recording (GX, GH or GOPR names) are joined; a missing chapter splits them."""
     touch(
         tmp_path,
         *("GX010042.MP4", "GX020042.MP4", "GX030042.MP4", "GX010043.MP4", "GX030043.MP4"),
@@ -111,29 +111,29 @@ START = datetime(2024, 5, 1, 10, 0, 0)
     [
         (20, 32, "DJI_0002.MP4", True),  # begins when the first ends
         (23, 32, "DJI_0002.MP4", True),  # the clock has whole seconds
-        (0, 32, "DJI_0002.MP4", True),  # all parts bear the start of the recording
+        (0, 32, "DJI_0002.MP4", True),  # all parts carry the start time of the recording
         (60, 32, "DJI_0002.MP4", False),  # another flight, later
         (20, 48, "DJI_0002.MP4", False),  # another size
         (20, 32, "DJI_0003.MP4", False),  # a number is missing
-        (20, 32, "DJI_0002_T.MP4", False),  # the thermal camera's
-        (None, 32, "DJI_0002.MP4", False),  # no clock, no proof
+        (20, 32, "DJI_0002_T.MP4", False),  # from the thermal camera
+        (None, 32, "DJI_0002.MP4", False),  # no creation time to compare
     ],
 )
 def test_dji_parts_are_joined_where_all_speaks_for_it(
     tmp_path: Path, later_s: int | None, width: int, second: str, joined: bool
 ) -> None:
-    """Number, file size, image size and creation time must all agree."""
+    """DJI parts are joined only if number, file size, image size and creation time all agree."""
     write_clip(tmp_path / "DJI_0001.MP4", START)
     later = None if later_s is None else START + timedelta(seconds=later_s)
     write_clip(tmp_path / second, later, width=width)
     found = discover(tmp_path, min_split_bytes=100).sources
     assert len(found) == (1 if joined else 2)
-    # Of usual size, a file was not cut by the camera; and nothing is decoded to find that out.
+    # Files far below the split size were not split by the camera, so they are not even decoded.
     assert len(discover(tmp_path).sources) == 2
 
 
 def test_new_dji_names_with_a_time_are_joined(tmp_path: Path) -> None:
-    """Names like DJI_20240501100000_0001_D are joined, with the telemetry of both parts in order."""
+    """DJI_20240501100000_0001_D names are joined, with the telemetry of both parts in order."""
     write_clip(tmp_path / "DJI_20240501100000_0001_D.MP4", START)
     write_clip(tmp_path / "DJI_20240501100020_0002_D.MP4", START + timedelta(seconds=20))
     touch(tmp_path, "DJI_20240501100020_0002_D.SRT", "DJI_20240501100000_0001_D.SRT")
@@ -143,7 +143,7 @@ def test_new_dji_names_with_a_time_are_joined(tmp_path: Path) -> None:
 
 
 def test_links_are_followed(tmp_path: Path) -> None:
-    """Linked files and folders are read under the names of the links, as in a data set under git-annex."""
+    """Linked files and folders keep the names of their links, as in a git-annex data set."""
     touch(tmp_path, "store/f3a9.mp4", "store/77c1.SRT", "other/b.mp4")
     (tmp_path / "video").mkdir()
     (tmp_path / "video" / "a.mp4").symlink_to("../store/f3a9.mp4")
@@ -156,7 +156,7 @@ def test_links_are_followed(tmp_path: Path) -> None:
 
 
 def test_links_are_read_once_and_loops_end(tmp_path: Path) -> None:
-    """A link to what is read already, a loop and a broken link are listed; nothing is counted twice."""
+    """Duplicate, looping and broken links are listed as ignored; nothing is counted twice."""
     touch(tmp_path, "a.mp4", "inner/b.mp4")
     (tmp_path / "again.mp4").symlink_to("a.mp4")
     (tmp_path / "gone.mp4").symlink_to("nowhere.mp4")
@@ -173,7 +173,7 @@ def test_links_are_read_once_and_loops_end(tmp_path: Path) -> None:
 
 
 def test_special_files_are_not_opened(tmp_path: Path) -> None:
-    """A pipe named .mp4 is ignored, as reading it would block."""
+    """A named pipe ending in .mp4 is ignored because reading it would block."""
     touch(tmp_path, "a.mp4")
     os.mkfifo(tmp_path / "b.mp4")
     found = discover(tmp_path)
@@ -182,7 +182,7 @@ def test_special_files_are_not_opened(tmp_path: Path) -> None:
 
 
 def test_names_of_sequences_are_safe_and_unique(tmp_path: Path) -> None:
-    """Sequence names are valid folder names for any file name, even on case-insensitive file systems."""
+    """Any file name gives a valid folder name that is unique on case-insensitive file systems."""
     touch(tmp_path, "Flug über Köln.mp4", "полёт.mp4", "a/x.mp4", "b/x.mp4", "c/X.mp4", "..x.mp4")
     names = [s.sequence for s in discover(tmp_path).sources]
     assert names == ["Flug-uber-Koln", "x", "b-x", "c-X", "sequence"]
@@ -193,7 +193,7 @@ def test_names_of_sequences_are_safe_and_unique(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
-    """A missing or empty folder, only other files or links, and another kind of file are refused."""
+    """Missing, empty and unusable inputs are refused with a one-line reason."""
     touch(tmp_path, "other/readme.txt", "other/flight.srt", "linked/notes.txt")
     (tmp_path / "empty").mkdir()
     (tmp_path / "linked" / "a.mp4").symlink_to("nowhere.mp4")
@@ -211,7 +211,7 @@ def test_a_folder_without_input_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_the_real_data_is_found(shared_data: Path) -> None:
-    """Three videos are found, and 172 photos in one sequence in order of their names."""
+    """The real data gives three videos, and 172 photos in one sequence ordered by name."""
     assert [s.sequence for s in discover(shared_data / "video").sources] == [
         "gopro-karma",
         "sample-5s",
@@ -223,7 +223,7 @@ def test_the_real_data_is_found(shared_data: Path) -> None:
 
 
 def test_photos_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    """Stills without times are counted 1, 2, ..., 10, and a copy follows its original."""
+    """Photos without times are sorted by number (1, 2, ..., 10), with a copy after its original."""
     for name in ("frame10.png", "frame2.png", "frame1 (1).png", "frame1.png"):
         Image.new("L", (8, 8)).save(tmp_path / name)
     (source,) = discover(tmp_path).sources
@@ -231,7 +231,7 @@ def test_photos_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
 
 
 def test_photos_are_in_the_order_of_their_times(tmp_path: Path) -> None:
-    """EXIF times come before names: counters of cameras start again."""
+    """EXIF times take precedence over names, because camera counters wrap around."""
     for second, name in enumerate(("DJI_0999.jpg", "DJI_0001.jpg", "DJI_0002.jpg")):
         exif = Image.Exif()
         exif[306] = f"2026:05:01 12:00:0{second}"

@@ -1,4 +1,4 @@
-"""Video files: properties, times and orientation of frames, and the effect of damage."""
+"""Tests of video files: properties, times and orientation of frames, and the effects of damage."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def write_video(
 
 
 def noise_images(count: int, width: int = 320, height: int = 240) -> list[np.ndarray]:
-    """Create images that compress badly, so that a file has bytes to damage."""
+    """Create images that compress badly, so that the file is long enough to damage."""
     rng = np.random.default_rng(5)
     return [rng.integers(0, 255, (height, width, 3), dtype=np.uint8) for _ in range(count)]
 
 
 def test_probe_reads_a_drone_video(shared_data: Path) -> None:
-    """Size, rate, clock and tracks of the GoPro Karma clip are those that the camera wrote."""
+    """Size, rate, clock and tracks of the GoPro Karma clip are those the camera wrote."""
     info = probe(shared_data / "video" / "gopro-karma.mp4")
     assert (info.width, info.height, info.rotation_deg, info.codec) == (854, 480, 0, "h264")
     assert info.frame_count == 362
@@ -83,7 +83,7 @@ def test_probe_reads_a_drone_video(shared_data: Path) -> None:
 
 
 def test_all_frames_of_a_drone_video_come_at_its_rate(shared_data: Path) -> None:
-    """Both decoders give 362 frames at 29.97 fps."""
+    """Both decoders agree, and all 362 frames are decoded at 29.97 fps."""
     path = shared_data / "video" / "gopro-karma.mp4"
     report = DecodeReport()
     gray = list(decode_gray(path, max_width=320, report=report))
@@ -99,12 +99,12 @@ def test_all_frames_of_a_drone_video_come_at_its_rate(shared_data: Path) -> None
     small = cv2.cvtColor(
         cv2.resize(full.image, (320, 180), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY
     )
-    # Full-range luma: the two agree to rounding of the colour conversion.
+    # Both are full-range luma and agree up to rounding in the colour conversion.
     assert np.abs(small.astype(int) - gray[7].image.astype(int)).mean() < 2
 
 
 def test_a_real_portrait_video_of_variable_rate_keeps_its_timestamps(shared_data: Path) -> None:
-    """One of 146 frames, with a timestamp before its predecessor's, is dropped and reported."""
+    """Variable timestamps are kept; one frame with a decreasing timestamp is dropped and reported."""
     path = shared_data / "video" / "sample-5s_h265.mp4"
     report = DecodeReport()
     times = np.array([f.time_s for f in decode_gray(path, max_width=160, report=report)])
@@ -112,13 +112,13 @@ def test_a_real_portrait_video_of_variable_rate_keeps_its_timestamps(shared_data
     assert probe(path).fps == pytest.approx(28.787, abs=1e-3)
     assert (len(times), report.out_of_order) == (145, 1)
     assert np.all(np.diff(times) > 0)
-    # Ticks of 1001/30000 s with holes, which index / rate would miss by up to 0.1 s.
+    # Timestamps are multiples of 1001/30000 s with gaps; index / rate would be up to 0.1 s off.
     assert np.diff(times).max() > 2.9 * 1001 / 30000
     assert report.notes == ["1 frames dropped because their timestamps did not increase"]
 
 
 def test_times_are_the_containers_and_begin_at_zero(tmp_path: Path) -> None:
-    """Times follow a variable frame rate, with 0 at a first timestamp of 40 ticks."""
+    """Times follow the container's variable rate, and the first timestamp becomes 0."""
     ticks = [40, 41, 43, 50, 51, 90]
     images = [marked_image()] * 6
     path = write_video(tmp_path / "v.mkv", images, ticks=ticks, time_base=Fraction(1, 1000))
@@ -144,7 +144,7 @@ def test_frames_stand_upright(
     size: tuple[int, int],
     corner: tuple[int, int] | None,
 ) -> None:
-    """The display matrix turns and mirrors both the full and the grey image; corner is (right, lower)."""
+    """The display matrix rotates and mirrors colour and grey images; corner is (right, lower)."""
     path = write_video(
         tmp_path / "v.mp4", [marked_image()] * 2, rotation_deg=rotation_deg, mirrored=mirrored
     )
@@ -169,7 +169,7 @@ def _bright_corner(image: np.ndarray) -> tuple[int, int]:
 
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv422p10le", "yuv444p"])
 def test_other_pixel_formats_give_8_bits(tmp_path: Path, pixel_format: str) -> None:
-    """10 bits and other chroma come out as the same colours, and as grey at reduced size."""
+    """10-bit and other chroma formats give the same 8-bit colours, and grey at reduced size."""
     path = write_video(tmp_path / "v.mkv", [marked_image()] * 2, pixel_format=pixel_format)
     frame = next(decode(path))
     gray = next(decode_gray(path, max_width=32))
@@ -182,7 +182,7 @@ def test_other_pixel_formats_give_8_bits(tmp_path: Path, pixel_format: str) -> N
 
 
 def test_colours_of_bt709_are_kept(tmp_path: Path) -> None:
-    """HD video is BT.709, tagged so or not; read as BT.601 its red would be off by 20 levels."""
+    """HD video is decoded as BT.709; decoding it as BT.601 would change red by 20 levels."""
     image = np.full((720, 64, 3), (20, 40, 200), np.uint8)
     path = write_video(tmp_path / "v.mp4", [image] * 2, bt709=True)
     frame = next(decode(path))
@@ -191,7 +191,7 @@ def test_colours_of_bt709_are_kept(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
-    """48 pixels of 4:3 become 64, and a note says so."""
+    """48 pixels of aspect 4:3 are resampled to 64, and a note says so."""
     image = marked_image(48, 48)
     path = write_video(tmp_path / "v.mp4", [image] * 2, pixel_aspect=Fraction(4, 3))
     info = probe(path)
@@ -206,7 +206,7 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
 
 
 def test_a_change_of_size_within_a_file_shows_in_the_frames(tmp_path: Path) -> None:
-    """Frames of concatenated transport streams, as some recorders write them, keep their own sizes."""
+    """Frames of concatenated transport streams, as some recorders write, keep their own sizes."""
     first = write_video(tmp_path / "a.ts", [marked_image(64, 48)] * 5)
     second = write_video(tmp_path / "b.ts", [marked_image(96, 48)] * 5, ticks=list(range(5, 10)))
     path = tmp_path / "both.ts"
@@ -218,7 +218,7 @@ def test_a_change_of_size_within_a_file_shows_in_the_frames(tmp_path: Path) -> N
 
 
 def test_only_wanted_frames_are_converted(tmp_path: Path) -> None:
-    """Unwanted frames have no image, and decoding ends after the last wanted one."""
+    """Only wanted frames have an image, and decoding stops after the last of them."""
     path = write_video(tmp_path / "v.mp4", [marked_image()] * 8)
     frames = list(decode(path, wanted={2, 4}))
     assert [f.index for f in frames] == [0, 1, 2, 3, 4]
@@ -226,7 +226,7 @@ def test_only_wanted_frames_are_converted(tmp_path: Path) -> None:
 
 
 def test_damaged_packets_are_passed_over_and_told(tmp_path: Path) -> None:
-    """Zeros in the stream cost some frames; those up to the next key frame are marked as damaged."""
+    """Zeroed bytes cost some frames; those up to the next key frame are marked as damaged."""
     path = write_video(tmp_path / "v.mp4", noise_images(40), gop=10)
     data = bytearray(path.read_bytes())
     begin = data.find(b"mdat") + (len(data) * 2) // 5
@@ -247,7 +247,7 @@ def test_damaged_packets_are_passed_over_and_told(tmp_path: Path) -> None:
 
 
 def test_a_video_that_breaks_off_gives_what_it_has(tmp_path: Path) -> None:
-    """If half the frames of a file with its index in front are cut off, the rest is reported missing."""
+    """A file cut in half gives its remaining frames and reports how many are missing."""
     options = {"movflags": "faststart"}
     path = write_video(tmp_path / "v.mp4", noise_images(40), container_options=options)
     data = path.read_bytes()
@@ -271,7 +271,7 @@ def _audio_only(path: Path) -> None:
 
 
 def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
-    """An empty, text, playlist, truncated, audio-only, folder or missing file gets its own message."""
+    """Each kind of unusable file (empty, text, truncated, audio only, ...) gets its own one-line message."""
     real = write_video(tmp_path / "real.mp4", noise_images(3))
     content = real.read_bytes()
     (tmp_path / "empty.mp4").touch()

@@ -1,4 +1,4 @@
-"""Bundle adjustment of surveys that mapping left bent, with exact truth."""
+"""Tests of bundle adjustment of bent surveys, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.worlds.survey_world import HEIGHT_M, error_m, survey
 
 @pytest.fixture(scope="module")
 def unbent_m() -> float:
-    """What noise alone leaves where adjustment starts at the truth."""
+    """Return the position error due to noise alone, adjusting from the true model."""
     model, centers = survey(0.0)
     assert error_m(model, centers) < 1e-9
     adjust(model, refine_principal_point=False, threads=2)
@@ -23,7 +23,7 @@ def unbent_m() -> float:
 def test_a_bent_survey_is_straightened_as_far_as_noise_lets_it(
     unbent_m: float, sag_m: float
 ) -> None:
-    """It hardly decreases the cost, and few right measurements of points that come along are dropped."""
+    """A bent survey is straightened to the noise level, and few correct observations are dropped."""
     model, centers = survey(sag_m)
     before = error_m(model, centers)
     assert before > 0.5
@@ -32,6 +32,7 @@ def test_a_bent_survey_is_straightened_as_far_as_noise_lets_it(
 
 
 def test_wrong_measurements_are_found_in_a_bent_survey(unbent_m: float) -> None:
+    """Most of 300 wrong observations in a bent survey are dropped."""
     model, centers = survey(3.0, wrong=300)
     dropped = adjust(model, refine_principal_point=False, threads=2)
     assert 270 < dropped < 600
@@ -41,7 +42,7 @@ def test_wrong_measurements_are_found_in_a_bent_survey(unbent_m: float) -> None:
 def test_a_step_that_leaves_all_behind_the_cameras_is_not_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What lies there costs nothing: an undamped step has ended there, at no cost at all."""
+    """A step that puts all points behind the cameras (at zero cost) is rejected and damped."""
     adjustment, radii = pycolmap.bundle_adjustment, []
 
     def overshoot_first(

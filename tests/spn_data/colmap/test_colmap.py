@@ -1,4 +1,4 @@
-"""The COLMAP adapter on data that pycolmap synthesises with exact truth, without any image."""
+"""Tests of the COLMAP adapter on synthetic pycolmap data with exact ground truth and no images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from spn_data.matching.features import Features
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
-    """Folder with database.db of 20 images and 300 points, and the truth."""
+    """Return a folder with database.db of 20 images and 300 points, and the true model."""
     folder = tmp_path_factory.mktemp("synthetic")
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
@@ -55,7 +55,7 @@ def job(folder: Path, target: Path, **options: object) -> MappingJob:
 
 @pytest.fixture(scope="module")
 def mapped(synthetic: tuple[Path, pycolmap.Reconstruction]) -> Path:
-    """Folder of the model that the mapper made of it, with snapshots beside it."""
+    """Return the model that the mapper reconstructs from it; snapshots are in a sibling folder."""
     folder, _ = synthetic
     (model,) = run_mapping(
         job(folder, folder / "mapped", snapshot_every=5),
@@ -68,6 +68,7 @@ def mapped(synthetic: tuple[Path, pycolmap.Reconstruction]) -> Path:
 def test_mapping_finds_the_true_poses(
     synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path
 ) -> None:
+    """After alignment, the mapped poses equal the true ones."""
     true = scene_of(synthetic[1])
     found = read_scene(mapped)
     assert found.names == true.names
@@ -80,6 +81,7 @@ def test_mapping_finds_the_true_poses(
 def test_mapping_tells_how_many_images_are_registered(
     synthetic: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:
+    """Mapping reports the number of registered images as it grows."""
     folder, _ = synthetic
     heard: list[int] = []
     run_mapping(job(folder, tmp_path), log=tmp_path / "log", progress=heard.append)
@@ -89,6 +91,7 @@ def test_mapping_tells_how_many_images_are_registered(
 def test_mapping_goes_on_from_a_snapshot(
     synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
 ) -> None:
+    """Mapping resumes from a snapshot and registers all images."""
     folder, _ = synthetic
     first = min((folder / "mapped" / "snapshots").iterdir(), key=lambda p: p.name)
     assert 2 <= count_registered(first) < 20
@@ -101,6 +104,7 @@ def test_mapping_goes_on_from_a_snapshot(
 
 
 def test_a_half_written_snapshot_is_passed_over(mapped: Path, tmp_path: Path) -> None:
+    """The latest complete snapshot is used; truncated ones are ignored."""
     snapshots = mapped.parent.parent / "snapshots"
     newest = max(snapshots.iterdir(), key=lambda p: p.name)
     assert latest_snapshot(snapshots) == newest
@@ -115,13 +119,14 @@ def test_a_half_written_snapshot_is_passed_over(mapped: Path, tmp_path: Path) ->
 
 
 def test_a_death_of_the_mapper_is_told_with_the_end_of_its_log(tmp_path: Path) -> None:
+    """A mapper process that fails is reported as a stage error."""
     (tmp_path / "database.db").write_text("no database")
     with pytest.raises(StageError, match=r"mapping (ended with code|was killed by)"):
         run_mapping(job(tmp_path, tmp_path), log=tmp_path / "log", progress=lambda _: None)
 
 
 def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -> None:
-    """First those that two pairs have, then the strongest; of images with few of them, all."""
+    """Thinning keeps features matched in two pairs first, then the strongest matched ones."""
     rng = np.random.default_rng(0)
     camera = Camera.from_horizontal_fov(800, 600, 70)
     matches = {
@@ -137,12 +142,12 @@ def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -
         for ids, pairs in matches.items():
             pairs = pairs.astype(np.uint32)
             database.write_pair(VerifiedPair(ids, pairs, pairs, 3, None, np.eye(3), None))
-        for _ in range(2):  # the second replaces the first
+        for _ in range(2):  # the second call replaces the first file
             database.write_thinned(tmp_path / "thin.db", features=100)
         whole = {image.name: database.read_keypoints(image.name) for image in images}
     with MapDatabase.open(tmp_path / "thin.db") as thin:
         assert thin.ids == {"1.jpg": 1, "2.jpg": 2, "3.jpg": 3}
-        rows = {}  # of the features kept, in the whole
+        rows = {}  # rows of the kept features in the full database
         for name, keypoints in whole.items():
             few = thin.read_keypoints(name)
             assert len(few) == 100
@@ -157,7 +162,7 @@ def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -
         assert kept("2.jpg", "3.jpg") >= {(i, j) for i, j in matches[2, 3].tolist() if i in b}
         twice = sorted(set(b.tolist()) & set(range(480, 500)))
         once = sorted(set(b.tolist()) - set(twice))
-        alone = sorted(set(range(480, 500)) - set(twice))  # of the weak pair
+        alone = sorted(set(range(480, 500)) - set(twice))  # matched only in the weak pair
         of_second = [*twice, *sorted([*once, *alone])[: 100 - len(twice)]]
         of_first = sorted(a.tolist())[:100]
         strong = np.isin(a, of_first) & np.isin(b, of_second)
@@ -168,10 +173,10 @@ def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -
 def test_a_database_without_an_image_has_all_of_the_others(
     synthetic: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:
-    """Neither features nor pairs of that one, which can get others; bytes of all else as they were."""
+    """Removing an image drops only its features and pairs; new features can be written for it."""
     with MapDatabase.open(synthetic[0] / "database.db") as whole:
         bare, *others = sorted(whole.ids)
-        for _ in range(2):  # the second replaces the first
+        for _ in range(2):  # the second call replaces the first file
             whole.write_without(tmp_path / "bare.db", [bare])
         expected = {k: n for k, n in whole.verified_pairs().items() if bare not in k}
         with MapDatabase.open(tmp_path / "bare.db") as made:
@@ -194,6 +199,7 @@ def test_a_database_without_an_image_has_all_of_the_others(
 def test_poses_from_a_thinned_database_get_the_points_of_all_matches(
     synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
 ) -> None:
+    """Triangulating with all matches restores the tracks without moving the poses."""
     folder, _ = synthetic
     with MapDatabase.open(folder / "database.db") as database:
         database.write_thinned(tmp_path / "database.db", features=200)
@@ -211,6 +217,7 @@ def test_poses_from_a_thinned_database_get_the_points_of_all_matches(
 def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
     synthetic: tuple[Path, pycolmap.Reconstruction], mapped: Path, tmp_path: Path
 ) -> None:
+    """Refining a perfect model as OPENCV keeps its reprojection error and distortion near zero."""
     done = refine(
         mapped,
         tmp_path / "refined",
@@ -233,10 +240,10 @@ def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
 def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
     mapped: Path, tmp_path: Path
 ) -> None:
-    """A point 81 degrees off the axis, measured in the image's middle, is dropped before refinement."""
+    """A point 81 degrees off axis but measured mid-image is dropped before refinement."""
     model = pycolmap.Reconstruction(mapped)
     image = model.images[model.reg_image_ids()[0]]
-    # Beside the camera, where those on the other side of the scene see it.
+    # A point next to the camera, visible from cameras on the far side of the scene.
     beside = image.cam_from_world().inverse() * np.array([6.3, 0.0, 1.0])
     track = pycolmap.Track()
     for other_id in model.reg_image_ids():
@@ -248,7 +255,7 @@ def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
         elif pixel is None or not ((pixel > 0) & (pixel < [camera.width, camera.height])).all():
             continue
         k = next(k for k, p in enumerate(other.points2D) if p.has_point3D())
-        model.delete_observation(other_id, k)  # makes room for another measurement
+        model.delete_observation(other_id, k)  # frees a keypoint for the new measurement
         other.points2D[k].xy = pixel
         track.add_element(other_id, k)
     assert track.length() >= 3
@@ -273,6 +280,7 @@ def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
 
 @pytest.mark.parametrize("model", ["RADIAL", "OPENCV"])
 def test_an_upgraded_camera_projects_as_before(model: str) -> None:
+    """Upgrading a SIMPLE_RADIAL camera to a richer model keeps its projection."""
     native = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=800, height=600, params=[500.0, 401, 299, -0.05]
     )
@@ -284,6 +292,7 @@ def test_an_upgraded_camera_projects_as_before(model: str) -> None:
 
 
 def test_a_camera_that_is_fuller_already_stays_as_it_is() -> None:
+    """An OPENCV camera is not reduced to RADIAL."""
     params = [5.0, 5, 4, 3, 0.1, 0, 0, 0]
     native = pycolmap.Camera(model="OPENCV", width=8, height=6, params=params)
     upgrade_camera(native, "RADIAL")
@@ -292,7 +301,7 @@ def test_a_camera_that_is_fuller_already_stays_as_it_is() -> None:
 
 
 def test_residuals_are_projected_minus_measured(mapped: Path) -> None:
-    """Against pycolmap's own projection of its own points."""
+    """Residuals equal pycolmap's own projection minus the measured keypoints."""
     scene, seen, _ = read_map(mapped)
     native = pycolmap.Reconstruction(str(mapped))
     image = next(
@@ -307,6 +316,7 @@ def test_residuals_are_projected_minus_measured(mapped: Path) -> None:
 def test_a_transformed_model_is_the_model_seen_from_the_other_frame(
     mapped: Path, tmp_path: Path
 ) -> None:
+    """A similarity moves poses and points together and keeps residuals small."""
     rotation = rotations_from_vectors(np.array([[0.3, -1.2, 2.0]]))[0]
     world_from_model = Similarity(2.5, rotation, np.array([100.0, -50.0, 7.0]))
     write_transformed(mapped, tmp_path / "world", world_from_model)
@@ -320,6 +330,7 @@ def test_a_transformed_model_is_the_model_seen_from_the_other_frame(
 
 
 def test_poses_agree_with_pycolmaps_own_centres(mapped: Path) -> None:
+    """Camera centres equal pycolmap's projection centres."""
     scene = read_scene(mapped)
     native = pycolmap.Reconstruction(str(mapped))
     centers = {
@@ -330,6 +341,7 @@ def test_poses_agree_with_pycolmaps_own_centres(mapped: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["missing", "truncated"])
 def test_a_damaged_model_is_a_format_error(mapped: Path, tmp_path: Path, damage: str) -> None:
+    """A model with a missing or truncated images.bin raises FormatError."""
     for file in mapped.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     if damage == "missing":
@@ -350,6 +362,7 @@ def features(n: int) -> Features:
 
 
 def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
+    """Images, features, pairs and cameras written to the database are read back unchanged."""
     camera = Camera.from_horizontal_fov(800, 600, 70, (0.0,))
     images = [
         DatabaseImage("a/1.jpg", "a"),
@@ -365,7 +378,7 @@ def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
             VerifiedPair((1, 2), matches, matches[:1], 2, np.eye(3), np.eye(3), None)
         )
     with MapDatabase.open(tmp_path / "db") as database:
-        # What is there keeps its id; what is new comes behind it, with a camera of its own.
+        # Existing images keep their ids; new ones are appended with their own camera.
         database.add_images(images, {"a": (camera, True), "b": (camera, False)})
         database.write_pair(VerifiedPair((1, 3), none, none, 1, None, None, None))
         assert database.ids == {"a/1.jpg": 1, "a/2.jpg": 2, "b/1.jpg": 3}
@@ -383,6 +396,7 @@ def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_no_database_is_a_format_error(tmp_path: Path) -> None:
+    """A text file opened as a database raises FormatError."""
     (tmp_path / "db").write_text("text")
     with (
         pytest.raises(FormatError, match="not a COLMAP database"),
@@ -392,6 +406,7 @@ def test_a_file_that_is_no_database_is_a_format_error(tmp_path: Path) -> None:
 
 
 def test_poses_survive_the_way_through_colmaps_convention() -> None:
+    """Poses survive the round trip through COLMAP's cam_from_world."""
     rng = np.random.default_rng(0)
     poses = Poses.from_rotations(
         rng.normal(size=(20, 3)), rotations_from_vectors(rng.normal(size=(20, 3)))

@@ -1,4 +1,4 @@
-"""Bends that the positions of a flight take out of a survey, with exact truth."""
+"""Tests of removing doming from surveys by camera positions, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _LINES = 12  # 480 images
 
 @pytest.fixture(autouse=True)
 def _enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand images would take a minute."""
+    """Lower the required number of positions, because a thousand images would take a minute."""
     monkeypatch.setattr(doming, "_MIN_POSITIONS", 400)
 
 
 def fixes(centers: np.ndarray, sigma_m: float = 0.8) -> dict[str, list[float]]:
-    """Positions by name, turned and moved as a model's frame is to the world's, with noise."""
+    """Return noisy positions by name, rotated and shifted as the world is against the model."""
     rng = np.random.default_rng(1)
     noisy = centers + rng.normal(0, sigma_m, centers.shape)
     turned = noisy @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + [300, 200, 50]
@@ -39,7 +39,7 @@ def reprojection_px(model: pycolmap.Reconstruction) -> float:
 
 
 def test_a_bend_is_taken_out_of_cameras_and_points_alike() -> None:
-    """To decimetres, though positions are off by metres; what fitted still does, as parts move rigidly."""
+    """Doming is reduced from metres to decimetres, and reprojection errors hardly change."""
     model, centers = survey(15.0, lines=_LINES)
     before_m, before_px = error_m(model, centers), reprojection_px(model)
     bend_m = correct_doming(model, fixes(centers))
@@ -50,6 +50,7 @@ def test_a_bend_is_taken_out_of_cameras_and_points_alike() -> None:
 
 
 def test_positions_that_are_wrong_do_not_bend_it() -> None:
+    """Gross errors in 5 % of the positions do not disturb the correction."""
     model, centers = survey(15.0, lines=_LINES)
     positions = fixes(centers)
     for name in list(positions)[::20]:
@@ -70,6 +71,7 @@ def test_positions_that_are_wrong_do_not_bend_it() -> None:
 def test_a_model_is_left_as_it_is_where(
     sag_m: float, lines: int, given: int, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A model is unchanged if straight, or if positions are too noisy, too few or in one line."""
     if lines == 1:
         monkeypatch.setattr(doming, "_MIN_POSITIONS", 30)
     model, centers = survey(sag_m, lines=lines)

@@ -1,4 +1,4 @@
-"""The incremental mapper on synthetic images, as COLMAP runs it and as large surveys are mapped."""
+"""Tests of the incremental mapper on synthetic images, in COLMAP's mode and the large-survey mode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Events = list[dict[str, int]]
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
-    """40 images of 600 points, measured with 0.5 pixels of noise, and the true model."""
+    """Return 40 images of 600 points, measured with 0.5 px noise, and the true model."""
     path = tmp_path_factory.mktemp("synthetic") / "database.db"
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
@@ -39,7 +39,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.R
 
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> Events:
-    """What the parent would be told."""
+    """Record the events sent to the parent process."""
     events: Events = []
     monkeypatch.setattr(child, "send", events.append)
     return events
@@ -47,7 +47,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Events:
 
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes at which models are adjusted, where 20 images are a large survey."""
+    """Treat 20 images as a large survey, and record the model sizes at each adjustment."""
     monkeypatch.setattr(incremental, "_MAX_IMAGES_COLMAP", 20)
     sizes = []
     adjust_long_tracks: Callable[..., None] = incremental.adjust_long_tracks
@@ -75,7 +75,7 @@ def job(database: Path, folder: Path, start_from: Path | None = None) -> Mapping
 
 
 def position_error(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> float:
-    """Median after the best similarity, as a share of the cameras' spread."""
+    """Return the median position error after alignment, relative to the spread of the cameras."""
     found, right = scene_of(model), scene_of(truth)
     row = {name: k for k, name in enumerate(right.names)}
     true = right.poses.centers[[row[name] for name in found.names]]
@@ -86,7 +86,7 @@ def position_error(model: pycolmap.Reconstruction, truth: pycolmap.Reconstructio
 def test_a_large_survey_is_adjusted_as_it_grows_and_comes_out_as_right(
     database: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, told: Events, large: list[int]
 ) -> None:
-    """From the size that COLMAP solves inexactly, each time that it has grown by a third, and at its end."""
+    """A large survey is adjusted at each growth by a third and at the end, and its poses are right."""
     path, truth = database
     models = incremental.map_incrementally(job(path, tmp_path))
     assert [m.num_reg_images() for m in models.values()] == [_IMAGES]
@@ -101,6 +101,7 @@ def test_up_to_a_thousand_images_colmap_adjusts_by_itself(
     told: Events,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Small surveys never use the adjustment meant for large ones."""
     path, truth = database
     monkeypatch.setattr(
         incremental, "adjust_long_tracks", lambda *_, **__: pytest.fail("not its own")
@@ -117,6 +118,7 @@ def test_an_interrupted_large_survey_goes_on_from_its_snapshot(
     large: list[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """An interrupted large survey resumes from its snapshot and is completed."""
     path, truth = database
 
     def send(event: dict[str, int]) -> None:

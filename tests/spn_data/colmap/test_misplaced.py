@@ -1,4 +1,4 @@
-"""Images that lie where they show next to nothing of the model are taken out, and no others."""
+"""Tests that images whose pose shows hardly any of their matched points are removed, and no others."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import read_scene, write_native
 
-_LEFT = 12  # points that agree with a wrong pose by chance
+_LEFT = 12  # observations that agree with a wrong pose by chance
 
 
 @pytest.fixture(scope="module")
 def synthetic(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[pycolmap.Reconstruction, dict[tuple[str, str], int]]:
-    """The true model of 20 images and 300 points, and how many matches each pair has."""
+    """Return the true model of 20 images and 300 points, and the number of matches per pair."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=20, num_points3D=300
@@ -34,6 +34,7 @@ def synthetic(
 def test_a_right_model_keeps_all_its_images(
     synthetic: tuple[pycolmap.Reconstruction, dict[tuple[str, str], int]], tmp_path: Path
 ) -> None:
+    """No image of a correct model is removed, and no model is written."""
     truth, matches = synthetic
     write_native(truth, tmp_path / "right")
     assert drop_misplaced(tmp_path / "right", tmp_path / "placed", matches) == []
@@ -43,7 +44,7 @@ def test_a_right_model_keeps_all_its_images(
 def test_images_that_show_a_dozen_of_the_points_they_match_are_taken_out(
     synthetic: tuple[pycolmap.Reconstruction, dict[tuple[str, str], int]], tmp_path: Path
 ) -> None:
-    """The others stay just where they are, with their points."""
+    """Images with only a dozen observations are removed; all other poses and points are unchanged."""
     truth, matches = synthetic
     wrong = pycolmap.Reconstruction(truth)
     names = []
@@ -65,6 +66,7 @@ def test_images_that_show_a_dozen_of_the_points_they_match_are_taken_out(
 def test_an_image_that_matches_little_may_show_little(
     synthetic: tuple[pycolmap.Reconstruction, dict[tuple[str, str], int]], tmp_path: Path
 ) -> None:
+    """An image with few observations is kept if it also has few matches."""
     truth, matches = synthetic
     model = pycolmap.Reconstruction(truth)
     image = model.images[model.reg_image_ids()[0]]
