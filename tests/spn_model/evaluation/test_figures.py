@@ -1,4 +1,4 @@
-"""Figures of an evaluation: what is drawn is where the numbers say, and nothing is left out in silence."""
+"""Tests of evaluation figures: marks are at the correct positions and omissions are stated."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def shifted(by, method="net", covariance=None):
 
 
 def parsed(figure):
-    """The tree; every number in it is one."""
+    """Return the parsed SVG tree, after checking that it has no NaN or infinity."""
     assert not re.search(r"\b(nan|inf)\b", figure, re.IGNORECASE)
     return ElementTree.fromstring(figure)
 
@@ -48,7 +48,7 @@ def texts(tree):
 
 
 def circles(tree, colour):
-    """Centres (N, 2) of the circles of one colour that carry a title."""
+    """Return centres, shape (N, 2), of the circles of one colour that carry a title."""
     found = [
         (float(c.get("cx")), float(c.get("cy")))
         for group in tree.iter(f"{SVG}g")
@@ -60,7 +60,7 @@ def circles(tree, colour):
 
 
 def test_a_map_has_east_to_the_right_and_north_upwards():
-    """From above, and obliquely: what is higher is higher on the page."""
+    """The top view has east right and north up; the oblique view shows greater heights higher up."""
     np.testing.assert_allclose(view_matrix(-90, 90), [[1, 0, 0], [0, 1, 0]], atol=1e-12)
     oblique = view_matrix(-60, 25)
     np.testing.assert_allclose(oblique @ oblique.T, np.eye(2), atol=1e-12)
@@ -70,7 +70,7 @@ def test_a_map_has_east_to_the_right_and_north_upwards():
 
 
 def test_estimates_are_drawn_to_scale():
-    """From above, frames 2 m apart in east stay equally far apart on the page, and shifts keep the scale."""
+    """In the top view, equally spaced frames stay equally spaced, and offsets are drawn to scale."""
     tree = parsed(figures.trajectories(TRAINING, frames(), [shifted([0, 4, 0])]))
     drawn = circles(tree, svg.COLOURS[0])
     assert len(drawn) == 8  # four frames in two views
@@ -85,7 +85,7 @@ def test_estimates_are_drawn_to_scale():
 
 
 def test_what_is_not_drawn_is_counted():
-    """An estimate far outside the place and one without a pose are named in the legend."""
+    """The legend counts estimates outside the plot and frames without a pose."""
     found = shifted([0, 0, 0])
     centers = found.poses.centers.copy()
     centers[0], centers[1] = 1e6, np.nan
@@ -110,7 +110,7 @@ def test_names_cannot_break_out_of_a_figure():
 
 
 def test_one_frame_can_be_drawn():
-    """A group of a single frame, at a training pose, with a perfect estimate."""
+    """A single frame at a training pose with a perfect estimate can be drawn."""
     true = TRAINING[:1]
     perfect = Estimates("net", true, np.eye(6)[None])
     training = TRAINING[:1]
@@ -125,7 +125,7 @@ def test_one_frame_can_be_drawn():
 
 
 def test_nothing_with_a_pose_can_be_drawn():
-    """A method that found no pose at all has empty panels that say so."""
+    """A method without any pose has empty panels that say so."""
     lost = Estimates("lost", Poses(np.full((4, 3), np.nan), np.full((4, 4), np.nan)))
     one = evaluate(lost, frames())
     assert "lost (4 without a pose)" in texts(
@@ -138,7 +138,7 @@ def test_nothing_with_a_pose_can_be_drawn():
 
 
 def test_very_many_frames_are_thinned():
-    """5,000 frames and training cameras stay a figure that a browser shows, and the legend says so."""
+    """Of 5,000 frames and training cameras only a subset is drawn, and the legend says so."""
     rng = np.random.default_rng(0)
     true = level(rng.uniform(0, 10, (5000, 3)))
     some = evaluation_frames(
@@ -161,7 +161,7 @@ def bars(tree, colour):
 
 
 def test_bars_are_as_high_as_their_counts():
-    """Errors 1, 1, 1 and 2 m: one bar thrice as high as the other, none beyond the scale."""
+    """Errors of 1, 1, 1 and 2 m give one bar three times as high as the other."""
     centers = TRUE.centers + np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 2]])
     one = evaluate(Estimates("net", Poses(centers, TRUE.quats_wxyz)), frames())
     tree = parsed(figures.histograms([one]))
@@ -172,7 +172,7 @@ def test_bars_are_as_high_as_their_counts():
 
 
 def test_errors_beyond_the_scale_have_their_own_bar():
-    """Of 100 frames one is 1 km off: the scale stays with the others, the bar beyond says one."""
+    """One outlier of 1 km among 100 frames does not stretch the scale and gets an overflow bar."""
     true = level(np.tile([[2.0, 2, 5]], (100, 1)))
     centers = true.centers + np.linspace(0.1, 2, 100)[:, None] * [1, 0, 0]
     centers[50, 0] = 1000
@@ -186,7 +186,7 @@ def test_errors_beyond_the_scale_have_their_own_bar():
 
 
 def test_the_oracle_lies_on_the_dashed_line():
-    """A method that is wrong by the distance to the nearest training frame has its dots on that line."""
+    """Errors equal to the distance to the nearest training frame are drawn on the dashed line."""
     distance = np.array([0.25, 0.75, 1.25, 2.5, 5.0])
     true = level(np.stack([-distance, 0 * distance, 0 * distance], axis=1))
     nearest = Estimates("oracle", level(np.zeros((5, 3))))
@@ -205,7 +205,7 @@ def test_the_oracle_lies_on_the_dashed_line():
 
 
 def test_right_covariances_are_drawn_on_the_diagonal():
-    """Dots stand where expected and observed shares say, at 0.05 to 0.95."""
+    """Equal expected and observed shares, from 0.05 to 0.95, are drawn on the diagonal."""
     one = evaluate(shifted([0.1, 0, 0], covariance=np.tile(np.eye(6), (4, 1, 1))), frames())
     right = replace(one.calibration, observed=one.calibration.expected)
     tree = parsed(figures.calibration([replace(one, calibration=right)]))
@@ -221,7 +221,7 @@ def test_right_covariances_are_drawn_on_the_diagonal():
 
 
 def test_calibration_needs_a_covariance():
-    """A figure of nothing is refused."""
+    """A calibration figure without any covariance raises ValueError."""
     with pytest.raises(ValueError, match="no method states a covariance"):
         figures.calibration([evaluate(shifted([1, 0, 0]), frames())])
 
@@ -235,5 +235,5 @@ def test_calibration_needs_a_covariance():
     ],
 )
 def test_ticks_are_round(low, high, wanted):
-    """Multiples of 1, 2 or 5 within the range, both ends included."""
+    """Ticks are multiples of 1, 2 or 5 (times a power of ten) within the range, ends included."""
     assert svg.ticks(low, high) == pytest.approx(wanted)

@@ -1,4 +1,4 @@
-"""Errors of estimated poses, on poses whose errors are known exactly."""
+"""Tests of error metrics, on poses with exactly known errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from spn_model.evaluation.tables import header, paper_rows, rows, write_errors, 
 
 
 def poses(centers, vectors=None):
-    """Poses at centres, with cam_from_world rotations from rotation vectors (none: the identity)."""
+    """Return poses at centres with rotations from rotation vectors (default: identity)."""
     centers = np.asarray(centers, float)
     vectors = np.zeros_like(centers) if vectors is None else np.asarray(vectors, float)
     return Poses.from_rotations(centers, rotations_from_vectors(vectors))
@@ -52,14 +52,14 @@ def frames_of(true, strata=None, nearest_m=None):
 
 
 def without_pose(found, row):
-    """The same estimates, with none for one frame."""
+    """Return the same estimates, with the pose of one frame unknown."""
     centers = found.centers.copy()
     centers[row] = np.nan
     return Poses(centers, found.quats_wxyz)
 
 
 def test_figures_of_four_known_errors():
-    """Errors of 1, 2, 3 and 6 m east and 0 to 30 deg give the figures that one computes by hand."""
+    """Errors of 1, 2, 3 and 6 m east and 0 to 30 deg give the statistics computed by hand."""
     true = poses(np.zeros((4, 3)))
     turned = np.zeros((4, 3))
     turned[:, 2] = np.deg2rad([0, 10, 20, 30])
@@ -77,7 +77,7 @@ def test_figures_of_four_known_errors():
 
 
 def test_nothing_is_aligned():
-    """Estimates that are all shifted by the same 7 m are 7 m wrong, whatever their shape."""
+    """Estimates that share a 7 m offset count as 7 m wrong, whatever their shape."""
     rng = np.random.default_rng(0)
     true = poses(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)))
     found = Poses(true.centers + np.array([2.0, 3.0, 6.0]), true.quats_wxyz)
@@ -88,7 +88,7 @@ def test_nothing_is_aligned():
 
 
 def test_heights_that_are_too_low_are_negative_up():
-    """The signed error is estimated minus true, and its sign is lost only in the absolute one."""
+    """The signed error is estimated minus true; only the absolute error drops the sign."""
     true = poses([[0, 0, 10], [0, 0, 12], [0, 0, 20]])
     found = poses([[0, 0, 9], [0, 0, 8], [0, 0, 22]])
     axes = evaluate(Estimates("net", found), frames_of(true)).summary.axes
@@ -98,7 +98,7 @@ def test_heights_that_are_too_low_are_negative_up():
 
 
 def test_a_frame_without_a_pose_is_infinitely_wrong():
-    """It counts in medians and shares, is left out of means, and is never given a pose."""
+    """A frame without a pose counts in medians and shares, not in means, and never gets a pose."""
     true = poses(np.zeros((4, 3)))
     found = without_pose(poses([[1, 0, 0], [2, 0, 0], [3, 0, 0], [0, 0, 0]]), 3)
     one = evaluate(Estimates("net", found), frames_of(true), MetricOptions(within=((10.0, 10.0),)))
@@ -114,7 +114,7 @@ def test_a_frame_without_a_pose_is_infinitely_wrong():
 
 
 def test_quaternions_of_both_signs_are_one_rotation():
-    """An estimate with all four components negated has no rotation error."""
+    """A negated quaternion has no rotation error."""
     true = poses(np.zeros((1, 3)), [[0.3, -0.2, 0.9]])
     found = Poses(true.centers, -true.quats_wxyz)
     errors = frame_errors(Estimates("net", found), true)
@@ -122,7 +122,7 @@ def test_quaternions_of_both_signs_are_one_rotation():
 
 
 def test_an_estimate_that_is_no_rotation_is_refused():
-    """A network's quaternion that was not normalised is a mistake of ours, and told."""
+    """An estimate with an unnormalised quaternion raises ValueError."""
     true = poses(np.zeros((1, 3)))
     found = Poses(true.centers, 1.1 * true.quats_wxyz)
     with pytest.raises(ValueError, match="not normalised"):
@@ -130,7 +130,7 @@ def test_an_estimate_that_is_no_rotation_is_refused():
 
 
 def test_truth_without_a_pose_is_refused():
-    """Nothing is compared with an unknown truth, and nothing of another length."""
+    """A frame with unknown true pose, or a different number of estimates, raises ValueError."""
     true = poses(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="true pose"):
         frame_errors(Estimates("net", true), without_pose(true, 1))
@@ -139,7 +139,7 @@ def test_truth_without_a_pose_is_refused():
 
 
 def test_strata_are_judged_apart():
-    """Each stratum has the figures of its own frames; frames without one are 'unknown'."""
+    """Each stratum has statistics of its own frames; frames without one are 'unknown'."""
     true = poses(np.zeros((5, 3)))
     found = poses([[1, 0, 0], [2, 0, 0], [4, 0, 0], [8, 0, 0], [16, 0, 0]])
     strata = ["high", "low", "high", "low", ""]
@@ -153,7 +153,7 @@ def test_strata_are_judged_apart():
 
 
 def test_curve_has_every_frame_once():
-    """Bins are closed below and open above; the last has no end; empty ones are left out."""
+    """Bins are closed below and open above, the last one is unbounded, and empty ones are omitted."""
     true = poses(np.zeros((5, 3)))
     found = poses([[1, 0, 0], [3, 0, 0], [5, 0, 0], [7, 0, 0], [9, 0, 0]])
     options = MetricOptions(bin_edges_m=(0, 1, 2, 10))
@@ -170,7 +170,7 @@ def test_curve_has_every_frame_once():
 
 
 def test_distance_to_training_weighs_angle():
-    """A frame 1 m off that looks away is farther than one 3 m off that looks the same way."""
+    """A training pose 1 m away with opposite view counts as farther than one 3 m away with the same view."""
     training = poses([[1, 0, 0], [3, 0, 0]], [[0, 0, np.pi], [0, 0, 0]])
     true = poses([[0, 0, 0]])
     frames = evaluation_frames("a", np.array(["a/0"]), np.array(["low"]), true, training)
@@ -179,21 +179,21 @@ def test_distance_to_training_weighs_angle():
 
 
 def test_an_empty_group_has_no_figures():
-    """A group without frames is refused."""
+    """A group without frames raises ValueError."""
     with pytest.raises(ValueError, match="has no frames"):
         evaluate(Estimates("net", poses(np.zeros((0, 3)))), frames_of(poses(np.zeros((0, 3)))))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.77, 1.0])
 def test_quantile_is_numpys_where_all_is_finite(share):
-    """Against NumPy, for several numbers of values."""
+    """For finite values the quantile equals NumPy's, for several sample sizes."""
     for n in (1, 2, 7, 20, 21):
         values = np.random.default_rng(n).normal(size=n)
         assert quantile(values, share) == pytest.approx(np.quantile(values, share))
 
 
 def sampled(n, inflate=1.0, seed=0):
-    """True poses, and estimates whose errors are drawn from a covariance that they state.
+    """Return estimates with errors drawn from a covariance, the true poses, and that covariance.
 
     inflate : stated standard deviations over true ones.
     """
@@ -211,7 +211,7 @@ def sampled(n, inflate=1.0, seed=0):
 
 
 def test_right_covariances_are_found_right():
-    """Errors drawn from what is stated: ratio 1, 0.1 % beyond, the reliability curve on its diagonal."""
+    """Correctly stated covariances give a ratio of 1, 0.1 % beyond, and a diagonal reliability curve."""
     estimates, true, covariance = sampled(20_000)
     one = evaluate(estimates, frames_of(true)).calibration
     # The median of chi-squared(6) at this n has a standard error of 1 %.
@@ -227,7 +227,7 @@ def test_right_covariances_are_found_right():
 
 @pytest.mark.parametrize(("inflate", "ratio"), [(0.5, 4.0), (2.0, 0.25)])
 def test_wrong_covariances_are_found_wrong(inflate, ratio):
-    """Half the true sigma stated gives a ratio of 4 and a curve below the diagonal, and the reverse."""
+    """Stating half the true sigma gives a ratio of 4 and a curve below the diagonal, and vice versa."""
     estimates, true, _ = sampled(4_000, inflate)
     one = evaluate(estimates, frames_of(true)).calibration
     assert one.ratio == pytest.approx(ratio, rel=0.06)
@@ -236,7 +236,7 @@ def test_wrong_covariances_are_found_wrong(inflate, ratio):
 
 
 def test_the_vector_of_the_covariance_turns_the_estimate_into_the_truth():
-    """e^T C^-1 e sees the correlation of centre and rotation with its right sign."""
+    """e^T C^-1 e accounts for the correlation of centre and rotation with the correct sign."""
     estimates, true, _ = sampled(4_000)
     wrong = estimates.covariance.copy()
     wrong[:, :3, 3:] *= -1
@@ -247,14 +247,14 @@ def test_the_vector_of_the_covariance_turns_the_estimate_into_the_truth():
 
 
 def test_median_of_chi_squared_is_the_papers():
-    """The constants that the documentation names."""
+    """Quantiles of chi-squared equal the constants in the documentation."""
     assert chdtri(6, 0.5) == pytest.approx(5.348, abs=5e-4)
     assert chdtri(3, 0.5) == pytest.approx(2.366, abs=5e-4)
     assert chdtri(6, 0.001) == pytest.approx(22.46, abs=5e-3)
 
 
 def test_covariances_that_are_none_are_counted():
-    """NaN is unknown; a negative variance or a rank below six is unusable; neither enters a figure."""
+    """NaN counts as unknown, a negative variance or rank below six as unusable; neither is evaluated."""
     good = np.diag([1.0, 1, 1, 1e-4, 1e-4, 1e-4])
     negative, flat = good.copy(), good.copy()
     negative[2, 2] = -1
@@ -272,7 +272,7 @@ def test_covariances_that_are_none_are_counted():
 
 
 def test_metrics_json_says_all_and_stays_json(tmp_path):
-    """Infinity and NaN are null, every method of a group is there, the paper's table beside it."""
+    """Infinity and NaN become null, and every method of a group and the paper's table are included."""
     estimates, true, _ = sampled(30)
     lost = replace(estimates, method="lost", poses=without_pose(estimates.poses, slice(0, 20)))
     evaluations = [evaluate(e, frames_of(true)) for e in (estimates, lost)]
@@ -300,7 +300,7 @@ def test_metrics_json_says_all_and_stays_json(tmp_path):
 
 
 def test_errors_csv_has_a_row_for_each_frame(tmp_path):
-    """Cells are the errors to their digits; what is unknown is empty."""
+    """Cells hold errors rounded to the stated digits; unknown values are empty."""
     true = poses([[0, 0, 0], [0, 0, 10]])
     found = without_pose(poses([[3, 0, -4], [0, 0, 0]]), 1)
     write_errors(
@@ -325,7 +325,7 @@ def test_errors_csv_has_a_row_for_each_frame(tmp_path):
 
 
 def test_docs_list_what_the_files_hold(tmp_path):
-    """docs/evaluation.md names every key of metrics.json and, in their order, the columns of errors.csv."""
+    """docs/evaluation.md lists every key of metrics.json and the columns of errors.csv in order."""
     page = (Path(__file__).resolve().parents[3] / "docs" / "evaluation.md").read_text()
     json_part, csv_part = page.split("## metrics.json")[1].split("## errors.csv")
     json_part = json_part.split("### Facts")[0]  # of a run: test_evaluate.py
@@ -352,7 +352,7 @@ def test_docs_list_what_the_files_hold(tmp_path):
 
 
 def test_axes_are_named_where_the_world_has_a_place():
-    """East, north and up need an origin."""
+    """Axes are named east, north and up only if the world has an origin."""
     facts = {"units": "m", "up_is_known": True, "camera": None}
     somewhere = GeoOrigin(49.0, 8.4, 0.0, HeightReference.TAKEOFF)
     assert axes_of(DatasetInfo(origin=somewhere, **facts)) == ("east", "north", "up")
@@ -360,7 +360,7 @@ def test_axes_are_named_where_the_world_has_a_place():
 
 
 def test_rows_of_the_table_fit_their_header():
-    """Our rows and the paper's have a cell for each title, and the paper's say that they are not ours."""
+    """Our rows and the paper's have one cell per column, and the paper's are marked as such."""
     estimates, true, _ = sampled(30)
     evaluations = [evaluate(estimates, frames_of(true))]
     titles = header(evaluations)

@@ -1,4 +1,4 @@
-"""Checkpoints: what is saved comes back whole, and what is no checkpoint is refused clearly."""
+"""Tests of checkpoints: they are restored completely, and other files are rejected clearly."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def saved(field: Path, tmp_path: Path) -> tuple[Path, TinyModel, View]:
-    """A checkpoint of a pose model with weights, statistics and a counter that are not those of a new one."""
+    """Save a checkpoint whose weights, statistics and counter differ from a new model's."""
     model = TinyModel.make({"width": 5, "dropout": 0.25}, seed=3)
     with Dataset(field) as dataset:
         model.fit(TrainingSet(dataset.groups["train"]))
@@ -42,7 +42,7 @@ def saved(field: Path, tmp_path: Path) -> tuple[Path, TinyModel, View]:
 
 
 def rewritten(path: Path, **changes: object) -> Path:
-    """A copy with other values in its document, or (a tensor under its name) other tensors."""
+    """Return a copy with changed values in its document, or with changed tensors."""
     from safetensors import safe_open
 
     with safe_open(path, "pt") as file:
@@ -63,7 +63,7 @@ def rewritten(path: Path, **changes: object) -> Path:
 
 
 def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
-    """The loaded model estimates bit for bit what the saved one does, and knows its camera."""
+    """The loaded model estimates bit-identical poses and knows its camera."""
     path, model, view = saved
     found = load(path)
     assert isinstance(found, Checkpoint)
@@ -86,7 +86,7 @@ def test_a_checkpoint_alone_gives_the_same_poses(saved, field):
 
 
 def test_weights_in_channels_last_are_saved_as_they_are(saved, tmp_path):
-    """A network whose memory is laid out for speed is saved in the ordinary order."""
+    """A network in channels-last memory format is saved in the default layout."""
     _, model, view = saved
     before = {k: v.clone() for k, v in model.network.state_dict().items()}
     model.network.to(memory_format=torch.channels_last)
@@ -97,7 +97,7 @@ def test_weights_in_channels_last_are_saved_as_they_are(saved, tmp_path):
 
 
 def test_a_full_disk_keeps_the_old_checkpoint(saved, monkeypatch):
-    """One line names the file and the reason; the old file stands and nothing lies beside it."""
+    """A failed write names file and reason, keeps the old checkpoint, and leaves no temporary file."""
     path, model, view = saved
     before = path.read_bytes()
 
@@ -114,7 +114,7 @@ def test_a_full_disk_keeps_the_old_checkpoint(saved, monkeypatch):
 
 
 def test_what_is_no_file_is_told(tmp_path):
-    """A missing path and a folder are the user's mistakes."""
+    """A missing path or a folder raises InputError."""
     with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "none.safetensors")
     with pytest.raises(InputError, match="is not a file"):
@@ -122,7 +122,7 @@ def test_what_is_no_file_is_told(tmp_path):
 
 
 def test_another_file_is_refused(saved, tmp_path):
-    """Published weights, another format of ours and another version are named for what they are."""
+    """Published weights, another format of ours and another version are rejected with a specific message."""
     path, _, _ = saved
     save_file({"a": torch.zeros(2)}, tmp_path / "w.safetensors")
     with pytest.raises(FormatError, match="is not a checkpoint of this program"):
@@ -156,7 +156,7 @@ def test_another_file_is_refused(saved, tmp_path):
     ],
 )
 def test_what_does_not_fit_is_refused(saved, changes, told):
-    """Another kind, other options, other tensors, damage: each is one clear line with the path."""
+    """Another kind, other options, other tensors and damage each give one clear line with the path."""
     other = rewritten(saved[0], **changes)
     with pytest.raises(FormatError, match=told) as caught:
         load(other)
@@ -164,7 +164,7 @@ def test_what_does_not_fit_is_refused(saved, changes, told):
 
 
 def test_a_file_cut_short_is_refused(saved):
-    """At any length."""
+    """A file truncated at any length is rejected."""
     path, _, _ = saved
     content = path.read_bytes()
     for length in (0, 7, 100, len(content) // 2, len(content) - 1):
@@ -174,7 +174,7 @@ def test_a_file_cut_short_is_refused(saved):
 
 
 def test_the_view_is_that_of_the_data_set(saved, field, tmp_path):
-    """It changes with the file, and its JSON is read as strictly as it is written."""
+    """The view changes with the data set file, and reading its JSON rejects invalid values."""
     _, _, view = saved
     with Dataset(write_field(tmp_path / "other.h5", 5, 1)) as dataset:
         assert view_of(dataset).dataset != view.dataset

@@ -1,4 +1,4 @@
-"""A stage that learns validation frames too: it sees them all, and nothing says any more that they judge."""
+"""Tests of a stage that also trains on validation frames, which then no longer count as held-out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RECIPE = Recipe(
 
 @pytest.fixture
 def rows_seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, set[int]]]:
-    """Sizes of training sets, with the rows that batches take of them."""
+    """Return the sizes of training sets with the rows used in batches."""
     seen: list[tuple[int, set[int]]] = []
     made = TinyModel.batch
 
@@ -43,7 +43,7 @@ def rows_seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, set[int]]]:
 
 
 def test_several_groups_are_one_training_set(field):
-    """Rows of one group after those of the other: images, poses, points, pixels that show the scene."""
+    """Rows of the second group follow those of the first, with matching images, poses and points."""
     with Dataset(field) as dataset:
         first, second = dataset.groups["train"], dataset.groups["validation"]
         both = TrainingSet(first, second, memory_bytes=64 * 48 * 3 * 26)
@@ -55,14 +55,17 @@ def test_several_groups_are_one_training_set(field):
 
 
 def test_the_last_stage_learns_what_was_held_out(field, tmp_path, rows_seen):
-    """The first one sees 24 training frames, the other one these and 6 validation frames."""
+    """The first stage uses 24 training frames, the last one also the 6 validation frames."""
     train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
     assert [(count, len(rows)) for count, rows in rows_seen] == [(24, 24), (30, 30)]
 
 
 @pytest.mark.parametrize("steps", [4, 9, 15])
 def test_validation_frames_judge_until_they_are_learnt(field, tmp_path, steps):
-    """Stopped in either stage or not: their errors are told as they were before, and the end is kept."""
+    """Validation errors are reported only for the stage that holds validation frames out.
+
+    This holds if training is interrupted in either stage, and the final network is the one kept.
+    """
     with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(steps))
     facts = train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower())
@@ -80,7 +83,7 @@ def test_validation_frames_judge_until_they_are_learnt(field, tmp_path, steps):
 
 
 def test_evaluating_says_which_frames_a_network_was_trained_on(field, tmp_path):
-    """Beside the errors on them, which are those of training images; not of a network that was not."""
+    """A note marks the network that was also trained on validation frames, and only that one."""
     train(RECIPE, files(tmp_path / "all"), Data(field), ONE_THREAD, Follower())
     held_out = replace(RECIPE, stages=(HELD_OUT,))
     train(held_out, files(tmp_path / "held out"), Data(field), ONE_THREAD, Follower())
@@ -94,7 +97,7 @@ def test_evaluating_says_which_frames_a_network_was_trained_on(field, tmp_path):
 
 
 def test_other_frames_than_these_are_refused(tmp_path):
-    """A recipe that would train on test frames is told its line."""
+    """A recipe that would train on test frames is rejected with its line number."""
     path = tmp_path / "mine.toml"
     path.write_text('kind = "tiny"\n[[stages]]\nimages = 5\nframes = "test"\n')
     with pytest.raises(InputError, match=r":4: frames is 'test', needs to be training or all"):

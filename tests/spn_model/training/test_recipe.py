@@ -1,4 +1,4 @@
-"""Recipes: those of the package can be made, and every mistake in one is told with its line."""
+"""Tests of recipes: those of the package are valid, and errors name the line."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_recipe_is_read_whole(tmp_path):
-    """Every value where it belongs, a path from the file's own folder, defaults for the rest."""
+    """All values are read, paths are relative to the recipe file, and missing values get defaults."""
     recipe = read_recipe(str(written(tmp_path, GOOD)))
     assert (recipe.kind, recipe.weights, recipe.optimizer) == ("regression", "none", "sgd")
     assert recipe.momentum == 0.8
@@ -83,7 +83,7 @@ def test_a_recipe_is_read_whole(tmp_path):
     ],
 )  # fmt: skip
 def test_a_mistake_is_told_with_its_line(tmp_path, old, new, told):
-    """Unknown keys, wrong types, values out of range, TOML that is none."""
+    """Unknown keys, wrong types, values out of range and invalid TOML are reported with file and line."""
     assert old in GOOD
     path = written(tmp_path, GOOD.replace(old, new))
     with pytest.raises(InputError, match=told) as caught:
@@ -92,7 +92,7 @@ def test_a_mistake_is_told_with_its_line(tmp_path, old, new, told):
 
 
 def test_what_is_no_recipe_is_refused(tmp_path):
-    """A name that there isn't, a file without stages, one that is large, one that is not text."""
+    """An unknown name, a file without stages, a huge file and a binary file are rejected."""
     with pytest.raises(InputError, match=r"unknown recipe 'none'; .* default, paper"):
         read_recipe("none")
     with pytest.raises(InputError, match=r"a recipe needs 1 to 50 tables \[\[stages\]\]"):
@@ -105,7 +105,7 @@ def test_what_is_no_recipe_is_refused(tmp_path):
 
 
 def test_the_recipes_of_the_package_can_be_made():
-    """Their kinds know their options, and each has a budget in minutes."""
+    """Every recipe of the package has valid options and a total budget of 30 minutes."""
     assert {"default", "paper", "vgg16", "posenet"} <= set(names())
     for name in names():
         recipe = read_recipe(name)
@@ -115,7 +115,7 @@ def test_the_recipes_of_the_package_can_be_made():
 
 
 def test_the_papers_recipe_is_the_papers():
-    """Added layers first, where pretraining data go; then all; beta 500 on both."""
+    """The paper's recipe first trains added layers on pretraining data, then all; beta is 500 in both."""
     first, second = read_recipe("paper").stages
     assert (first.data, second.data) == ("pretraining", "area")
     assert first.options["freeze_trunk"]
@@ -125,7 +125,7 @@ def test_the_papers_recipe_is_the_papers():
 
 
 def test_another_budget_keeps_the_shares():
-    """In images, in minutes, or both; nothing given changes nothing."""
+    """A new budget in images, minutes or both keeps the stages' shares; no budget changes nothing."""
     stages = (Stage(name="a", minutes=6, batch=16), Stage(name="b", minutes=24))
     recipe = Recipe(kind="regression", stages=stages)
     assert recipe.with_budget(None, None) == recipe
@@ -138,7 +138,7 @@ def test_another_budget_keeps_the_shares():
 
 
 def test_progress_is_of_whichever_budget_is_spent_first():
-    """Half the images, or three quarters of the time."""
+    """Progress is the larger of the shares of images and time used."""
     stage = Stage(name="a", images=1000, minutes=2)
     assert stage.progress(500, 10) == 0.5
     assert stage.progress(500, 90) == 0.75
@@ -146,7 +146,7 @@ def test_progress_is_of_whichever_budget_is_spent_first():
 
 
 def test_the_rate_rises_and_falls():
-    """Over the warm-up it rises by equal steps; a cosine is at half when half is done, and ends at 0."""
+    """The learning rate warms up linearly, then follows its cosine, constant or linear schedule."""
     stage = Stage(name="a", images=10_000, rate=0.4, warmup_steps=4)
     assert [stage.learning_rate_at(k, 0) for k in range(5)] == pytest.approx(
         [0.1, 0.2, 0.3, 0.4, 0.4]
@@ -165,5 +165,5 @@ def test_the_rate_rises_and_falls():
     [(900, 0, 900), (0, 2, 24_000), (900, 2, 900), (50_000, 2, 24_000)],
 )
 def test_a_stage_knows_about_how_many_images_it_draws(images, minutes, drawn):
-    """Its budget, or 200 a second; the smaller of two."""
+    """The expected number of images is the smaller of the image budget and 200 per second."""
     assert Stage(name="all", images=images, minutes=float(minutes)).expected_images == drawn

@@ -1,4 +1,4 @@
-"""The training loop on a small field: it learns, goes on after a kill, and stops where nothing is learnt."""
+"""Tests of the training loop on a small field: convergence, resuming after a kill, and divergence."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ RECIPE = Recipe(
 
 @pytest.fixture(scope="module")
 def unbroken(field: Path, tiny_kind: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a whole training."""
+    """Return the folder of an uninterrupted training."""
     folder = tmp_path_factory.mktemp("unbroken")
     train(RECIPE, files(folder), Data(field), ONE_THREAD, Follower())
     return folder
 
 
 def test_a_training_learns_where_the_camera_is(field, tmp_path):
-    """1500 images seen bring validation frames from the spread of the field (20 m) to below 4 m."""
+    """Training on 6000 images reduces the validation error from about 20 m to less than 4 m."""
     recipe = replace(RECIPE, stages=(Stage(name="all", images=6000, batch=12, rate=0.03),))
     follower = Follower()
     facts = train(recipe, files(tmp_path), Data(field), ONE_THREAD, follower)
@@ -85,7 +85,7 @@ def test_a_training_learns_where_the_camera_is(field, tmp_path):
 
 
 def test_two_trainings_of_one_seed_are_the_same(field, unbroken, tmp_path):
-    """Bit for bit; another seed gives another network."""
+    """Two trainings with one seed are bit-identical; another seed gives another network."""
     train(RECIPE, files(tmp_path / "a"), Data(field), ONE_THREAD, Follower())
     train(RECIPE, files(tmp_path / "b"), Data(field), replace(ONE_THREAD, seed=6), Follower())
     first, same, other = (
@@ -98,7 +98,10 @@ def test_two_trainings_of_one_seed_are_the_same(field, unbroken, tmp_path):
 
 @pytest.mark.parametrize("steps", [1, 7, 12, 30])
 def test_a_stopped_training_goes_on_to_the_same_end(field, unbroken, tmp_path, steps):
-    """Stopped within, at the end of, and after the first stage: weights and errors are those of one piece."""
+    """A resumed training gives the same weights and errors as an uninterrupted one.
+
+    It is stopped within, at the end of, and after the first stage.
+    """
     with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(steps))
     state = read_state(tmp_path / "state.safetensors")
@@ -136,7 +139,7 @@ train(RECIPE, files(Path(sys.argv[1])), Data(Path(sys.argv[2])), ONE_THREAD, Slo
 
 @pytest.mark.slow
 def test_a_training_killed_with_signal_9_goes_on_to_the_same_end(field, unbroken, tmp_path):
-    """Killed three times in different places, it ends with the weights of one that never was, bit for bit."""
+    """A training killed three times at different steps ends bit-identical to an uninterrupted one."""
     command = [sys.executable, "-c", KILLED, str(tmp_path), str(field)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     reached = []
@@ -165,7 +168,7 @@ def test_a_training_killed_with_signal_9_goes_on_to_the_same_end(field, unbroken
 ALIKE = replace(
     RECIPE,
     options={"dropout": 0.0, "normalised": False},
-    optimizer="sgd",  # unlike Adam it tells a mean of gradients from their sum
+    optimizer="sgd",  # unlike Adam, distinguishes the mean of gradients from their sum
     stages=(Stage(name="all", images=240, batch=4, rate=0.05),),
 )
 SHARED = """
@@ -182,7 +185,10 @@ print(len(follower.rows))
 
 @pytest.mark.slow
 def test_two_processes_make_the_network_of_one_with_batches_twice_as_large(field, tmp_path):
-    """Gradients are averaged over gloo, each process sees its half of a batch, the first one writes."""
+    """Two processes that average gradients over gloo match one process with twice the batch size.
+
+    Each process gets half of a batch, and only the first one writes.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
@@ -213,12 +219,12 @@ def test_two_processes_make_the_network_of_one_with_batches_twice_as_large(field
     assert two.facts["processes"] == 2
     state, other = two.model.network.state_dict(), one.model.network.state_dict()
     for name in state:
-        if name != "variance":  # of a few validation frames: a ratio of small errors
+        if name != "variance":  # from a few validation frames: a ratio of small errors
             assert torch.allclose(state[name], other[name], rtol=1e-4, atol=1e-5), name
 
 
 def test_the_log_tells_training_and_validation_apart(unbroken):
-    """Every row has all columns; seconds of training and of validation grow, each for itself."""
+    """Every log row has all columns; training and validation seconds accumulate separately."""
     rows = log(unbroken)
     assert list(rows[0]) == list(COLUMNS)
     assert [r["stage"] for r in rows if r["event"] == "validation"] == ["head", "all", "all", "all"]
@@ -233,14 +239,14 @@ def test_the_log_tells_training_and_validation_apart(unbroken):
 
 
 def test_a_budget_in_minutes_ends_a_training(field, tmp_path):
-    """0.02 minutes are 1.2 s of training, and a step more at most."""
+    """A budget of 0.02 minutes ends training after 1.2 s, plus at most one step."""
     recipe = RECIPE.with_budget(None, 0.02)
     facts = train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())
     assert 1.2 <= facts["train_s"] < 1.8
 
 
 def test_judging_does_not_count_as_training(field, tmp_path, monkeypatch):
-    """However long it takes; both are told, each for itself."""
+    """Slow validation does not count as training time; both times are reported separately."""
     quick = TinyModel.estimate
 
     def slow(self: TinyModel, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
@@ -251,12 +257,12 @@ def test_judging_does_not_count_as_training(field, tmp_path, monkeypatch):
     recipe = replace(RECIPE, stages=RECIPE.stages[1:])
     often = replace(ONE_THREAD, validations=8)
     facts = train(recipe, files(tmp_path), Data(field), often, Follower())
-    assert facts["validate_s"] > 8 * 3 * 0.1  # 6 validation frames and 16 others, 8 at once
+    assert facts["validate_s"] > 8 * 3 * 0.1  # 6 validation and 16 training frames, in batches of 8
     assert facts["train_s"] < 0.7 * facts["validate_s"]
 
 
 def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
-    """A network that has become much worse replaces nothing; one that is 2 % worse does."""
+    """A much worse network does not replace the best one; one that is 2 % worse does."""
     model = TinyModel.make({"dropout": 0.0}, 5)
     with Dataset(field) as dataset:
         training = dataset.groups["train"]
@@ -282,7 +288,10 @@ def test_the_best_network_is_kept_and_the_later_of_two_alike(field, tmp_path):
 
 
 def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monkeypatch):
-    """Where a stage renders views, they fit these, not the validation frames; each stage has its own."""
+    """If a stage renders views, covariances are scaled to held-out views instead of validation frames.
+
+    Each stage renders its own views.
+    """
     stages = []
 
     def views(self: TinyModel, data: TrainingSet, count: int) -> HeldOutViews:
@@ -316,7 +325,10 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
 
 
 def test_frames_of_places_that_no_training_image_shows_do_not_judge(tmp_path):
-    """Of 24 validation frames, 12 see points of their own alone; where 5 are left, all judge."""
+    """Validation frames without points in common with training frames are not used for validation.
+
+    If too few frames remain (here 5 of 24), all are used.
+    """
     for strange, expected in ((12, 12), (19, 24)):
         path = tmp_path / f"{strange}.h5"
         with DatasetWriter(
@@ -338,7 +350,7 @@ def test_frames_of_places_that_no_training_image_shows_do_not_judge(tmp_path):
 
 @pytest.mark.parametrize("at", [0.0, 0.6])
 def test_a_training_that_turns_to_nan_stops(field, tmp_path, at):
-    """It says so, and keeps the checkpoint of before; without one it says that too."""
+    """A NaN loss stops training with a message that says whether an earlier checkpoint is kept."""
     stage = Stage(name="sick", images=240, batch=6, rate=0.02, options={"sick_at": at})
     told = "the checkpoint after 20 steps is kept" if at else "there is no checkpoint yet"
     with pytest.raises(StageError, match=f"diverged after .* steps: the loss is nan.*{told}"):
@@ -351,7 +363,7 @@ def test_a_training_that_turns_to_nan_stops(field, tmp_path, at):
 
 
 def test_a_loss_far_above_its_beginning_is_seen():
-    """One that jumps about its level is not; one that grows a hundredfold is, within 100 steps."""
+    """A noisy loss is accepted; a hundredfold increase is detected within 100 steps."""
     rng = np.random.default_rng(0)
     sound, sick = LossMonitor(1), LossMonitor(1)
     for k in range(400):
@@ -370,7 +382,7 @@ def test_a_loss_far_above_its_beginning_is_seen():
 
 
 def test_another_training_set_is_refused(tmp_path):
-    """Nothing to train on, two groups of training frames, and no file."""
+    """A data set without training frames, one with two training groups, and a missing file are rejected."""
     empty = tmp_path / "empty.h5"
     with DatasetWriter(empty, INFO, {"train": Role.TRAIN, "low": Role.TEST}) as writer:
         writer.append("low", frame("low", 0))
@@ -388,7 +400,7 @@ def test_another_training_set_is_refused(tmp_path):
 
 
 def test_a_kind_of_network_hears_how_long_a_stage_is(field, tmp_path, monkeypatch):
-    """The images that each stage draws."""
+    """`begin_stage` receives the number of images that each stage draws."""
     heard = []
     begin = TinyModel.begin_stage
     monkeypatch.setattr(TinyModel, "begin_stage", lambda *of: (heard.append(of[3]), begin(*of)))
@@ -397,7 +409,10 @@ def test_a_kind_of_network_hears_how_long_a_stage_is(field, tmp_path, monkeypatc
 
 
 def test_pretraining_takes_its_own_data_set(field, tmp_path):
-    """The first stage sees the other data set, targets are then those of the area, layers go on."""
+    """The first stage trains on the pretraining data set, the second on the area's.
+
+    Targets are those of the area, and the weights of the first stage are kept.
+    """
     other = write_field(tmp_path / "other.h5", 7, 2)
     stages = tuple(
         replace(s, data=d) for s, d in zip(RECIPE.stages, ("pretraining", "area"), strict=True)
@@ -414,7 +429,7 @@ def test_pretraining_takes_its_own_data_set(field, tmp_path):
 
 
 def test_a_frozen_layer_stays_and_others_move(field, tmp_path):
-    """After a stage that freezes the first convolution it is as drawn."""
+    """A stage that freezes the first convolution leaves it unchanged and trains other layers."""
     recipe = replace(RECIPE, stages=RECIPE.stages[:1])
     train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())
     new = TinyModel.make({}, 5).network.state_dict()
@@ -424,7 +439,7 @@ def test_a_frozen_layer_stays_and_others_move(field, tmp_path):
 
 
 def test_a_state_of_another_training_is_refused(field, tmp_path):
-    """A state of another network, and a damaged one, give one line."""
+    """The state of another network and a damaged state are rejected."""
     with pytest.raises(TrainingStopped):
         train(RECIPE, files(tmp_path), Data(field), ONE_THREAD, Follower(3))
     wider = replace(RECIPE, options={"width": 9})
@@ -437,7 +452,7 @@ def test_a_state_of_another_training_is_refused(field, tmp_path):
 
 
 def test_the_log_of_redone_steps_is_cut_off(tmp_path):
-    """What a killed training wrote after its last state is not there twice."""
+    """Rows written after the last saved state are removed on resuming, so none is duplicated."""
     log_file = Log(tmp_path / "log.csv", 0)
     kept = log_file.write({"event": "steps", "step": 1, "loss": 0.5})
     log_file.write({"event": "steps", "step": 2})
@@ -449,7 +464,10 @@ def test_the_log_of_redone_steps_is_cut_off(tmp_path):
 
 
 def test_every_image_comes_once_an_epoch():
-    """Over batches that do not divide the images, and over processes; the next epoch has another order."""
+    """Every image is drawn once per epoch, in a different order each time.
+
+    This holds for batches that do not divide the number of images, and for several processes.
+    """
     rows = np.concatenate([rows_of_step(10, 4, k, 3, 0) for k in range(5)])
     assert sorted(rows[:10]) == sorted(rows[10:]) == list(range(10))
     assert list(rows[:10]) != list(rows[10:])
@@ -459,7 +477,7 @@ def test_every_image_comes_once_an_epoch():
 
 
 def test_what_is_random_differs_between_steps_stages_and_processes():
-    """And is the same for the same step."""
+    """Random seeds differ between steps, stages and processes, and are the same for the same step."""
     keys = [(1, 0, 5, 0), (2, 0, 5, 0), (1, 1, 5, 0), (1, 0, 6, 0), (1, 0, 5, 1)]
     assert len({generator_of_step(*key).integers(2**60) for key in keys}) == len(keys)
     assert len({torch_seed_of_step(*key) for key in keys}) == len(keys)
@@ -467,7 +485,7 @@ def test_what_is_random_differs_between_steps_stages_and_processes():
 
 
 def test_spread_rows_hold_the_ends():
-    """First and last are among them, none twice."""
+    """Selected rows include the first and the last, without duplicates."""
     assert list(spread_rows(5, 64)) == [0, 1, 2, 3, 4]
     assert list(spread_rows(100, 3)) == [0, 50, 99]
     assert list(spread_rows(1, 4)) == [0]
