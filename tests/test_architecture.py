@@ -1,4 +1,4 @@
-"""The rules of docs/architecture.md, read from the source itself."""
+"""The rules of docs/architecture.md, checked on the source code."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ NAMES = [path.relative_to(ROOT).as_posix() for path in MODULES]
 
 @cache
 def _tree(path: Path) -> ast.Module:
-    """Syntax tree of a module."""
+    """Return the syntax tree of a module."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def _imports(path: Path) -> Iterator[str]:
-    """Full names of all that a module imports, anywhere in it."""
+    """Yield the full names of everything that a module imports, also inside functions."""
     for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -38,7 +38,7 @@ def _imports(path: Path) -> Iterator[str]:
 
 
 def _importers(library: str) -> set[str]:
-    """Modules of ours that import a library or anything in it."""
+    """Return our modules that import a library or anything in it."""
     return {
         name
         for name, path in zip(NAMES, MODULES, strict=True)
@@ -47,27 +47,28 @@ def _importers(library: str) -> set[str]:
 
 
 def _outside(names: set[str], *folders: str) -> set[str]:
+    """Return the names outside the given folders."""
     return {name for name in names if not name.startswith(folders)}
 
 
 def test_the_packages_are_found():
-    """The rules below are about real files."""
+    """The source files are found, so that the rules below apply to something."""
     assert len(NAMES) > 50
     assert "spn_data/geometry/pose.py" in NAMES
 
 
 def test_pycolmap_is_imported_in_one_place():
-    """pycolmap is imported by spn_data/colmap/__init__.py and by nothing else."""
+    """Only spn_data/colmap/__init__.py imports pycolmap."""
     assert _importers("pycolmap") == {"spn_data/colmap/__init__.py"}
 
 
 def test_only_colmap_knows_pycolmaps_objects():
-    """The module object that spn_data.colmap passes on is used inside that package alone."""
+    """Only spn_data.colmap uses the pycolmap module that it re-exports."""
     assert _outside(_importers("spn_data.colmap.pycolmap"), "spn_data/colmap/") == set()
 
 
 def test_pyav_stays_with_video():
-    """PyAV is imported where videos are opened, decoded, encoded, or searched for subtitles."""
+    """Only modules that open, decode or encode videos or search them for subtitles import PyAV."""
     assert _importers("av") == {
         "spn_data/capture/video_container.py",
         "spn_data/media/container.py",
@@ -77,7 +78,7 @@ def test_pyav_stays_with_video():
 
 
 def test_hdf5_stays_with_the_data_set():
-    """h5py is imported by the module that writes dataset.h5 and the one that reads it."""
+    """Only the modules that write and read dataset.h5 import h5py."""
     assert _importers("h5py") == {
         "spn_data/dataset/hdf5_writer.py",
         "spn_data/dataset/hdf5_reader.py",
@@ -94,18 +95,18 @@ def test_the_terminal_belongs_to_cli(library):
 
 @pytest.mark.parametrize("library", ["torch", "spn_model", "spn_cli"])
 def test_spn_data_stands_alone(library):
-    """spn_data imports no torch, no network and no command line."""
+    """spn_data imports neither torch nor spn_model nor the command line."""
     assert {n for n in _importers(library) if n.startswith("spn_data/")} == set()
 
 
 def test_spn_model_knows_no_command_line():
-    """spn_model does not import spn_cli, nor pycolmap by any way."""
+    """spn_model imports neither spn_cli nor pycolmap, not even through spn_data.colmap."""
     found = _importers("spn_cli") | _importers("pycolmap") | _importers("spn_data.colmap")
     assert {n for n in found if n.startswith("spn_model/")} == set()
 
 
 def test_only_pipeline_inputs_and_cli_know_the_area():
-    """The user's area is no business of value, format and engine modules."""
+    """Only pipeline, inputs, Python interface and command line import the area."""
     allowed = (
         "spn_data/area/",
         "spn_data/pipeline/",
@@ -117,7 +118,7 @@ def test_only_pipeline_inputs_and_cli_know_the_area():
 
 
 def test_only_cli_and_the_python_interface_know_the_pipeline():
-    """Nothing below the pipeline calls it."""
+    """Only command line and Python interface import the pipeline."""
     allowed = ("spn_data/pipeline/", "spn_data/api.py", "cli/")
     assert _outside(_importers("spn_data.pipeline"), *allowed) == set()
 
@@ -127,14 +128,14 @@ GEOMETRY = [name for name in NAMES if name.startswith("spn_data/geometry/")]
 
 @pytest.mark.parametrize("name", ["spn_data/errors.py", *GEOMETRY])
 def test_geometry_knows_arrays_only(name):
-    """Modules of geometry import errors and one another, nothing else of ours."""
+    """Modules of spn_data.geometry import only errors and each other."""
     ours = {full for full in _imports(ROOT / name) if full.startswith("spn_")}
     allowed = ("spn_data.errors.", "spn_data.geometry.")
     assert {full for full in ours if not full.startswith(allowed)} == set()
 
 
 def test_on_board_needs_errors_and_geometry_only():
-    """Modules on board import one another, spn_data.errors and spn_data.geometry."""
+    """Modules of spn_model.onboard import only spn_data.errors, spn_data.geometry and each other."""
     allowed = ("spn_data.errors.", "spn_data.geometry.", "spn_model.onboard.")
     for name, path in zip(NAMES, MODULES, strict=True):
         if name.startswith("spn_model/onboard/"):
@@ -143,14 +144,14 @@ def test_on_board_needs_errors_and_geometry_only():
 
 
 def _module(path: Path) -> str:
-    """Dotted name of a module of ours."""
+    """Return the dotted name of one of our modules."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     parts = parts[1:] if parts[0] == "cli" else parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def _graph() -> dict[str, set[str]]:
-    """Modules of ours that each module imports."""
+    """Return the modules of ours that each module imports."""
     names = {_module(path) for path in MODULES}
     graph = {}
     for path in MODULES:
@@ -160,7 +161,7 @@ def _graph() -> dict[str, set[str]]:
 
 
 def _cycles(graph: dict[str, set[str]]) -> list[str]:
-    """Nodes that reach themselves."""
+    """Return the nodes that can reach themselves."""
 
     def reach(start: str) -> set[str]:
         seen: set[str] = set()
@@ -175,18 +176,18 @@ def _cycles(graph: dict[str, set[str]]) -> list[str]:
 
 
 def test_the_check_for_cycles_finds_one():
-    """A cycle of three is found, a diamond is none."""
+    """`_cycles` finds a cycle of three and accepts a diamond."""
     assert _cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c"]
     assert _cycles({"a": {"b", "c"}, "b": {"d"}, "c": {"d"}, "d": set()}) == []
 
 
 def test_no_modules_import_each_other():
-    """There is no import cycle among modules, imports within functions and for types included."""
+    """The modules have no import cycle, including imports in functions and for type checking."""
     assert _cycles(_graph()) == []
 
 
 def test_no_folders_import_each_other():
-    """There is no import cycle among the folders of the packages."""
+    """The folders of the packages have no import cycle."""
     rooms: dict[str, set[str]] = {}
     for name, found in _graph().items():
         room = ".".join(name.split(".")[:2])
@@ -199,19 +200,19 @@ def test_no_folders_import_each_other():
 
 @pytest.mark.parametrize(("package", "most"), [("spn_data", 6), ("spn_model", 4)])
 def test_few_modules_are_at_the_top(package, most):
-    """Modules belong to a room; few stay at the top of a package."""
+    """Only a few modules are at the top level of a package."""
     assert len(list((ROOT / package).glob("*.py"))) <= most
 
 
 def _code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function after its docstring."""
+    """Return the number of lines of a function after its docstring."""
     first = function.body[0]
     start = first.end_lineno if ast.get_docstring(function) else function.lineno
     return (function.end_lineno or 0) - (start or 0)
 
 
 def test_no_function_is_long():
-    """A function has at most 80 lines of code after its docstring."""
+    """No function has more than 80 lines of code after its docstring."""
     found = [
         f"{name}:{node.lineno} {node.name}"
         for name, path in zip(NAMES, MODULES, strict=True)
@@ -222,7 +223,7 @@ def test_no_function_is_long():
 
 
 def test_no_two_public_classes_share_a_name():
-    """A class has one name, and the name one class."""
+    """No two public classes have the same name."""
     seen: dict[str, str] = {}
     for name, path in zip(NAMES, MODULES, strict=True):
         for node in _tree(path).body:
@@ -232,7 +233,7 @@ def test_no_two_public_classes_share_a_name():
 
 
 def test_the_library_never_prints():
-    """spn_data and spn_model speak through return values, progress and errors."""
+    """spn_data and spn_model never print, prompt, exit or break into a debugger."""
     found = [
         f"{name}:{node.lineno}"
         for name, path in zip(NAMES, MODULES, strict=True)
@@ -246,13 +247,13 @@ def test_the_library_never_prints():
 
 
 def test_nothing_is_pickled():
-    """Stored files can't carry code: pickle and its relatives are not used."""
+    """No module uses pickle or similar formats, since stored files must not carry code."""
     for library in ("pickle", "shelve", "joblib", "dill"):
         assert _importers(library) == set()
 
 
 def test_xml_goes_through_defusedxml():
-    """XML from outside is never given to the standard parsers; their exceptions may be named."""
+    """No module imports a standard XML parser, unsafe for untrusted input; only two XML types are allowed."""
     for name, path in zip(NAMES, MODULES, strict=True):
         found = {full for full in _imports(path) if full.split(".")[0] in ("xml", "lxml")}
         allowed = {"xml.etree.ElementTree.ParseError", "xml.etree.ElementTree.Element"}
@@ -261,13 +262,13 @@ def test_xml_goes_through_defusedxml():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_module_is_long(name):
-    """A module has at most 400 lines; one that grows past it has a second subject."""
+    """No module has more than 400 lines."""
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= 400
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_module_says_what_it_is(name):
-    """A module with code begins with a docstring."""
+    """Every module with code has a docstring."""
     tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
     assert not tree.body or ast.get_docstring(tree)
 
@@ -279,6 +280,7 @@ def test_the_list_of_modules_is_current():
 
 
 def _run(code: str) -> str:
+    """Run Python code in a new process and return its output."""
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
     )
@@ -288,7 +290,7 @@ def _run(code: str) -> str:
 
 @pytest.mark.parametrize("command", ["data", "model"])
 def test_help_is_quick(command):
-    """--help of a command loads none of the heavy libraries."""
+    """--help of a program loads none of the heavy libraries."""
     heavy = ("torch", "pycolmap", "cv2", "av", "scipy")
     loaded = _run(
         "import sys\n"
@@ -320,7 +322,7 @@ def test_help_of_every_command_is_quick():
 
 
 def test_png_can_be_written_beside_pycolmap(tmp_path):
-    """spn_data.colmap loads cv2 before pycolmap: the other order aborts the process on PNG."""
+    """Writing a PNG works because spn_data.colmap loads cv2 before pycolmap; the other order aborts."""
     path = tmp_path / "image.png"
     _run(
         "import spn_data.colmap\n"
@@ -331,6 +333,7 @@ def test_png_can_be_written_beside_pycolmap(tmp_path):
 
 
 def _tracked() -> list[Path]:
+    """Return the files tracked by git."""
     done = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, timeout=30)
     if done.returncode != 0:
         pytest.skip("this is no git checkout")
@@ -339,7 +342,7 @@ def _tracked() -> list[Path]:
 
 
 def test_no_file_names_a_machine():
-    """No tracked file holds an absolute path of someone's machine."""
+    """No tracked file contains an absolute path on a particular machine."""
     places = re.compile(rb"(?<![\w.])/(?:work|home|root|Users|mnt|tmp)/\w")
     found = [
         f"{path.relative_to(ROOT)}: {hit[0].decode()}"

@@ -1,4 +1,4 @@
-"""Benchmarks measure what they say, of both sides alike, and leave what they measure untouched."""
+"""Benchmarks measure both sides correctly and alike, and do not modify their input."""
 
 from __future__ import annotations
 
@@ -28,21 +28,24 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 @pytest.fixture
 def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """benchmarks/reconstruct.py, which like a script finds its neighbours in its own folder."""
+    """benchmarks/reconstruct.py, imported with its folder on the path, as when run as a script."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module("reconstruct")
 
 
 def files(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files in a folder by relative path."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def a_scene(names: list[str], poses: Poses) -> Scene:
+    """Return a scene of images with poses and without points."""
     none = np.zeros(0, int)
     return Scene(tuple(names), poses, np.ones(len(names), int), {}, np.zeros((0, 3)), none)
 
 
 def some_poses(n: int) -> Poses:
+    """Draw random poses."""
     rng = np.random.default_rng(5)
     return Poses.from_rotations(
         rng.normal(size=(n, 3)), rotations_from_vectors(rng.normal(size=(n, 3)))
@@ -51,7 +54,7 @@ def some_poses(n: int) -> Poses:
 
 @pytest.mark.slow
 def test_both_pipelines_map_simulated_frames_and_are_judged_by_the_truth(tmp_path: Path) -> None:
-    """Eight frames at 480 x 270: both place every camera to 5 cm, and the area stays as it was."""
+    """On eight 480 x 270 frames both pipelines are accurate to 5 cm, and the area is not modified."""
     flights = tmp_path / "flights"
     simulate(
         flights,
@@ -83,7 +86,7 @@ def test_both_pipelines_map_simulated_frames_and_are_judged_by_the_truth(tmp_pat
         mine = figures[who]
         assert mine["failure"] is None
         assert mine["registered"] == mine["errors"]["frames"] == 8
-        # Frames of 480 pixels a metre or so from what they show: a few millimetres are usual.
+        # At 480 pixels and about a metre from the scene, errors are usually a few millimetres.
         assert 1e-5 < mine["errors"]["position_median_m"] < 0.05
         assert mine["errors"]["rotation_median_deg"] < 0.5
         assert 0.05 < mine["mean_error_px"] < 1.0
@@ -103,7 +106,7 @@ def test_both_pipelines_map_simulated_frames_and_are_judged_by_the_truth(tmp_pat
 
 @pytest.mark.slow
 def test_baseline_matches_real_photos_by_their_position(shared_data: Path, tmp_path: Path) -> None:
-    """Photos with EXIF positions, which extraction inserts by itself, go through match_spatial."""
+    """Photos with EXIF positions, which feature extraction inserts, are matched with match_spatial."""
     photos = tmp_path / "photos"
     photos.mkdir()
     for number in range(60, 66):
@@ -119,6 +122,7 @@ def test_baseline_matches_real_photos_by_their_position(shared_data: Path, tmp_p
 
 
 def compared(area: Path, out: Path, *arguments: str) -> dict[str, Any]:
+    """Run the benchmark as a script and return its JSON output."""
     command = [sys.executable, str(BENCHMARKS / "reconstruct.py"), str(area), "--json", str(out)]
     done = subprocess.run(
         [*command, *arguments], capture_output=True, text=True, timeout=300, check=False
@@ -130,13 +134,13 @@ def compared(area: Path, out: Path, *arguments: str) -> dict[str, Any]:
 
 
 def test_an_area_without_frames_is_refused(benchmark: ModuleType, tmp_path: Path) -> None:
-    """The message says what is missing and what makes it."""
+    """An area without frames is rejected; the message names the command to run."""
     with pytest.raises(Exception, match=f"{FRAMES} is missing; run spn-data reconstruct first"):
         benchmark.compare(tmp_path, None, tmp_path, who=["ours"], threads=1, seed=0)
 
 
 def test_usage_counts_all_descendants(benchmark: ModuleType, tmp_path: Path) -> None:
-    """A grandchild that burns 0.5 s and holds 100 MB is counted, and an abort is told as its signal."""
+    """A grandchild's 0.5 s of CPU time and 100 MB are counted, and an abort is reported as signal 6."""
     grandchild = (
         "import time; held = bytearray(b'x') * 100_000_000; end = time.process_time() + 0.5\n"
         "while time.process_time() < end: pass"
@@ -155,7 +159,7 @@ def test_usage_counts_all_descendants(benchmark: ModuleType, tmp_path: Path) -> 
 def test_a_contestant_that_dies_is_a_failure_with_the_end_of_its_log(
     benchmark: ModuleType, tmp_path: Path
 ) -> None:
-    """An area without frames ends it early; the figures say how, and hold its seconds."""
+    """A failed contestant is reported with its exit code, the end of its log and its CPU time."""
     figures, scene = benchmark.run("pycolmap", tmp_path / "absent", tmp_path / "work", 1, 0)
     assert scene is None
     assert figures["failure"].startswith("ended with code 1: ")
@@ -164,7 +168,7 @@ def test_a_contestant_that_dies_is_a_failure_with_the_end_of_its_log(
 
 
 def test_difference_is_zero_for_the_same_cameras_in_another_gauge(benchmark: ModuleType) -> None:
-    """Only images of both count, whatever their order among the others."""
+    """Scenes that differ by a similarity have no difference over their common images."""
     poses = some_poses(6)
     gauge = Similarity(2.5, rotations_from_vectors(np.array([0.3, -1.0, 2.0])), np.ones(3))
     ours = a_scene(["a", "b", "c", "d", "f"], poses[np.array([0, 1, 2, 3, 5])])
@@ -176,7 +180,7 @@ def test_difference_is_zero_for_the_same_cameras_in_another_gauge(benchmark: Mod
 
 
 def test_difference_is_a_share_of_the_cameras_extent(benchmark: ModuleType) -> None:
-    """One camera of many, moved by a hundredth of the extent, is that share off and alone so."""
+    """One camera of 60, off by 1 % of the extent, hardly changes the median; `only` keeps the scene order."""
     poses = some_poses(60)
     centers = poses.centers.copy()
     extent = np.linalg.norm(np.ptp(centers, axis=0))
@@ -185,7 +189,7 @@ def test_difference_is_a_share_of_the_cameras_extent(benchmark: ModuleType) -> N
     figures = benchmark.difference(
         a_scene(names, Poses(centers, poses.quats_wxyz)), a_scene(names, poses)
     )
-    # The similarity takes up about 1/60 of it.
+    # The best-fit similarity absorbs about 1/60 of the offset.
     assert figures["position_median_share"] < 0.0005
     ours = benchmark.only(a_scene(names, poses), {"07", "03"})
     assert ours.names == ("03", "07")
@@ -193,7 +197,7 @@ def test_difference_is_a_share_of_the_cameras_extent(benchmark: ModuleType) -> N
 
 
 def test_scenes_on_a_line_are_not_compared(benchmark: ModuleType) -> None:
-    """Nothing fixes the rotation about a straight flight: said, not made up."""
+    """Scenes on a straight line, which leaves a rotation undetermined, are reported as not comparable."""
     poses = some_poses(4)
     line = Poses(np.outer(np.arange(4.0), [1, 2, 3]), poses.quats_wxyz)
     scene = a_scene(list("abcd"), line)

@@ -1,4 +1,4 @@
-"""The Python interface: what it reads is right, its names are documented, workers get their data."""
+"""Python interface: data read from areas and datasets, documented names, and data loader workers."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ NAMES = [
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set with images in several groups."""
+    """A dataset with images in several groups."""
     return write_judged(tmp_path_factory.mktemp("judged") / "dataset.h5")
 
 
 def test_an_area_is_read_in_a_few_lines(finished_area: Path) -> None:
-    """Labels, map and frames of an area agree with one another."""
+    """Labels, map and frames of an area are consistent with each other."""
     area = spn_data.open_area(str(finished_area))
     labels = area.labels()
     assert area.sequences[:2] == ("mapping", "mapping (tracked)")
@@ -47,7 +47,7 @@ def test_an_area_is_read_in_a_few_lines(finished_area: Path) -> None:
 
 
 def test_what_does_not_exist_is_named(finished_area: Path, tmp_path: Path) -> None:
-    """An unknown sequence is refused with those that exist; so is a folder that does not exist."""
+    """An unknown sequence is rejected with a list of those that exist; a missing folder is rejected too."""
     area = spn_data.open_area(finished_area)
     with pytest.raises(InputError, match="no sequence 'low'; the area has: mapping"):
         area.labels("low")
@@ -58,7 +58,7 @@ def test_what_does_not_exist_is_named(finished_area: Path, tmp_path: Path) -> No
 
 
 def test_samples_are_a_sequence(dataset: Path) -> None:
-    """Indexing, length, iteration and negative indices work as for a list, with the data set's own values."""
+    """Samples support indexing, negative indices, length and iteration, with the values of the dataset."""
     samples = spn_data.open_samples(str(dataset), "train")
     with spn_data.Dataset(str(dataset)) as opened:
         group = opened["train"]
@@ -76,7 +76,7 @@ def test_samples_are_a_sequence(dataset: Path) -> None:
 
 
 def test_samples_survive_pickling(dataset: Path) -> None:
-    """A copy of an opened data set opens the file itself."""
+    """An unpickled copy of open samples opens the file again."""
     samples = spn_data.open_samples(dataset, "train")
     copy = pickle.loads(pickle.dumps(samples))
     samples.close()
@@ -86,7 +86,7 @@ def test_samples_survive_pickling(dataset: Path) -> None:
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_workers_read_what_one_process_reads(dataset: Path, method: str) -> None:
-    """Batches by two workers equal those made without any, forked and spawned, with the file open before."""
+    """Two forked or spawned workers, started with the file open, read the same images as one process."""
     from torch.utils.data import DataLoader
 
     samples = spn_data.open_samples(dataset, "train")
@@ -97,7 +97,7 @@ def test_workers_read_what_one_process_reads(dataset: Path, method: str) -> None
 
 
 def test_the_page_shows_names_that_exist() -> None:
-    """Every attribute of the packages that docs/python.md uses is one that they offer."""
+    """Every attribute used in docs/python.md and every name in `__all__` exists."""
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     for package in (spn_data, spn_model):
         used = set(re.findall(rf"\b{package.__name__}\.([A-Za-z_]\w*)", text))
@@ -110,13 +110,14 @@ def test_the_page_shows_names_that_exist() -> None:
 
 
 def _load(name: str) -> Any:
+    """Load a documented name with griffe."""
     griffe = pytest.importorskip("griffe")
     return griffe.load(name, search_paths=[str(ROOT)], docstring_parser="numpy")
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_documented_names_have_numpydoc_sections(name: str) -> None:
-    """Each name of the API reference tells its parameters, attributes and results in sections."""
+    """Every name in the API reference has numpydoc sections for parameters, attributes and results."""
     found = _load(name)
     if found.is_module:
         return

@@ -1,4 +1,4 @@
-"""The built wheel: what it holds, and what it needs, in a clean environment without a network."""
+"""The built wheel in a clean environment without network: its files, dependencies and commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 
 def needed(requirements: list[str], extra: str = "") -> set[str]:
-    """Distributions that requirements lead to, directly or not, as installed here; names in lower case."""
+    """Return the installed distributions required directly or indirectly; names in lower case."""
     found: set[str] = set()
     waiting = [(Requirement(text), extra) for text in requirements]
     while waiting:
@@ -52,7 +52,7 @@ def needed(requirements: list[str], extra: str = "") -> set[str]:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built by the build backend that is installed here."""
+    """The wheel, built with the installed build backend."""
     folder = tmp_path_factory.mktemp("wheel")
     code = f"import hatchling.build as b; print(b.build_wheel({str(folder)!r}))"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
@@ -61,7 +61,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Clean:
-    """A virtual environment that holds the wheel and what one extra of it needs, and nothing else."""
+    """Virtual environment with only the wheel and the dependencies of one of its extras."""
 
     def __init__(self, folder: Path, wheel: Path, extra: str):
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
@@ -77,14 +77,14 @@ class Clean:
             self._link(metadata.distribution(name))
 
     def _link(self, distribution: metadata.Distribution) -> None:
-        """Make the top-level entries of an installed distribution visible here."""
+        """Link the top-level entries of an installed distribution into the environment."""
         for top in {file.parts[0] for file in distribution.files or [] if file.parts[0] != ".."}:
             source = Path(str(distribution.locate_file(top)))
             if source.exists() and not (self.packages / top).exists():
                 (self.packages / top).symlink_to(source)
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run Python there, in another folder, without any path of this checkout."""
+        """Run Python in the environment, in another folder and without any path of this checkout."""
         environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
         return subprocess.run(
             [self.python, *words],
@@ -104,7 +104,7 @@ class Clean:
 
 
 def test_the_wheel_holds_our_packages_and_nothing_of_a_generic_name(wheel: Path) -> None:
-    """Top-level entries are three packages and the metadata; data files and markers of types are there."""
+    """The wheel has only our three packages at top level, with data files and type markers."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
@@ -120,7 +120,7 @@ def test_the_wheel_holds_our_packages_and_nothing_of_a_generic_name(wheel: Path)
 
 
 def test_the_drone_needs_three_packages(wheel: Path, tmp_path: Path) -> None:
-    """With the extra `onboard` alone a bundle runs; neither COLMAP, PyAV, HDF5 nor PyTorch is installed."""
+    """A bundle runs with the extra `onboard` alone, without COLMAP, PyAV, HDF5 and PyTorch."""
     clean = Clean(tmp_path / "drone", wheel, "onboard")
     assert {"numpy", "onnxruntime", "opencv-python-headless"} <= clean.distributions
     assert not {"av", "click", "h5py", "pycolmap", "scipy", "torch"} & clean.distributions
@@ -143,7 +143,7 @@ def test_the_drone_needs_three_packages(wheel: Path, tmp_path: Path) -> None:
 def test_a_missing_extra_is_named_in_one_line(
     wheel: Path, tmp_path: Path, command: str, extra: str
 ) -> None:
-    """Without its extra a command prints the pip command that installs it, and exits with 1."""
+    """Without its extra a command prints the pip command that installs it and exits with code 1."""
     clean = Clean(tmp_path / "bare", wheel, "")
     done = clean.command(command, "--version")
     assert done.returncode == 1
@@ -152,7 +152,7 @@ def test_a_missing_extra_is_named_in_one_line(
 
 
 def test_the_data_command_runs_with_its_extra(wheel: Path, tmp_path: Path) -> None:
-    """With the extra `data`, version and help are printed, and spn-model names what it lacks."""
+    """With the extra `data`, spn-data prints version and help, and spn-model names its missing extra."""
     clean = Clean(tmp_path / "data", wheel, "data")
     assert "torch" not in clean.distributions
     done = clean.command("spn-data", "--version")
