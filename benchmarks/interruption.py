@@ -73,12 +73,12 @@ class Run:
 
     @property
     def output(self) -> str:
-        """What this run has printed so far."""
+        """Output printed by this run so far."""
         return self.log.read_text()[self._from :]
 
     @property
     def step(self) -> str:
-        """The step reported last."""
+        """Step reported last."""
         lines = [line.split(":")[0] for line in self.output.splitlines()]
         known = [line for line in lines if line.startswith(STEPS) or line[:2] in ("1-", "2-", "3-")]
         return known[-1] if known else "start"

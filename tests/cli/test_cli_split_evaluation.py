@@ -182,7 +182,7 @@ def test_what_was_planted_fails_the_audit(
 ) -> None:
     """Each planted fault fails exactly the expected check of the audit."""
     plant(area)
-    for stage in ("4-tracked/medium", SPLIT):  # what a forger would mend too
+    for stage in ("4-tracked/medium", SPLIT):  # a forger would also update these records
         now = {s: Area(area).record(s).fingerprint() for s in Area(area).record(stage).upstream}
         rewrite(area / stage / "stage.json", lambda value, now=now: value.update(upstream=now))
     result = run("audit", "--area", area)

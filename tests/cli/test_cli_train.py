@@ -190,7 +190,7 @@ def test_what_nothing_can_be_trained_with_leaves_no_run(place):
             assert told in ran.output
             assert len(ran.output.strip().splitlines()) == 1
     mended = trained(place, "--recipe", str(place / "bad.toml"), "--seed", "9")
-    assert "has no option 'frosen'" in mended.output  # and not: already exists
+    assert "has no option 'frosen'" in mended.output  # a failed run must not count as existing
 
 
 def test_an_area_without_a_split_is_refused(place):

@@ -202,7 +202,7 @@ def test_kills_at_random_moments(flight1: Path, flight2: Path, tmp_path: Path) -
         assert kill.difference.same_frames
         assert kill.difference.position_m < 0.01
         assert kill.difference.rotation_deg < 0.05
-        if not kill.step.startswith("mapping"):  # which goes on from its last snapshot
+        if not kill.step.startswith("mapping"):  # mapping resumes from its last snapshot
             assert kill.difference.largest_as_is_m < 1e-9
 
 

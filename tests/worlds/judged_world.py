@@ -24,7 +24,7 @@ ROLES = {
 
 
 def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: Any) -> Path:
-    """Write a dataset with two evaluation flights, one with two strata. changes : to DatasetInfo."""
+    """Write a dataset with two evaluation flights, one with two strata; `changes` are DatasetInfo fields."""
     info: DatasetInfo = replace(INFO, **changes)
     wanted = counts or {"train": 12, "validation": 3, "medium": 7, "low": 4}
     path.parent.mkdir(parents=True, exist_ok=True)

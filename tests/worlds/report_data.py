@@ -1,4 +1,4 @@
-"""Made-up area for the tests of the report: a circular flight over a field, and another one above it."""
+"""Synthetic area for the tests of the report: a circular flight over a field and another one above it."""
 
 from __future__ import annotations
 
