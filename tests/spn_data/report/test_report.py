@@ -1,4 +1,4 @@
-"""The report says what the area holds, judges it by its rules, and lets no text of the area become markup."""
+"""The report shows and judges the contents of an area, and escapes all of its text."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def given(html: str) -> dict:
-    """What the page's script is given."""
+    """Return the data passed to the script of the page."""
     (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html)
     return json.loads(text)
 
@@ -36,7 +36,7 @@ def with_counts(data: ReportData, **counts: object) -> ReportData:
 
 
 def test_an_area_with_everything_is_ready():
-    """No finding weighs against the made-up area, and the page says so before all else."""
+    """The complete synthetic area is judged ready at the top of the page, without adverse findings."""
     found = verdict(area())
     assert [f for f in found.findings if f.level is not Level.GOOD] == []
     assert found.headline == "Ready to train"
@@ -173,7 +173,7 @@ RULES = {
 
 @pytest.mark.parametrize("name", RULES)
 def test_each_rule_of_the_verdict(name):
-    """One thing wrong gives one finding of its weight, which decides the verdict and comes first."""
+    """Each single defect gives one finding of its weight, which decides the verdict and comes first."""
     change, level, text = RULES[name]
     found = verdict(change(area()))
     bad = [f for f in found.findings if f.level is not Level.GOOD]
@@ -183,7 +183,7 @@ def test_each_rule_of_the_verdict(name):
 
 
 def test_few_training_frames_are_a_reservation():
-    """93 training frames are fewer than 100; 143 are not."""
+    """93 training frames are fewer than 100 and give a reservation; 143 give none."""
     found = verdict(area(cameras=100))
     assert found.headline == "Ready to train, with 1 reservation"
     assert "93 training frames" in found.findings[0].text
@@ -201,7 +201,7 @@ def test_limits_of_the_verdict_are_documented():
 
 
 def test_options_are_documented_with_their_defaults():
-    """docs/report.md has a row for each option of `spn-data report`, and no other."""
+    """docs/report.md has a row for each option of `spn-data report`, and no others."""
     from spn_cli.report import report
 
     text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
@@ -213,7 +213,7 @@ def test_options_are_documented_with_their_defaults():
 
 
 def test_the_page_loads_nothing():
-    """No address, no file and no import: what the page shows is in it."""
+    """The page is self-contained: it has no address, file or import to load."""
     html = render(area())
     assert html.isascii()
     assert re.findall(r"https?://|@import|\burl\(|<link(?! rel=\"icon\" href=\"data:)", html) == []
@@ -225,7 +225,7 @@ HOSTILE = '</script><img src=x onerror="alert(1)">&amp;\'\u2028\udcff<!--'
 
 
 def test_no_text_of_the_area_becomes_markup():
-    """Paths, notes, reasons and names of sequences with tags in them are shown as they are."""
+    """Markup in paths, notes, reasons and sequence names is shown as plain text."""
     data = area()
     assert data.split is not None
     frames = data.frames
@@ -271,7 +271,11 @@ def test_no_text_of_the_area_becomes_markup():
 
 
 def test_each_section_is_there_with_its_figures():
-    """Registered frames, uncertainty, residuals, strata, places to fly again, audit, versions."""
+    """Each section shows its figures.
+
+    The sections are registered frames, uncertainty, residuals, strata, places to fly again, audit and
+    versions.
+    """
     html = render(area())
     for text in (
         "150 of 150",
@@ -290,7 +294,7 @@ def test_each_section_is_there_with_its_figures():
 
 
 def test_an_area_without_metres_says_so_everywhere():
-    """No metres and no north are claimed where the map is in its own unit."""
+    """Without georegistration the page claims neither metres nor north."""
     data = replace(area(), geo=None, units="model")
     html = render(data)
     assert html.count("units: model") == 2
@@ -300,7 +304,7 @@ def test_an_area_without_metres_says_so_everywhere():
 
 
 def test_an_area_with_frames_only_is_shown():
-    """Before there is a model, the page holds the frames and says what to do."""
+    """Before reconstruction, the page shows the frames and the next step."""
     data = area()
     nowhere = np.full((150, 3), np.nan)
     frames = data.frames.select(~data.frames.evaluation)
@@ -336,12 +340,12 @@ def test_an_area_with_frames_only_is_shown():
     ],
 )
 def test_arrays_are_packed_without_loss(kind, values):
-    """What the page is given is what was put in."""
+    """Packed arrays decode to the values put in."""
     np.testing.assert_array_equal(unpack(pack(values, kind)), values)
 
 
 def test_positions_of_points_are_exact_to_their_step():
-    """Points in the page lie within half a step of where they are: millimetres over 80 m."""
+    """Point coordinates are within half a step of their values: millimetres over 80 m."""
     data = area(map_points=500)
     packed = given(render(data))
     display = display_of(data.frames, data.points, has_up=True)
@@ -353,7 +357,7 @@ def test_positions_of_points_are_exact_to_their_step():
 
 
 def test_points_are_thinned_and_the_page_says_so():
-    """A page holds no more points than asked for, and none from far beyond the map."""
+    """The page has no more points than requested and none far beyond the map, and says so."""
     data = area(map_points=4000)
     far = data.points.xyz.copy()
     far[0] = [1e6, 0, 0]
@@ -365,7 +369,7 @@ def test_points_are_thinned_and_the_page_says_so():
 
 
 def test_frames_are_thinned_but_for_those_that_matter():
-    """Of too many frames, candidates go first; failed and chosen ones all stay."""
+    """If there are too many frames, candidates are dropped first; failed and chosen ones all stay."""
     base = flight("flight1", 400, radius_m=30, height_m=10, failed=50)
     status = np.where(np.arange(400) < 200, "skipped", base.status)
     frames = replace(base, status=status, tracked=np.arange(400) >= 300)
@@ -382,7 +386,7 @@ def test_frames_are_thinned_but_for_those_that_matter():
 
 
 def test_up_is_guessed_from_the_cameras_without_metres():
-    """In a model that lies on its side, what the cameras call up is shown upwards."""
+    """Without georegistration, the cameras' up direction is drawn upwards even in a tilted model."""
     frames = flight("flight1", 60, radius_m=30, height_m=10)
     turned = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     poses = frames.poses.from_rotations(
@@ -396,7 +400,7 @@ def test_up_is_guessed_from_the_cameras_without_metres():
 
 
 def test_residuals_are_drawn_true_to_scale():
-    """One residual of 1 m east, drawn 5 times longer: its line has the length of 5 m on the map's bar."""
+    """A residual of 1 m east, drawn 5 times larger, is as long as 5 m on the scale bar."""
     frames = flight("flight1", 60, radius_m=30, height_m=10)
     frames = replace(
         frames, gnss_m=np.tile([1.0, 0, 0.2], (60, 1)), gnss_outlier=np.zeros(60, bool)
@@ -417,7 +421,7 @@ def test_residuals_are_drawn_true_to_scale():
 
 
 def test_one_outlier_does_not_fill_the_map_of_residuals():
-    """A fix 500 m off is cut and marked, and the others keep their size."""
+    """A fix 500 m off is clipped and marked, and the other residuals keep their scale."""
     frames = flight("flight1", 60, radius_m=30, height_m=10)
     residuals = frames.gnss_m.copy()
     residuals[7] = [500.0, 0, 0]
@@ -430,18 +434,18 @@ def test_one_outlier_does_not_fill_the_map_of_residuals():
 
 
 def test_flights_without_fixes_have_no_map_of_residuals():
-    """Without GNSS nothing is drawn."""
+    """Without GNSS fixes, no map of residuals is drawn."""
     frames = flight("medium", 60, radius_m=30, height_m=10)
     assert residual_map(frames) == ""
 
 
 @pytest.mark.parametrize(("value", "rounded"), [(0.99, 0.5), (1.0, 1.0), (4.99, 2.0), (73.0, 50.0)])
 def test_round_figures_for_bars(value, rounded):
-    """Bars are 1, 2 or 5 times a power of ten."""
+    """Scale bars are 1, 2 or 5 times a power of ten."""
     assert round_down(value) == pytest.approx(rounded)
 
 
 def test_numbers_that_json_lacks_are_refused():
-    """NaN never gets into the page as JSON: browsers would not read it."""
+    """NaN is refused in the page's JSON because browsers cannot parse it."""
     with pytest.raises(ValueError):
         script_json({"x": float("nan")})

@@ -1,4 +1,4 @@
-"""The report in a real browser: it draws, says nothing on the console, sorts, filters and is quick."""
+"""The report in a real browser: drawing, sorting, filtering, speed and an empty console."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: chromium)"),
 ]
 
-# What the driver chatters about, which no page can do anything about.
+# Messages of the browser driver that do not come from the page.
 HARMLESS = ("GL Driver Message",)
 
-# Runs in the page after its own script, and leaves what it measured in the document.
+# Runs in the page after its own script and writes its measurements into the document.
 PROBE = """<script>
 const found = {};
 const pixels = canvas => {
@@ -60,7 +60,7 @@ const report = () => {
 
 @dataclass(frozen=True)
 class Visit:
-    """What a browser made of a page. found : what the probe measured; console : what the page said there."""
+    """Result of visiting a page: `found` holds the probe's measurements, `console` the page's messages."""
 
     found: dict[str, Any]
     console: list[str]
@@ -76,9 +76,9 @@ def visit(
     phone: bool = False,
     when_loaded: bool = False,
 ) -> Visit:
-    """Open a page in headless Chromium, run a probe in it, and read the document that it leaves.
+    """Open a page in headless Chromium, run a probe in it, and read the resulting document.
 
-    when_loaded : the probe waits for the page's images too.
+    If `when_loaded`, the probe also waits for the page's images.
     """
     if before:
         page = page.replace("<body>", f"<body><script>{before}</script>", 1)
@@ -86,7 +86,7 @@ def visit(
     if when_loaded:
         probe = f'window.addEventListener("load", () => {{ {probe} }});'
     page = page.replace("</body>", PROBE % probe + "</body>")
-    if phone:  # a window of Chromium has a least width, a frame has none
+    if phone:  # a Chromium window has a minimum width, a frame does not
         page = (
             f'<body><iframe srcdoc="{html.escape(page)}" width="390" height="844"></iframe></body>'
         )
@@ -111,7 +111,7 @@ def visit(
 
 
 def test_the_page_draws_and_says_nothing(tmp_path):
-    """WebGL draws points, cameras and grid; turning changes the picture; the console stays empty."""
+    """WebGL draws points, cameras and grid; rotating changes the picture; the console stays empty."""
     seen = visit(
         tmp_path,
         render(area()),
@@ -156,7 +156,7 @@ def test_the_page_draws_and_says_nothing(tmp_path):
 
 
 def test_the_table_sorts_and_filters(tmp_path):
-    """A click on a column sorts, another turns the order; what is unknown stays last; words filter."""
+    """Clicking a column sorts, clicking again reverses; unknown values stay last; words filter the rows."""
     data = area()
     backwards = data.frames.select(np.arange(len(data.frames))[::-1])  # frames without a pose first
     seen = visit(
@@ -194,7 +194,7 @@ def test_the_table_sorts_and_filters(tmp_path):
 
 
 def test_a_frame_is_told_and_found_from_its_strip(tmp_path):
-    """Pointing at a failed frame's tick tells why; a click shows it in the table, and marks the strip."""
+    """Hovering over a failed frame's tick shows the reason; a click selects it in table and strip."""
     seen = visit(
         tmp_path,
         render(area()),
@@ -220,7 +220,7 @@ def test_a_frame_is_told_and_found_from_its_strip(tmp_path):
 
 
 def test_a_page_without_a_model_is_quiet_too(tmp_path):
-    """Frames alone, without any pose, are listed and drawn over time, and nothing fails."""
+    """A page of frames without any pose lists them, draws them over time and raises no error."""
     data = area()
     frames = data.frames.select(~data.frames.evaluation)
     unknown = replace(
@@ -245,7 +245,7 @@ def test_a_page_without_a_model_is_quiet_too(tmp_path):
 
 
 def test_without_webgl_a_plain_canvas_draws(tmp_path):
-    """Where the browser gives no WebGL, the view is drawn all the same, and says so."""
+    """Without WebGL, the view is drawn on a plain canvas and a note says so."""
     seen = visit(
         tmp_path,
         render(area()),
@@ -265,7 +265,7 @@ def test_without_webgl_a_plain_canvas_draws(tmp_path):
 
 
 def test_a_large_area_loads_in_three_seconds(tmp_path):
-    """1,000 cameras and 100,000 points are shown within 3 s of opening the file, the better of two visits."""
+    """1,000 cameras and 100,000 points appear within 3 s of opening the file, in the better of two visits."""
     page = render(area(cameras=1000, map_points=100_000))
     visits = [
         visit(
@@ -284,7 +284,7 @@ def test_a_large_area_loads_in_three_seconds(tmp_path):
 
 
 def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
-    """At 390 pixels nothing but tables in their own frames is wider than the screen."""
+    """At a width of 390 pixels, only tables in their own frames are wider than the screen."""
     seen = visit(
         tmp_path,
         render(area()),

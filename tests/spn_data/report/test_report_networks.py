@@ -1,4 +1,4 @@
-"""The page's part on networks: their errors beside what needs none, from files that may be hostile."""
+"""The network section of the report: errors of networks and baselines, from possibly hostile files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ HOSTILE_SVG = (
 
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An area with two networks, evaluated together; no test may change it."""
+    """Area with two networks, evaluated together; tests must not change it."""
     root = tmp_path_factory.mktemp("networks") / "area"
     dataset = write_judged(root / "5-split" / "dataset.h5")
     for seed, name in enumerate(("first", "second")):
@@ -55,7 +55,7 @@ def root(evaluated: Path, tmp_path: Path) -> Path:
 
 
 def page(root: Path) -> str:
-    """The page of an area with these networks."""
+    """Return the page of an area with these networks."""
     runs, broken = read_runs(Area(root))
     html = render(replace(made_up_area(), runs=runs, broken_runs=broken))
     (section,) = re.findall(r'<section id="networks">.*?</section>', html, re.DOTALL)
@@ -70,7 +70,7 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def test_networks_stand_beside_what_needs_none(root):
-    """One table a group, both networks and all baselines in it, with the figures of metrics.json."""
+    """Each group has one table with both networks, all baselines, and the figures of metrics.json."""
     shown = page(root)
     for group, frames in (("low", 4), ("medium", 7)):
         assert f"<h3>{group}: {frames} test frames</h3>" in shown
@@ -87,7 +87,7 @@ def test_networks_stand_beside_what_needs_none(root):
 
 
 def test_a_short_training_is_called_short(root):
-    """Forty images are no training to judge a kind of network by, and the page says so."""
+    """A training on only forty images is marked as short."""
     shown = page(root)
     assert "Short training: first (40 images), second (40 images)." in shown
     table = shown[shown.index('class="trained"') : shown.index("</table>")]
@@ -100,7 +100,7 @@ def test_a_short_training_is_called_short(root):
 
 
 def test_figures_are_images_and_nothing_else(root):
-    """Each figure is an <img> with the file's own bytes in it: no figure is part of the page."""
+    """Each figure is an <img> with the exact bytes of its file, and no SVG is inlined."""
     shown = page(root)
     images = IMAGE.findall(shown)
     assert shown.count("<img") == len(images) == shown.count("src=")
@@ -114,7 +114,7 @@ def test_figures_are_images_and_nothing_else(root):
 
 
 def test_what_was_judged_on_other_frames_is_told(root):
-    """After another split, or another training, the page does not pass old figures off as today's."""
+    """After another split or further training, the page marks the old evaluation as outdated."""
     write_judged(root / "5-split" / "dataset.h5", {"train": 9, "medium": 4})
     assert "earlier dataset than the current one: first, second." in page(root)
     write_network(root / "runs/first/checkpoint.safetensors", root / "5-split/dataset.h5", seed=7)
@@ -146,7 +146,7 @@ DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {
 
 @pytest.mark.parametrize("what", DAMAGE)
 def test_a_damaged_metrics_json_is_told_and_the_rest_shown(root, what):
-    """One run that cannot be read is named with the remedy; the page and the other run stand."""
+    """An unreadable run is named with a remedy, and the page still shows the other run."""
     rewrite(root / "runs" / "first" / "metrics.json", DAMAGE[what])
     shown = page(root)
     assert "metrics.json: cannot be shown" in shown
@@ -156,13 +156,13 @@ def test_a_damaged_metrics_json_is_told_and_the_rest_shown(root, what):
 
 @pytest.mark.parametrize("content", ["", "{", "[" * 100_000, '{"version": 1e999}', "\x00"])
 def test_what_is_no_json_is_told(root, content):
-    """Empty, cut, bottomless: a line, and never a crash."""
+    """Empty, truncated and deeply nested files give one line instead of a crash."""
     (root / "runs" / "first" / "metrics.json").write_text(content)
     assert "metrics.json: cannot be shown" in page(root)
 
 
 def test_numbers_that_are_none_are_not_shown_as_numbers(root):
-    """NaN and infinity, which some JSON holds, are as unknown as null."""
+    """NaN and infinity, which some JSON files contain, are shown as unknown, like null."""
 
     def change(table: dict[str, Any]) -> None:
         table["groups"]["medium"]["first"]["position"].update(median=float("nan"), p95=float("inf"))
@@ -175,7 +175,7 @@ def test_numbers_that_are_none_are_not_shown_as_numbers(root):
 
 
 def test_runs_with_other_columns_share_a_table(root):
-    """A run that counts other limits or axes leaves cells empty; it neither shifts nor breaks the table."""
+    """Runs with different limits or axes share a table, with empty cells for missing columns."""
 
     def change(table: dict[str, Any]) -> None:
         one = table["groups"]["medium"]["second"]
@@ -189,7 +189,7 @@ def test_runs_with_other_columns_share_a_table(root):
 
 
 def test_no_text_of_metrics_becomes_markup(root):
-    """Names of methods, groups, kinds and notes with tags in them are shown as they are."""
+    """Markup in method, group, kind and note names is shown as plain text."""
 
     def change(table: dict[str, Any]) -> None:
         table["groups"][ALERT] = table["groups"].pop("medium")
@@ -209,7 +209,7 @@ def test_no_text_of_metrics_becomes_markup(root):
 
 
 def test_figures_that_are_none_of_ours_are_left_out(root):
-    """Links, other files and far too large ones are counted, not shown."""
+    """Links, foreign files and oversized figures are counted but not shown."""
     folder = root / "runs" / "first" / "figures"
     before = len(IMAGE.findall(page(root)))
     (root / "secret.svg").write_text('<svg viewBox="0 0 9 9"></svg>')
@@ -222,7 +222,7 @@ def test_figures_that_are_none_of_ours_are_left_out(root):
 
 
 def test_status_lists_runs(root):
-    """`spn-data status` tells which networks there are and which are not evaluated yet."""
+    """`spn-data status` lists the networks and marks those not evaluated yet."""
     area = root
     (area / ".1-frames.partial").mkdir()
     (area / "runs" / "second" / "metrics.json").unlink()
@@ -241,7 +241,10 @@ def test_status_lists_runs(root):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: chromium)")
 def test_a_hostile_figure_runs_nothing_in_a_browser(root, tmp_path):
-    """Scripts, handlers and links of an SVG do nothing as an image: it is drawn, and the console is empty."""
+    """A hostile SVG is drawn as an image: its scripts, handlers and links do nothing.
+
+    The console stays empty.
+    """
     figures = root / "runs" / "compared" / "figures"
     shutil.rmtree(figures)
     figures.mkdir()

@@ -1,4 +1,4 @@
-"""Simulated flights on disk: the same for the same options, complete or absent, and consistent."""
+"""Simulated flights on disk are reproducible, complete or absent, and consistent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from spn_data.simulate import (
     simulate_telemetry,
 )
 
-# Three frames of each flight at 160 x 90, with coarse surfaces: quick to paint and render.
+# Three frames of each flight at 160 x 90, with coarse textures: quick to paint and render.
 TINY = replace(
     preset("standard", seed=11),
     width=160,
@@ -54,7 +54,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_folder_holds_videos_telemetry_and_truth_and_nothing_else(flights: Path) -> None:
-    """The tree is the documented one, and no partial folder stays beside it."""
+    """The folder has the documented tree, and no partial folder remains."""
     assert list(tree(flights)) == [
         "evaluation/low.SRT",
         "evaluation/low.mp4",
@@ -73,7 +73,7 @@ def test_folder_holds_videos_telemetry_and_truth_and_nothing_else(flights: Path)
 
 
 def test_truth_is_that_of_the_paths_and_its_times_are_the_videos(flights: Path) -> None:
-    """Truth read back equals the exact path to a micrometre; times equal the container's."""
+    """Truth read back equals the exact path to a micrometre, and times equal the video container's."""
     for name, path in simulate_paths(TINY).items():
         truth = read_truth(flights / "truth", name)
         np.testing.assert_allclose(truth.poses.centers, path.poses.centers, rtol=0, atol=1e-8)
@@ -92,7 +92,7 @@ def test_truth_is_that_of_the_paths_and_its_times_are_the_videos(flights: Path) 
 
 
 def test_srt_says_what_the_telemetry_says_to_its_last_digit(flights: Path) -> None:
-    """Each record lies within half a unit of its last decimal of truth plus error model."""
+    """Each record is within half a unit of its last decimal of truth plus error model."""
     number = r"(-?\d+\.\d+)"
     pattern = re.compile(
         rf"\[latitude: {number}\] \[longitude: {number}\] \[rel_alt: {number} abs_alt: {number}\] "
@@ -116,7 +116,7 @@ def test_srt_says_what_the_telemetry_says_to_its_last_digit(flights: Path) -> No
 def test_same_options_give_the_same_bytes_whatever_renders_them(
     flights: Path, tmp_path: Path
 ) -> None:
-    """Two processes write what one wrote, of the flight asked for alone; another seed writes others."""
+    """Two processes write the same bytes as one, also for one flight alone; another seed differs."""
     only = replace(TINY, only=("flight2",))
     simulate(tmp_path / "two", only, workers=2)
     two, one = tree(tmp_path / "two"), tree(flights)
@@ -139,7 +139,7 @@ def test_same_options_give_the_same_bytes_whatever_renders_them(
     ],
 )
 def test_options_lead_to_complete_flights(change: dict[str, object], tmp_path: Path) -> None:
-    """Rolling shutter, other paths, other areas and bare telemetry all render."""
+    """Flights with rolling shutter, other paths, other areas and plain telemetry are all rendered."""
     options = replace(TINY, only=("mapping",), **change)  # type: ignore[arg-type]
     simulate(tmp_path / "out", options, workers=1)
     for name in simulate_paths(options):
@@ -150,7 +150,7 @@ def test_options_lead_to_complete_flights(change: dict[str, object], tmp_path: P
 
 
 def test_existing_folder_is_refused_and_a_stopped_run_leaves_nothing(tmp_path: Path) -> None:
-    """What is there stays; an interrupted run leaves neither the folder nor its partial one."""
+    """An existing folder is refused unchanged, and an interrupted run leaves no folder, even partial."""
     (tmp_path / "there").mkdir()
     with pytest.raises(StageError, match="there already exists; choose another folder"):
         simulate(tmp_path / "there", TINY, workers=1)
@@ -164,7 +164,7 @@ def test_existing_folder_is_refused_and_a_stopped_run_leaves_nothing(tmp_path: P
 
 
 def test_progress_counts_every_frame(tmp_path: Path) -> None:
-    """Progress goes from 1 to the number of frames of all flights asked for."""
+    """Progress goes from 1 to the number of frames of all requested flights."""
     seen: list[tuple[int, int]] = []
     options = replace(TINY, only=("evaluation",))
     simulate(tmp_path / "out", options, lambda *counts: seen.append(counts), workers=1)
@@ -173,7 +173,7 @@ def test_progress_counts_every_frame(tmp_path: Path) -> None:
 
 
 def test_impossible_options_are_refused_in_one_line() -> None:
-    """Odd image sizes, no frames, shares beyond one and offsets of minutes are the user's to correct."""
+    """Odd image sizes, no frames, shares beyond one and offsets of minutes give a one-line error."""
     for change, message in (
         ({"width": 161}, "image size 161 x 90: H.264 needs even numbers"),
         ({"fps": 0.0}, "fps, area factor and length factor must be above zero"),
@@ -186,7 +186,7 @@ def test_impossible_options_are_refused_in_one_line() -> None:
 
 
 def test_damaged_or_newer_truth_is_refused(flights: Path, tmp_path: Path) -> None:
-    """A missing flight, other columns, a garbage row and a newer version each get one clear line."""
+    """A missing flight, other columns, a garbage row and a newer version each give one clear line."""
     truth = tmp_path / "truth"
     truth.mkdir()
     for name, content in tree(flights / "truth").items():

@@ -1,4 +1,4 @@
-"""Simulated flights keep to their heights, angles and distances; telemetry is truth plus errors."""
+"""Simulated flights respect heights, angles and distances; telemetry is truth plus errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def mapping_poses(paths: dict[str, FlightPath]) -> Poses:
 
 
 def distances(poses: Poses, others: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Metres (N, M) and degrees (N, M) from each pose to each other."""
+    """Return metres (N, M) and degrees (N, M) between all pairs of poses."""
     metres = np.linalg.norm(poses.centers[:, None] - others.centers, axis=2)
     degrees = rotation_errors_deg(poses.quats_wxyz[:, None], others.quats_wxyz[None])
     return metres, degrees
@@ -46,7 +46,10 @@ def distances(poses: Poses, others: Poses) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("seed", "area_factor"), CASES)
 def test_flights_keep_to_their_heights_and_angles(seed: int, area_factor: float) -> None:
-    """Mapping flies 1.5-9 m high at -10 to +15 degrees and turns calmly; low flies 12-21 m at -45 to -70."""
+    """Heights, pitch angles and rates are within bounds.
+
+    Mapping flies 1.5-9 m high at -10 to +15 degrees and turns slowly; low flies 12-21 m at -45 to -70.
+    """
     paths = simulate_paths(options_of(seed, area_factor))
     assert list(paths) == ["flight1", "flight2", "medium", "low"]
     ranges = {"low": ((12.0, 21.0), (-70.0, -45.0)), "medium": ((1.5, 9.0), (-10.0, 15.0))}
@@ -71,7 +74,7 @@ def test_flights_keep_to_their_heights_and_angles(seed: int, area_factor: float)
 def test_low_flight_is_far_from_every_mapping_frame_and_medium_is_near(
     seed: int, area_factor: float
 ) -> None:
-    """Each low frame is 5 m or 35 degrees from all mapping frames; most of medium is near one."""
+    """Each low frame is 5 m or 35 degrees from all mapping frames; most medium frames are near one."""
     paths = simulate_paths(options_of(seed, area_factor))
     mapping = mapping_poses(paths)
     metres, degrees = distances(paths["low"].poses, mapping)
@@ -84,7 +87,7 @@ def test_low_flight_is_far_from_every_mapping_frame_and_medium_is_near(
 
 @pytest.mark.parametrize("paths", list(MappingPaths))
 def test_flights_stay_clear_of_walls_and_objects(paths: MappingPaths) -> None:
-    """No camera comes within half a metre of an obstacle, or two metres of a facade below its top."""
+    """No camera is within 0.5 m of an obstacle, or within 2 m of a facade below its top."""
     for seed in (1, 2, 3):
         options = replace(preset("standard", seed=seed), mapping_paths=paths)
         place = build_scene(options.scene)
@@ -98,7 +101,7 @@ def test_flights_stay_clear_of_walls_and_objects(paths: MappingPaths) -> None:
 
 
 def test_nadir_looks_down_in_lines_and_straight_is_straight() -> None:
-    """The other mapping paths: parallel lines 45 m up; a line off which the camera moves by centimetres."""
+    """The nadir path has parallel lines 45 m up; the straight path deviates by centimetres."""
     nadir = simulate_paths(
         replace(preset("standard"), mapping_paths=MappingPaths.NADIR, only=("mapping",))
     )
@@ -114,7 +117,7 @@ def test_nadir_looks_down_in_lines_and_straight_is_straight() -> None:
 
 
 def test_paths_depend_on_the_seed_alone_and_not_on_which_are_asked_for() -> None:
-    """Equal options give equal paths, `only` leaves the others as they are, another seed moves them."""
+    """Equal options give equal paths, `only` does not change the others, and another seed does."""
     options = preset("demo", seed=5)
     paths, again = (
         simulate_paths(options),
@@ -149,7 +152,7 @@ def test_presets_differ_in_image_and_rate_only() -> None:
 
 
 def test_telemetry_is_truth_plus_its_errors() -> None:
-    """Positions and heights lead back to truth plus the drawn error; the gimbal bias is constant."""
+    """Positions and heights are truth plus the drawn error, and the gimbal bias is constant."""
     options = preset("standard", seed=4)
     path = simulate_paths(options)["flight1"]
     telemetry = simulate_telemetry(path, options)
@@ -171,7 +174,7 @@ def test_telemetry_is_truth_plus_its_errors() -> None:
 
 
 def test_adding_the_time_offset_to_the_records_puts_them_right() -> None:
-    """The record stamped t describes the video's time t + offset."""
+    """A record stamped t describes the video at time t + offset."""
     options = replace(preset("standard"), time_offset_s=0.7, gnss=GnssOptions.rtk())
     path = simulate_paths(options)["flight2"]
     telemetry = simulate_telemetry(path, options)
@@ -187,7 +190,7 @@ def test_adding_the_time_offset_to_the_records_puts_them_right() -> None:
 
 
 def test_gnss_errors_have_the_stated_statistics() -> None:
-    """Sigma of each axis within 4 %, correlation 1/e after 60 s, white noise and bursts as set."""
+    """Sigma of each axis is within 4 %, correlation 1/e after 60 s, white noise and bursts as set."""
     rng = np.random.default_rng(0)
     time_s = np.arange(0.0, 121.0, 20.0)
     calm = GnssOptions(white_sigma_m=0.0, burst_interval_s=float("inf"))
@@ -209,7 +212,7 @@ def test_gnss_errors_have_the_stated_statistics() -> None:
 
 
 def test_rtk_has_three_centimetres_and_nothing_else() -> None:
-    """RTK noise is white: its deviation is 3 cm, and its mean over time vanishes."""
+    """RTK noise is white with a standard deviation of 3 cm, and its mean over time vanishes."""
     errors, is_burst = gnss_errors(np.arange(20000.0), GnssOptions.rtk(), np.random.default_rng(1))
     assert not is_burst.any()
     np.testing.assert_allclose(errors.std(axis=0), 0.03, rtol=0.03)

@@ -1,4 +1,4 @@
-"""The renderer is exact and free of aliasing; exposures and rolling shutters are centred on their pose."""
+"""Rendering is exact and free of aliasing; exposure and rolling shutter are centred on the pose."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def chessboard() -> Texture:
 
 
 def wall(texture: str, *, y: float = 8.0, half: float = 4.0) -> Face:
-    """Square that faces south, its middle one metre above the origin's height."""
+    """Return a square facing south, its centre one metre above the height of the origin."""
     return Face(
         texture,
         np.array([-half, y, 1 + half]),
@@ -55,13 +55,13 @@ def pixels_of(
 
 
 def found_corners(image: np.ndarray, expected: np.ndarray, window: int = 4) -> np.ndarray:
-    """Chessboard corners (N, 2) near expected pixels (N, 2), in COLMAP's convention.
+    """Return chessboard corners (N, 2) near expected pixels (N, 2), in COLMAP's convention.
 
-    The image is blurred first: the detector weighs squared gradients, which are biased by up to 0.1 px on
-    edges sharper than a pixel.
+    The image is blurred first because the detector weighs squared gradients, which are biased by up to 0.1 px
+    on edges sharper than a pixel.
     """
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.2)
-    # Where the detector fails it returns its start, which must therefore not be the answer.
+    # A failed detection returns its start, so the start must differ from the answer.
     start = (expected - 0.5 + 0.6).astype(np.float32).reshape(-1, 1, 2)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
     return cv2.cornerSubPix(grey, start, (window, window), (-1, -1), stop).reshape(-1, 2) + 0.5
@@ -72,7 +72,7 @@ def smoothed(image: np.ndarray) -> np.ndarray:
 
 
 def wide_enough(camera: Camera, expected: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Which corners (N,) lie inside the image and at least 9 px from each of their neighbours (N, K, 2)."""
+    """Return which corners (N,) are in the image and at least 9 px from their neighbours (N, K, 2)."""
     size = [camera.width, camera.height]
     inside = ((expected > 12) & (expected < np.array(size) - 12)).all(axis=1)
     spacing = np.linalg.norm(neighbours - expected[:, None], axis=2).min(axis=1)
@@ -81,7 +81,7 @@ def wide_enough(camera: Camera, expected: np.ndarray, neighbours: np.ndarray) ->
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_known_corners_appear_within_a_tenth_of_a_pixel(lens: str) -> None:
-    """Chessboard corners lie where Camera.project says, from several poses through a distorted lens."""
+    """Chessboard corners are where Camera.project predicts, for several poses and a distorted lens."""
     camera, face = LENSES[lens], wall("board")
     renderer = SceneRenderer([face], {"board": chessboard()}, camera)
     views = [
@@ -103,12 +103,12 @@ def test_known_corners_appear_within_a_tenth_of_a_pixel(lens: str) -> None:
     error = np.concatenate(errors)
     assert len(error) > 600
     assert np.linalg.norm(error, axis=1).max() < 0.1
-    # Half a pixel of convention would show here; what is left is the detector's noise.
+    # A half-pixel convention error would show here; what remains is detector noise.
     assert np.abs(error.mean(axis=0)).max() < 0.005
 
 
 def test_outlines_lie_within_a_fiftieth_of_a_pixel() -> None:
-    """The centroid of a small bright square before a dark wall is that of its projection."""
+    """The centroid of a small bright square on a dark wall agrees with its projection to 1/50 px."""
     camera = Camera.from_horizontal_fov(640, 360, 72.0)
     square = Face(
         "white", np.array([0.2, 5, 1.6]), np.array([0.8, 0.1, 0.1]), np.array([0.1, 0, -0.7])
@@ -130,7 +130,10 @@ def test_outlines_lie_within_a_fiftieth_of_a_pixel() -> None:
 
 
 def test_nearer_faces_hide_farther_ones_and_rays_past_all_see_haze() -> None:
-    """Order in the list does not matter, and a face is seen from its front only."""
+    """Faces occlude those behind in any list order and are visible from the front only.
+
+    Rays that hit no face see haze.
+    """
     camera = LENSES["72 degrees"]
     textures = {"near": plain((200, 0, 0)), "far": plain((0, 200, 0))}
     near, far = wall("near", y=4.0, half=0.5), wall("far", half=2.0)
@@ -145,7 +148,7 @@ def test_nearer_faces_hide_farther_ones_and_rays_past_all_see_haze() -> None:
 
 
 def test_panes_show_the_mirror_image_of_what_lies_opposite() -> None:
-    """A corner opposite a mirror appears where its mirror image projects to, from two eyes."""
+    """A corner opposite a mirror appears where its mirror image projects to, from two viewpoints."""
     camera = LENSES["72 degrees"]
     mirror = wall("glass")
     board = Face("board", np.array([7.0, -6, 8]), np.array([-14.0, 0, 0]), np.array([0, 0, -14.0]))
@@ -173,7 +176,7 @@ def textures(place: SceneFaces) -> dict[str, Texture]:
 def test_survey_targets_of_the_courtyard_appear_where_they_are(
     place: SceneFaces, textures: dict[str, Texture]
 ) -> None:
-    """The centres of the targets painted on the four facades project to within a tenth of a pixel."""
+    """Centres of the targets painted on the four facades are within 0.1 px of their projection."""
     camera = LENSES["72 degrees"]
     renderer = SceneRenderer(place.faces, textures, camera)
     for landmark, heading in zip(place.landmarks, (0, 180, 90, 270), strict=True):
@@ -187,7 +190,7 @@ def test_survey_targets_of_the_courtyard_appear_where_they_are(
 
 
 def test_detail_finer_than_a_pixel_turns_grey() -> None:
-    """A chessboard floor whose cells are smaller than a pixel shows no false pattern."""
+    """A chessboard floor with cells smaller than a pixel shows no aliasing pattern."""
     camera = Camera.from_horizontal_fov(320, 180, 30.0)
     cells = (np.indices((720, 720)).sum(axis=0) % 2 * 160 + 40).astype(np.uint8)
     board = Texture.from_image(np.dstack([np.kron(cells, np.ones((4, 4), np.uint8))] * 3))
@@ -201,13 +204,13 @@ def test_detail_finer_than_a_pixel_turns_grey() -> None:
         assert near.std() > 50
         image = renderer.render(*pose((0.3, 0.2, 140), (heading, -89, 4))).astype(np.float64)
         assert image.mean() == pytest.approx(120, abs=1.5)
-        assert image.std() < 6  # of 80 where they are seen sharply
+        assert image.std() < 6  # the contrast is 80 in sharp parts
 
 
 def test_courtyard_is_rendered_without_aliasing(
     place: SceneFaces, textures: dict[str, Texture]
 ) -> None:
-    """A frame differs from the area mean of a render at four times its size by no more than a lens's blur."""
+    """A frame differs from the area mean of a render at four times its size by at most a lens's blur."""
     camera = Camera.from_horizontal_fov(320, 180, 72.0, (-0.05, 0.015))
     fine = camera.scaled(1280, 720)
     for center, rotation in (pose((0, -9, 3), (20, 5, 0)), pose((-9, -8, 20.8), (45, -46, 0))):
@@ -217,7 +220,7 @@ def test_courtyard_is_rendered_without_aliasing(
             (320, 180),
             interpolation=cv2.INTER_AREA,
         )
-        # What is coarser than the grid must agree closely: aliasing is false coarse structure.
+        # Structure coarser than the grid must agree closely: aliasing is false coarse structure.
         assert np.abs(smoothed(image) - smoothed(reference)).mean() < 1.0
         assert np.abs(image.astype(float) - reference).mean() < 4.5
 
@@ -225,7 +228,7 @@ def test_courtyard_is_rendered_without_aliasing(
 def test_blurred_frame_is_the_mean_of_its_exposure_about_the_true_pose(
     place: SceneFaces, textures: dict[str, Texture]
 ) -> None:
-    """Sub-exposures lie symmetrically about the truth, and their sharp renders average to the frame."""
+    """Sub-exposures are symmetric about the truth, and their sharp renders average to the frame."""
     options = replace(preset("standard"), width=320, height=180, only=("medium",))
     path = simulate_paths(options)["medium"]
     frame = int(np.flatnonzero(path.blurred)[0])
@@ -238,12 +241,12 @@ def test_blurred_frame_is_the_mean_of_its_exposure_about_the_true_pose(
     image = render_frame(renderer, path, frame).astype(np.float64)
     sharp = [renderer.render(c, r) for c, r in zip(poses.centers, poses.rotations, strict=True)]
     assert np.abs(smoothed(image) - smoothed(np.mean(sharp, axis=0))).mean() < 1.0
-    # The middle pose alone, sharp, is something else.
+    # A sharp render at the middle pose alone differs.
     assert np.abs(image - renderer.render(path.poses.centers[frame], middle)).mean() > 3.0
 
 
 def test_rolling_shutter_reads_each_row_at_its_own_time() -> None:
-    """Corners appear where they are at the time their row is read, with the truth at the middle row."""
+    """Corners appear at the time their row is read, and the truth is at the middle row."""
     options = replace(preset("standard"), width=640, height=360, blur_share=0.0, only=("medium",))
     path = simulate_paths(options)["medium"]
     time_s = np.array([-1.0, 1.0])
@@ -268,7 +271,7 @@ def test_rolling_shutter_reads_each_row_at_its_own_time() -> None:
 
 
 def test_houses_leave_all_else_where_it_is() -> None:
-    """Twelve a hectare on 2.2 hectares, each with a part of the roofs' picture of its own."""
+    """Twelve houses per hectare change no other face, and each has its own part of the roof texture."""
     options = SceneOptions(texels_per_m=12.0, seed=3, area_factor=16.0)
     without, with_houses = (
         build_scene(replace(options, houses_per_hectare=n)) for n in (0.0, 12.0)

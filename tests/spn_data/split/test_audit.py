@@ -1,4 +1,4 @@
-"""The audit: each kind of leak and disagreement, planted in a data set that is otherwise sound, is found."""
+"""The audit finds each kind of leak and inconsistency planted in an otherwise valid data set."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spn_data.split.holdout import make_split
 def frames(
     sequence: str, count: int, *, north_m: float = 0.0, every_s: float = 0.5, kind: str = "f"
 ) -> Labels:
-    """Registered frames on a line to the east at 2 m/s, looking north."""
+    """Return registered frames on a line to the east at 2 m/s, looking north."""
     east = 2.0 * every_s * np.arange(count)
     centers = np.column_stack([east, np.full(count, north_m), np.full(count, 8.0)])
     angles = np.tile([0.0, -20.0, 0.0], (count, 1))
@@ -44,7 +44,7 @@ def frames(
 
 @pytest.fixture
 def mapping() -> Labels:
-    """100 chosen frames of a flight of 50 s, and 200 tracked ones between them."""
+    """100 chosen frames of a 50 s flight and 200 tracked frames between them."""
     tracked = replace(
         frames("one", 200, every_s=0.25, kind="d"), time_s=0.125 + 0.25 * np.arange(200)
     )
@@ -69,12 +69,12 @@ def parts(mapping: Labels, evaluation: dict[str, Labels]) -> dict[str, Labels]:
 
 
 def regrouped(split: Split, name: str, group: str) -> Split:
-    """The split with one frame in another group."""
+    """Return the split with one frame moved to another group."""
     return replace(split, group=np.where(split.names == name, group, split.group))
 
 
 def assert_fails(finding: AuditFinding, *words: str) -> None:
-    """Assert that a check failed with a line of evidence that contains all the words."""
+    """Assert that a check failed and that one line of evidence contains all the words."""
     assert finding.verdict is AuditVerdict.FAIL
     assert any(all(word in line for word in words) for line in finding.evidence), finding.evidence
 
@@ -97,7 +97,7 @@ def test_an_evaluation_frame_among_the_maps_images_is_found(mapping, evaluation)
 
 
 def test_an_evaluation_video_that_was_mapped_is_found_under_any_name(mapping, evaluation):
-    """Files are compared by content, not by name."""
+    """A mapped evaluation video is found under any file name because content is compared."""
     sources = {"medium": {"medium/renamed.mp4": "aaaa"}}
     found = audit.check_not_in_map(mapping.names.tolist(), SOURCES, evaluation, sources)
     assert_fails(found, "renamed.mp4", "one.mp4")
@@ -109,7 +109,10 @@ def test_an_evaluation_sequence_of_unknown_source_is_found(mapping, evaluation):
 
 
 def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
-    """Every fourth frame of the flight, 2 cm off, as labels of a copy are; another flight passes."""
+    """A relabelled copy of a mapping flight is noticed, and another flight passes.
+
+    In the copy, every fourth frame of the flight has a label 2 cm off.
+    """
     assert audit.check_duplicates(mapping, evaluation).verdict is AuditVerdict.PASS
     rows = np.arange(0, 100, 4)
     copy = frames("copy", 100).select(rows)
@@ -125,7 +128,7 @@ def test_a_mapping_flight_under_another_name_is_noticed(mapping, evaluation):
 
 
 def test_a_map_hash_that_changed_is_found():
-    """The map may change during a registration, or afterwards."""
+    """A map hash that changed during a registration or afterwards is reported."""
     same = audit.check_map_unchanged("m1", {"medium": MapHashes("m1", "m1")})
     assert same.verdict is AuditVerdict.PASS
     assert_fails(audit.check_map_unchanged("m2", {"medium": MapHashes("m1", "m2")}), "m1", "m2")
@@ -139,7 +142,7 @@ def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
 
 @pytest.mark.parametrize("tracked", [False, True])
 def test_a_training_frame_within_a_block_is_found(mapping, split, tracked):
-    """A chosen or tracked frame in a held-out block is reported by both checks."""
+    """A chosen or tracked training frame in a held-out block is reported by both checks."""
     held = mapping.names[
         (split.groups_of(mapping.names) == VALIDATION) & (mapping.tracked == tracked)
     ]
@@ -154,19 +157,22 @@ def test_a_held_out_frame_outside_all_blocks_is_found(mapping, split):
 
 
 def test_a_dense_training_frame_in_the_guard_gap_is_found(mapping, split):
-    """One tracked frame of the guard that trains is named, with its distance in seconds."""
+    """A tracked training frame in the guard is named, with its distance in seconds."""
     guard = mapping.names[(split.groups_of(mapping.names) == LEFT_OUT) & mapping.tracked][0]
     assert_fails(audit.check_gap(mapping, regrouped(split, guard, TRAIN)), guard, "s from")
 
 
 def test_a_gap_smaller_than_the_stated_one_is_found(mapping, split):
-    """Blocks cut for 2 s do not pass as cut for 3 s."""
+    """Blocks cut for a gap of 2 s do not pass as cut for 3 s."""
     stated = replace(split, options=SplitOptions(gap_s=3.0))
     assert audit.check_gap(mapping, stated).verdict is AuditVerdict.FAIL
 
 
 def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping, split):
-    """0.5 m and 5 degrees off, a minute later; one that looks elsewhere is not."""
+    """A training frame 0.5 m and 5 degrees from a held-out one, a minute later, is listed.
+
+    A frame at that place that looks in another direction is not.
+    """
     row = np.flatnonzero((split.groups_of(mapping.names) == VALIDATION) & ~mapping.tracked)[0]
     center = mapping.poses.centers[row] + [0.0, 0.5, 0.0]
     for heading_deg, listed in ((5.0, True), (40.0, False)):
@@ -187,7 +193,7 @@ def test_a_training_frame_that_comes_back_to_a_held_out_place_is_listed(mapping,
 
 
 def seen_points(mapping: Labels, views: dict[int, list[str]]) -> LabelObservations:
-    """Observations of points by id, each in the frames named."""
+    """Return observations of points by id, each in the named frames."""
     row_of = {name: k for k, name in enumerate(mapping.names.tolist())}
     pairs = sorted((row_of[name], point) for point, names in views.items() for name in names)
     rows, points = np.array(pairs, dtype=np.int64).T
@@ -195,7 +201,10 @@ def seen_points(mapping: Labels, views: dict[int, list[str]]) -> LabelObservatio
 
 
 def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
-    """Point 1 has two training frames, point 2 one and two validation frames, point 3 none."""
+    """A point marked for training must be seen by at least two training frames.
+
+    Point 1 has two training frames, point 2 has one and two validation frames, and point 3 has none.
+    """
     chosen = mapping.select(~mapping.tracked)
     group = split.groups_of(chosen.names)
     train, held = chosen.names[group == TRAIN], chosen.names[group == VALIDATION]
@@ -213,7 +222,7 @@ def test_a_point_that_one_training_frame_sees_is_found(mapping, split):
 
 
 def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
-    """Two pixels of one training frame are no second view."""
+    """Two pixels of a point in one training frame count as one view."""
     chosen = mapping.select(~mapping.tracked)
     row = np.flatnonzero(split.groups_of(chosen.names) == TRAIN)[0]
     seen = LabelObservations(np.array([row, row]), np.array([7, 7]), np.zeros((2, 2)))
@@ -230,14 +239,14 @@ def test_a_point_seen_twice_in_one_frame_has_one_view(mapping, split):
     ],
 )
 def test_a_wrong_mark_is_found(marks, word):
-    """Only the training group's points are for training."""
+    """Only points of the training group may be marked for training."""
     sound = audit.check_training_marks({"train": True, "validation": False, "medium": False})
     assert sound.verdict is AuditVerdict.PASS
     assert_fails(audit.check_training_marks(marks), word)
 
 
 def test_labels_that_are_not_finite_are_found(parts):
-    """A position, a covariance in part, a quaternion of another length, a negative variance."""
+    """Non-finite positions, partial covariances, non-unit quaternions and negative variances are found."""
     assert audit_files.check_labels(parts).verdict is AuditVerdict.PASS
     unknown = replace(parts["mapping"], covariance=np.full((100, 6, 6), np.nan))
     found = audit_files.check_labels({"mapping": unknown})
@@ -276,7 +285,11 @@ def test_a_frame_that_the_split_lacks_or_holds_twice_is_found(parts, split):
 
 
 def test_a_frame_in_a_group_that_is_not_its_own_is_found(parts, split):
-    """An evaluation frame that trains, a mapping frame in a test set, one without a pose, one of nowhere."""
+    """Frames in the wrong group are found.
+
+    Cases: an evaluation frame that trains, a mapping frame in a test set, a frame without a pose, an unknown
+    frame.
+    """
     for name, group in (("medium/f00003.jpg", TRAIN), ("one/f00003.jpg", "medium")):
         assert_fails(audit_files.check_completeness(parts, regrouped(split, name, group)), name)
     medium = parts["medium"]
@@ -294,7 +307,7 @@ def test_a_frame_left_out_without_a_reason_is_found(parts, split):
 
 
 def lists(parts: dict[str, Labels], split: Split) -> dict[str, PoseList]:
-    """What a sound dataset.h5 holds, by group."""
+    """Return the contents of a valid dataset.h5, by group."""
     labels = Labels.concatenate(list(parts.values()))
     group = split.groups_of(labels.names)
     return {
@@ -304,7 +317,7 @@ def lists(parts: dict[str, Labels], split: Split) -> dict[str, PoseList]:
 
 
 def test_a_data_set_that_differs_from_the_split_is_found(parts, split):
-    """A frame too many, one too few, and a pose that moved by a nanometre."""
+    """A frame too many, a missing frame, and a pose that moved by a nanometre are found."""
     stored = lists(parts, split)
     assert audit_files.check_dataset(stored, parts, split).verdict is AuditVerdict.PASS
     medium = stored["medium"]
@@ -325,7 +338,7 @@ def test_a_data_set_that_differs_from_the_split_is_found(parts, split):
 
 
 def test_lists_that_differ_from_the_data_set_are_found(parts, split):
-    """Rounding to six decimals passes, one more unit of the last does not; nor another order or list."""
+    """Rounding to six decimals passes; a larger difference, another order or another list fails."""
     stored = {"dataset_train.txt": lists(parts, split)["train"]}
     wanted = stored["dataset_train.txt"]
     png = tuple(name.replace(".jpg", ".png") for name in wanted.names)
@@ -343,7 +356,7 @@ def test_lists_that_differ_from_the_data_set_are_found(parts, split):
 
 
 def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split):
-    """A validation frame and one of the evaluation sequence, beside training frames."""
+    """Measurements in the model of a validation or an evaluation frame are found among training ones."""
     group = split.groups_of(mapping.names)
     train, held = mapping.names[group == TRAIN][:5].tolist(), mapping.names[group == VALIDATION][0]
     png = [name.replace(".jpg", ".png") for name in train]

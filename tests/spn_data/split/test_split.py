@@ -1,4 +1,4 @@
-"""The split: blocks of a flight held out, with guards, on flights whose poses are written down."""
+"""Splits with held-out blocks and guards, on flights with prescribed poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def flight(
     start_s: float = 0.0,
     heading_deg: float = 0.0,
 ) -> Labels:
-    """Registered frames along centres (N, 3), all looking the same way."""
+    """Return registered frames at centres (N, 3), all with the same orientation."""
     n = len(centers)
     kind = "d" if tracked else "f"
     angles = np.tile([heading_deg, -20.0, 0.0], (n, 1))
@@ -50,7 +50,7 @@ def flight(
 
 
 def failed(labels: Labels, rows: slice, reason: str) -> Labels:
-    """The same labels, where some have no pose."""
+    """Return the same labels with some frames failed, without a pose."""
     status, why = labels.status.astype("<U10"), labels.reason.copy()
     centers, quats = labels.poses.centers.copy(), labels.poses.quats_wxyz.copy()
     status[rows], why[rows], centers[rows], quats[rows] = "failed", reason, np.nan, np.nan
@@ -58,7 +58,7 @@ def failed(labels: Labels, rows: slice, reason: str) -> Labels:
 
 
 def line(count: int, *, up_m: float = 8.0, step_m: float = 1.0, north_m: float = 0.0) -> np.ndarray:
-    """Centres (N, 3) along a straight line to the east."""
+    """Return centres (N, 3) along a straight line to the east."""
     return np.column_stack(
         [step_m * np.arange(count), np.full(count, north_m), np.full(count, up_m)]
     )
@@ -70,7 +70,7 @@ def nothing() -> Labels:
 
 @pytest.fixture
 def area() -> tuple[Labels, Labels]:
-    """Two flights of 100 s and 60 s with 2 chosen frames a second, and 10 tracked ones between."""
+    """Two flights of 100 s and 60 s with 2 chosen frames a second and 10 tracked frames between."""
     mapping = Labels.concatenate(
         [flight("one", line(200)), flight("two", line(120, north_m=20.0, up_m=12.0))]
     )
@@ -91,7 +91,7 @@ def evaluation() -> dict[str, Labels]:
 
 
 def nearest_s(labels: Labels, split: Split) -> float:
-    """Seconds between a training frame and the nearest held-out frame of its sequence, the slow way."""
+    """Return seconds from each training frame to its sequence's nearest held-out frame, by brute force."""
     group = split.groups_of(labels.names)
     return min(
         float(np.abs(labels.time_s[k] - labels.time_s[held]).min())
@@ -103,7 +103,7 @@ def nearest_s(labels: Labels, split: Split) -> float:
 
 
 def test_mapping_frames_train_and_each_evaluation_sequence_is_a_group(area, evaluation):
-    """By default, 11 % of each mapping flight validates, and nothing of it tests."""
+    """By default, 11 % of each mapping flight validates, none tests, and evaluation flights are groups."""
     mapping, _ = area
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     assert split.groups() == (TRAIN, VALIDATION, "medium")
@@ -117,7 +117,7 @@ def test_mapping_frames_train_and_each_evaluation_sequence_is_a_group(area, eval
 
 
 def test_blocks_in_time_have_about_the_length_wanted(area, evaluation):
-    """11 % of 100 s in blocks of about 5 s are two blocks, each of one stretch without a hole."""
+    """11 % of 100 s in blocks of about 5 s gives two contiguous blocks."""
     mapping, _ = area
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     mine = [block for block in split.blocks if block.sequence == "one"]
@@ -130,7 +130,7 @@ def test_blocks_in_time_have_about_the_length_wanted(area, evaluation):
 
 
 def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
-    """A tracked frame within a block validates; none that trains is nearer than 2 s to a block."""
+    """Tracked frames in a block validate, and no training frame is within 2 s of a block."""
     mapping, tracked = area
     split = make_split(mapping, tracked, evaluation, SplitOptions())
     everything = Labels.concatenate([mapping, tracked])
@@ -149,7 +149,7 @@ def test_dense_frames_fall_into_the_block_of_their_time(area, evaluation):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_gap_holds_for_every_seed(area, seed):
-    """Wherever the blocks fall, no training frame is nearer than the gap to test or validation."""
+    """For every seed, no training frame is closer than the gap to test or validation frames."""
     mapping, tracked = area
     options = SplitOptions(seed=seed, gap_s=3.0)
     split = make_split(mapping, tracked, {}, options)
@@ -158,7 +158,10 @@ def test_the_gap_holds_for_every_seed(area, seed):
 
 
 def test_without_an_evaluation_sequence_one_block_is_held_out_and_said_to_be_optimistic(area):
-    """About 15 % of all frames, in one stretch of one flight; validation keeps its distance from it too."""
+    """Without an evaluation sequence, one block of about 15 % of all frames tests, and a note warns.
+
+    Validation keeps its distance from the test block too.
+    """
     mapping, _ = area
     split = make_split(mapping, nothing(), {}, SplitOptions())
     assert split.optimistic
@@ -172,7 +175,7 @@ def test_without_an_evaluation_sequence_one_block_is_held_out_and_said_to_be_opt
 
 
 def test_an_evaluation_sequence_of_which_every_frame_failed_is_no_test(area, evaluation):
-    """A block is held out then, and a note says why."""
+    """If every frame of the evaluation sequence failed, a block is held out and a note says why."""
     lost = failed(evaluation["medium"], slice(None), "no map point is seen")
     split = make_split(area[0], nothing(), {"medium": lost}, SplitOptions())
     assert split.optimistic
@@ -181,7 +184,7 @@ def test_an_evaluation_sequence_of_which_every_frame_failed_is_no_test(area, eva
 
 
 def test_a_frame_without_a_pose_is_in_no_group(area, evaluation):
-    """Failed frames are left out with their reason, wherever they are."""
+    """Failed frames are left out of all groups with their reason, wherever they are."""
     mapping = failed(area[0], slice(0, 320, 7), "too few matches")
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     lost = mapping.names[~mapping.registered]
@@ -190,7 +193,7 @@ def test_a_frame_without_a_pose_is_in_no_group(area, evaluation):
 
 
 def test_the_same_input_gives_the_same_split_in_any_order(area, evaluation):
-    """The order of frames and the presence of another flight move no block; another seed does."""
+    """Frame order and other flights do not move any block, but another seed does."""
     mapping, tracked = area
     options = SplitOptions(seed=5)
     split = make_split(mapping, tracked, evaluation, options)
@@ -205,7 +208,7 @@ def test_the_same_input_gives_the_same_split_in_any_order(area, evaluation):
 
 
 def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
-    """Photos 10 s apart: blocks of several, and the photo on each side is left out, though 10 s away."""
+    """With photos 10 s apart, the photo on each side of a block is still left out."""
     photos = flight("photos", line(100, step_m=10.0), every_s=10.0)
     split = make_split(photos, nothing(), evaluation, SplitOptions())
     group = split.groups_of(photos.names)
@@ -221,7 +224,10 @@ def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
 
 
 def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
-    """Tracked frames of a hover of 20 s are in no group where a block ends as it begins: nothing moved."""
+    """A hover at the edge of a block is left out up to the next chosen frame.
+
+    Its tracked frames, 20 s long, show the same view as the block because nothing moved.
+    """
     moving = flight("one", line(30))
     after = flight("one", line(30) + np.array([30.0, 0.0, 0.0]), start_s=35.0)
     names = np.char.replace(after.names, "/f", "/g")
@@ -238,7 +244,7 @@ def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluat
 
 
 def test_a_short_flight_beside_a_long_one_trains_as_a_whole(area, evaluation):
-    """Of 3 s, block and guard would leave nothing: the flight gives no block, and a note says so."""
+    """A flight of 3 s, which a block and its guards would use up, trains entirely, with a note."""
     mapping = Labels.concatenate([area[0], flight("short", line(6, north_m=40.0))])
     split = make_split(mapping, nothing(), evaluation, SplitOptions())
     assert (split.groups_of(mapping.names[mapping.sequences == "short"]) == TRAIN).all()
@@ -246,7 +252,7 @@ def test_a_short_flight_beside_a_long_one_trains_as_a_whole(area, evaluation):
 
 
 def test_a_single_flight_of_nine_seconds_is_split_without_any_option():
-    """The test block lies at an end and shares its guard with validation: half of the rest trains."""
+    """In a 9 s flight the test block is at one end and shares its guard; half of the rest trains."""
     split = make_split(flight("a", line(18)), nothing(), {}, SplitOptions())
     assert split.counts()[TRAIN] >= 5
     assert split.counts()[VALIDATION] == 1
@@ -254,7 +260,7 @@ def test_a_single_flight_of_nine_seconds_is_split_without_any_option():
 
 
 def test_too_few_frames_are_an_error_that_names_the_way_out():
-    """4 frames within 2 s cannot be kept 2 s apart."""
+    """Four frames within 2 s cannot be kept 2 s apart, and the error names an option that helps."""
     with pytest.raises(GeometryError, match=r"leaves no frame for .*--gap"):
         make_split(flight("a", line(4)), nothing(), {}, SplitOptions())
 
@@ -266,7 +272,7 @@ def test_nothing_registered_is_an_error(evaluation):
 
 
 def test_left_out_dense_frames_are_in_no_group(area, evaluation):
-    """Without tracked frames, those of evaluation sequences are left out too."""
+    """If tracked frames are excluded, those of evaluation sequences are excluded too."""
     mapping, tracked = area
     more = flight("medium", line(100), every_s=0.1, tracked=True)
     both = {"medium": Labels.concatenate([evaluation["medium"], more])}
@@ -283,7 +289,7 @@ def test_a_sequence_may_not_be_called_like_a_group(area, evaluation, name):
 
 
 def raster() -> Labels:
-    """Eight lines of 40 m, 2 m apart: a flight in which every place has neighbours in time and space."""
+    """Flight of eight lines of 40 m, 2 m apart, with neighbours in time and space everywhere."""
     rows = [
         line(41, north_m=2.0 * k) if k % 2 == 0 else line(41, north_m=2.0 * k)[::-1]
         for k in range(8)
@@ -292,7 +298,7 @@ def raster() -> Labels:
 
 
 def test_blocks_in_space_touch_and_keep_their_distance(evaluation):
-    """Validation is one region of cells; training stays 3 m off in plan view and 2 s off in time."""
+    """Validation is one region of cells; training stays 3 m away in plan and 2 s away in time."""
     mapping = raster()
     options = SplitOptions(validation=Policy.SPACE)
     split = make_split(mapping, nothing(), evaluation, options)
@@ -315,7 +321,7 @@ def test_blocks_in_space_touch_and_keep_their_distance(evaluation):
 
 @pytest.mark.parametrize("seed", range(15))
 def test_a_place_apart_from_the_others_is_no_region(evaluation, seed):
-    """A frame 100 m away has no neighbours: it is never all that validates."""
+    """An isolated frame 100 m away, without neighbours, is never the whole validation set."""
     away = flight("away", line(1) + np.array([100.0, 100.0, 0.0]))
     mapping = Labels.concatenate([raster(), away])
     options = SplitOptions(validation=Policy.SPACE, seed=seed)
@@ -325,14 +331,14 @@ def test_a_place_apart_from_the_others_is_no_region(evaluation, seed):
 
 @pytest.mark.parametrize("seed", range(15))
 def test_half_of_a_flight_is_left_to_training_where_that_can_be_had(evaluation, seed):
-    """Of 7 s, a block in the middle would leave 6 of 14 frames, one at an end leaves 9."""
+    """In a 7 s flight, a block at one end is preferred: it leaves 9 of 14 frames instead of 6."""
     short = flight("short", line(14))
     split = make_split(short, nothing(), evaluation, SplitOptions(seed=seed))
     assert split.counts()[TRAIN] >= 7
 
 
 def test_a_band_of_heights_is_held_out(evaluation):
-    """On a climb, the frames of a band validate and those within 1 m above and below are left out."""
+    """On a climb, frames of a height band validate and those within 1 m above and below are left out."""
     climb = line(400, step_m=0.2)
     climb[:, 2] = np.linspace(2, 42, 400)
     mapping = flight("climb", climb)
@@ -351,7 +357,7 @@ def test_space_and_height_need_metres(area, evaluation, policy):
 
 
 def test_all_frames_at_one_place_cannot_be_split_in_space(evaluation):
-    """A hover fills one cell: nothing would train."""
+    """A hover fills a single cell and is refused because no frame would train."""
     hover = flight("a", np.tile([1.0, 1.0, 5.0], (60, 1)))
     with pytest.raises(GeometryError, match="leaves no frame for train"):
         make_split(hover, nothing(), evaluation, SplitOptions(validation=Policy.SPACE))
@@ -359,7 +365,7 @@ def test_all_frames_at_one_place_cannot_be_split_in_space(evaluation):
 
 @pytest.mark.parametrize("policy", list(Policy))
 def test_a_split_comes_back_from_its_file(area, evaluation, policy, tmp_path: Path):
-    """Groups, reasons, blocks and options are those that were written."""
+    """Groups, reasons, blocks and options read from the file equal those written."""
     mapping = raster() if policy is not Policy.TIME else area[0]
     mapping = failed(mapping, slice(0, 3), "too few matches")
     mapping.poses.centers[3:, 2] += np.linspace(0, 30, len(mapping) - 3)
@@ -377,7 +383,7 @@ def test_a_split_comes_back_from_its_file(area, evaluation, policy, tmp_path: Pa
 
 
 def test_the_file_says_what_validation_cannot_be_free_of(area, tmp_path: Path):
-    """split.json states the joint bundle adjustment and that a test on a mapping flight is optimistic."""
+    """split.json warns of the joint bundle adjustment and of an optimistic test on a mapping flight."""
     write_split(tmp_path / "split.json", make_split(area[0], nothing(), {}, SplitOptions()))
     table = read_json(tmp_path / "split.json")
     said = " ".join(table["not_free_of"])

@@ -1,4 +1,4 @@
-"""Files that appear atomically, and CSV files."""
+"""Atomic writing of files, and CSV files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spn_data.storage.files import atomic_writer, read_csv, write_atomically, wr
 
 
 def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> None:
-    """Neither an exception in the block nor a full disk changes the file or leaves a temporary file."""
+    """Neither an exception in the block nor a full disk changes the file or leaves a temporary one."""
     path = tmp_path / "list.csv"
     write_atomically(path, "before")
     with pytest.raises(TypeError):
@@ -27,13 +27,13 @@ def test_a_failure_leaves_what_stood_there_and_nothing_else(tmp_path: Path) -> N
 
 
 def test_text_is_utf8_with_its_own_line_ends(tmp_path: Path) -> None:
-    """Text does not depend on the locale, so it can be read on another machine."""
+    """Text is UTF-8 with fixed line ends whatever the locale, so other machines can read it."""
     write_csv(tmp_path / "a.csv", {"straße": ["é", "x\r\ny"], "n": [1, 2]})
     assert (tmp_path / "a.csv").read_bytes() == 'straße,n\né,1\n"x\r\ny",2\n'.encode()
 
 
 def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
-    """A missing folder is reported with the name of the file."""
+    """A missing folder is reported in one line with the name of the file."""
     with pytest.raises(StageError, match=r"none/a\.txt cannot be written: No such file"):
         write_atomically(tmp_path / "none" / "a.txt", "")
 
@@ -52,7 +52,7 @@ def test_a_place_that_takes_no_file_is_told_in_one_line(tmp_path: Path) -> None:
 def test_csv_of_others_is_refused_with_its_line(
     tmp_path: Path, content: bytes, message: str
 ) -> None:
-    """Another header, a truncated row, an unclosed quote, invalid UTF-8 and an oversized file are refused."""
+    """Other headers, truncated rows, unclosed quotes, invalid UTF-8 and oversized files are refused."""
     path = tmp_path / "t.csv"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):

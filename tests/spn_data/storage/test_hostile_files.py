@@ -1,4 +1,4 @@
-"""Damaged or hostile files of an area, cameras and recipes are told in one line that names the file."""
+"""Damaged or hostile area files, cameras and recipes give a one-line error that names the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HUGE = "1" + "0" * 400
 
 @pytest.fixture
 def area(tmp_path: Path) -> Area:
-    """An area with stage 1-frames."""
+    """Return an area with stage 1-frames."""
     made = Area(tmp_path / "area")
     work = made.begin(FRAMES, {"n": 1}, {"a.mp4": "f"}, overwrite=False)
     assert isinstance(work, StageWork)
@@ -50,7 +50,7 @@ def area(tmp_path: Path) -> Area:
     ],
 )
 def test_a_value_of_another_kind_in_stage_json_is_damage(area, name, value):
-    """Each part of stage.json is of its kind before it is used."""
+    """Values of the wrong type in stage.json are refused before use."""
     path = area.folder(FRAMES) / "stage.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
     with pytest.raises(FormatError, match=r"1-frames/stage\.json: "):
@@ -58,7 +58,7 @@ def test_a_value_of_another_kind_in_stage_json_is_damage(area, name, value):
 
 
 def test_a_missing_count_is_damage(area):
-    """A count that is not there is told with its file when it is used."""
+    """A missing count is reported with its file when it is used."""
     path = area.folder(FRAMES) / "stage.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "counts": {}}))
     with pytest.raises(FormatError, match=r"stage\.json: is damaged: its counts have no 'chosen'"):
@@ -80,7 +80,7 @@ def test_a_missing_count_is_damage(area):
     ],
 )
 def test_json_that_is_no_object_of_bounded_numbers_is_damage(tmp_path, text):
-    """Nesting, numbers without bound and other kinds of JSON are refused by the one reader."""
+    """Deep nesting, unbounded numbers and JSON other than an object are refused by the reader."""
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(FormatError, match=r"a\.json: cannot be read") as error:
@@ -101,14 +101,14 @@ def test_json_that_is_no_object_of_bounded_numbers_is_damage(tmp_path, text):
     ],
 )
 def test_an_area_file_of_other_kinds_is_damage(tmp_path, text):
-    """Sources are a list of texts and evaluation is a table of texts."""
+    """An area file is refused unless sources are a list of texts and evaluation is a table of texts."""
     (tmp_path / "area.toml").write_text(text)
     with pytest.raises(FormatError, match=r"area\.toml: is not an area file"):
         Area(tmp_path)
 
 
 def test_an_area_file_that_is_a_folder_is_told(tmp_path):
-    """A folder of this name is no crash."""
+    """A folder with the name of the area file gives an error instead of a crash."""
     (tmp_path / "area.toml").mkdir()
     with pytest.raises(FormatError, match=r"area\.toml: .*Is a directory"):
         Area(tmp_path)
@@ -116,7 +116,7 @@ def test_an_area_file_that_is_a_folder_is_told(tmp_path):
 
 @pytest.mark.parametrize("counts", [{}, {"chosen": 3}, None, {"chosen": [], "sequences": 1}])
 def test_status_tells_damage_in_one_line(area, counts):
-    """The command names the damaged record and ends with code 1."""
+    """`status` names the damaged record in one line and exits with code 1."""
     path = area.folder(FRAMES) / "stage.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "counts": counts}))
     result = CliRunner().invoke(main, ["status", "--area", str(area.root)])
@@ -143,7 +143,7 @@ CAMERA = {"model": "PINHOLE", "width": 640, "height": 360, "params": [400, 400, 
     ],
 )
 def test_a_camera_of_other_kinds_is_refused(tmp_path, text):
-    """Numbers of a camera file are finite, bounded, and neither text nor false."""
+    """Non-finite, unbounded, text and boolean numbers in a camera file are refused."""
     path = tmp_path / "camera.json"
     path.write_text(text)
     with pytest.raises(InputError, match=r"camera\.json: does not contain a camera"):
@@ -158,7 +158,7 @@ def test_a_camera_of_other_kinds_is_refused(tmp_path, text):
     ],
 )
 def test_a_recipe_beyond_bounds_is_refused(tmp_path, line, told):
-    """A number of 400 digits is told with its line, and nesting with the file."""
+    """A number of 400 digits is reported with its line, and deep nesting with the file."""
     path = tmp_path / "r.toml"
     path.write_text(f'kind = "regression"\n{line}\n[[stages]]\nimages = 100\n')
     with pytest.raises(InputError, match=rf"r\.toml:{told}"):
@@ -185,7 +185,7 @@ def wrong(**values: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     ],
 )
 def test_a_registration_without_a_similarity_is_damage(tmp_path, change):
-    """Labels are transformed only by a positive scale, a rotation and three numbers."""
+    """Labels are transformed only by a positive scale, a rotation and a translation of three numbers."""
     path = tmp_path / "registration.json"
     table = {"version": 1, "world_from_model": change(Similarity.identity().to_json())}
     path.write_text(json.dumps(table))
@@ -194,7 +194,7 @@ def test_a_registration_without_a_similarity_is_damage(tmp_path, change):
 
 
 def test_old_versions_of_a_killed_process_are_removed(area):
-    """The next command that locks the area removes old versions whose new one is in place, and no others."""
+    """The next command that locks the area removes only old versions that were already replaced."""
     group = area.root / "4-eval"
     for name in (".old-b", ".old-gone", ".moved-b", "b"):
         (group / name).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Figures of a tracked frame: its standard deviations from residuals and geometry."""
+"""Standard deviations of tracked frames from residuals and geometry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spn_data.tracking.tracked_frames import TrackingOptions
 
 
 def test_sigma_is_a_share_of_the_distance_and_grows_with_the_residuals() -> None:
-    """Residuals of 1 px, 0.04 m and 0.002 rad for one pixel per axis, and points at 10 m."""
+    """Residuals of 1 px, points at 10 m, and 0.04 m and 0.002 rad per pixel give the expected sigma."""
     camera = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 320.0, 240.0]))
     x, y = np.meshgrid(np.arange(20.0, 640, 60), np.arange(20.0, 480, 60))
     pixels = np.column_stack([x.ravel(), y.ravel()])

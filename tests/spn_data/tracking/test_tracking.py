@@ -1,4 +1,4 @@
-"""Poses of the frames between labelled ones, against the exact truth of a small rendered world."""
+"""Poses of frames between labelled ones, against the exact truth of a small rendered world."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def poses_of(tracked: list[TrackedFrame]) -> Poses:
 
 
 def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
-    """Through H.264, a distorted lens, uneven motion; before the first and after the last label as well."""
+    """Frames between, before and after labels get poses, despite H.264, distortion and uneven motion."""
     heard: list[tuple[int, int]] = []
     labels, seen = track_frames(
         world.videos,
@@ -70,7 +70,7 @@ def test_every_other_frame_of_two_files_gets_its_pose(world: World) -> None:
 
 
 def test_frames_off_a_steady_motion_are_dropped_from_the_labels(world: World) -> None:
-    """Nothing may turn faster or slower here, which the flight does; two workers give the same poses."""
+    """Frames whose rotation rate is not constant are dropped; two workers give the same poses."""
     options = replace(OPTIONS, max_jump_deg=0.02, max_turn_deg_s2=1e-6)
     labels, seen = track_frames(
         world.videos,
@@ -92,7 +92,7 @@ def test_frames_off_a_steady_motion_are_dropped_from_the_labels(world: World) ->
 
 
 def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
-    """An image moved by a known fraction, begun 12 pixels off; those that leave it or are hidden are lost."""
+    """Points are followed to 0.1 px from a start 12 px off; points out of view or occluded are lost."""
     before = TEXTURE[:400, :400]
     moved = cv2.warpAffine(
         before, np.array([[1, 0, 3.3], [0, 1, -2.6]]), (400, 400), flags=cv2.INTER_CUBIC
@@ -115,7 +115,7 @@ def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
 
 
 def test_a_larger_image_is_followed_at_reduced_size_in_full_size_pixels(world: World) -> None:
-    """Half the size: the same poses within what half the pixels can tell, pixels as before."""
+    """At half size, poses agree within what the resolution allows, and pixels are in full-size units."""
     segment = world.segment(9, 15)
     small = [cv2.resize(g, (240, 135), interpolation=cv2.INTER_AREA) for g in segment.grays]
     anchors = [
@@ -136,7 +136,7 @@ def test_a_larger_image_is_followed_at_reduced_size_in_full_size_pixels(world: W
 def test_a_labelled_frame_in_the_wrong_place_takes_its_neighbours_along_to_no_place(
     world: World,
 ) -> None:
-    """Its pose and points 1.5 m off together, as a repeated facade would have it: none is labelled wrong."""
+    """If a label and its points are both 1.5 m off, as on a repeated facade, no frame is labelled wrong."""
     segment = world.segment(9, 15)
     right, wrong = segment.anchors
     off = np.array([1.5, 0.0, 0.0])
@@ -156,7 +156,7 @@ def test_a_labelled_frame_in_the_wrong_place_takes_its_neighbours_along_to_no_pl
 
 
 def test_a_frame_of_something_else_fails_and_those_around_it_do_not(world: World) -> None:
-    """Here its pixels are noise."""
+    """A frame of pure noise fails, and the frames around it do not."""
     segment = world.segment(9, 15)
     grays = list(segment.grays)
     grays[2] = np.random.default_rng(0).integers(0, 255, grays[2].shape).astype(np.uint8)
@@ -182,7 +182,7 @@ def test_each_check_names_its_reason(world: World, options: TrackingOptions, rea
 
 
 def test_a_pose_off_the_motion_of_its_neighbours_fails_and_they_stay(world: World) -> None:
-    """Moved by 5 % of its distance; without it the frames beside it fit."""
+    """A pose displaced by 5 % of its distance fails, and its neighbours keep their poses."""
     tracked = [*track_segment(world.segment(9, 15), OPTIONS)]
     found = {frame.row: frame for frame in tracked}
     drop_jumps(world.sequence, found, OPTIONS)
@@ -195,13 +195,13 @@ def test_a_pose_off_the_motion_of_its_neighbours_fails_and_they_stay(world: Worl
 
 
 def test_segments_lie_between_labelled_frames_and_hold_both(world: World) -> None:
-    """The frames before the first one wait for the second; those after the last have the last two."""
+    """Segments are bounded by two labelled frames; the frames at both ends use the two nearest labels."""
     reasons: dict[int, str] = {}
     lengths = np.random.default_rng(4).integers(2, 40, len(world.points))
     sequence = replace(world.sequence, points=replace(world.points, track_lengths=lengths))
     segments = list(read_segments(sequence, world.videos, OPTIONS, reasons))
     of_first = lengths[world.points.rows_of(segments[0].anchors[0].point_ids)]
-    assert (np.diff(of_first) <= 0).all()  # the points that most frames see are followed
+    assert (np.diff(of_first) <= 0).all()  # points seen in most frames are followed first
     assert [s.rows.tolist() for s in segments] == [
         [0, 1, 2],
         [4, 5, 6, 7, 8],
@@ -215,7 +215,7 @@ def test_segments_lie_between_labelled_frames_and_hold_both(world: World) -> Non
 
 
 def test_a_long_gap_keeps_its_ends_only_and_memory_bounded(world: World) -> None:
-    """Only frames 3 and 20 are labelled, and four images are all that may wait."""
+    """With only frames 3 and 20 labelled, frames mid-gap fail and at most four images are kept in memory."""
     few = np.array([0, 3])
     sequence = replace(
         world.sequence, labelled=world.labelled.select(few), seen=world.seen.select(few)
@@ -233,7 +233,7 @@ def test_a_long_gap_keeps_its_ends_only_and_memory_bounded(world: World) -> None
 
 
 def test_frames_of_a_lens_without_labels_and_unreadable_frames_say_so(world: World) -> None:
-    """The zoom changed after the last labelled frame; one frame before was damaged."""
+    """After a zoom change without labels frames fail with a reason, as does a damaged frame."""
     frames = world.frames
     cameras = frames.cameras.astype("<U4")
     cameras[21:] = "f-2"
@@ -251,7 +251,7 @@ def test_frames_of_a_lens_without_labels_and_unreadable_frames_say_so(world: Wor
 
 
 def test_a_pose_is_fitted_among_outliers_and_not_where_points_lie_behind(world: World) -> None:
-    """A third of the points are 5 to 60 pixels off; the start is 30 cm and 1.5 degrees off."""
+    """With a third of the points 5 to 60 px off and a start 30 cm and 1.5 degrees off, the pose is found."""
     rng = np.random.default_rng(1)
     true = world.poses[10:11]
     ids, pixels = visible(world.points, true)
@@ -269,7 +269,7 @@ def test_a_pose_is_fitted_among_outliers_and_not_where_points_lie_behind(world: 
     assert error_m[0] < 0.02
     assert error_deg[0] < 0.05
     assert np.array_equal(fit.inliers(2.0), ~bad)
-    # 0.3 px on each axis, and the inverse is that of one pixel.
+    # The noise is 0.3 px per axis; `inverse` is for one pixel.
     sigma_m = 0.3 * np.sqrt(np.trace(fit.inverse[:3, :3]))
     assert error_m[0] / 4 < sigma_m < 0.02
     behind = Poses(true.centers + np.array([0.0, 100.0, 0.0]), true.quats_wxyz)

@@ -1,4 +1,4 @@
-"""Covariance of a map, checked against dense algebra, repeated bundle adjustments, and its gauge."""
+"""Map covariance against dense algebra, repeated bundle adjustments and gauge transformations."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def some_functional(scene: Scene, camera_id: int | None = None, seed: int = 1) -
 
 
 def test_derivatives_are_those_of_the_residuals() -> None:
-    """Small changes of poses, intrinsics and points change the residuals as linearised."""
+    """Small changes of poses, intrinsics and points change the residuals as the Jacobian predicts."""
     scene, seen = small().scene, small().seen
     unknowns, bundle = linearized(scene, seen)
     rng = np.random.default_rng(3)
@@ -182,7 +182,7 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
 
 
 def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np.ndarray:
-    """Return the covariance of all unknowns, points last: the inverse under the seven inner constraints."""
+    """Return the covariance of all unknowns, points last, under the seven inner constraints."""
     unknowns, bundle = linearized(scene, seen)
     n, p = bundle.design.shape[1], 3 * len(scene.points)
     by_point = np.zeros((bundle.design.shape[0], p))
@@ -231,7 +231,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
 
 
 def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
-    """The result is K M K with M summed over tracks, times the correction for the redundancy."""
+    """The cluster-robust covariance is K M K, M summed over tracks, times the redundancy correction."""
     rng = np.random.default_rng(6)
     whole = small(8, 60)
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
@@ -251,15 +251,15 @@ def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
         block = expected[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
         size = np.sqrt(np.diag(block))
         assert np.abs((found[k] - block) / np.outer(size, size)).max() < 1e-3
-    assert covariance.sigma_px == pytest.approx(0.15, rel=0.5)  # drift hides in points and poses
+    assert covariance.sigma_px == pytest.approx(0.15, rel=0.5)  # poses and points absorb drift
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["independent", "drifting"])
 def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
-    """Over 30 noise draws, poses and functionals have chi-squared errors within a third (NEES).
+    """Over 30 noise draws, NEES of poses and functionals is within a third of its expectation.
 
-    Errors that drift along tracks do so only if they are not taken as independent.
+    Errors that drift along tracks meet this only if they are not assumed independent.
     """
     rng = np.random.default_rng(12)
     whole = small(points=800)
@@ -290,7 +290,7 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
 
 
 def test_a_similarity_moves_covariances_with_the_map() -> None:
-    """Scaled by 7, rotated and translated, the map has the same errors in its new unit and axes."""
+    """Scaling by 7, rotating and translating the map transforms its covariances in the same way."""
     rng = np.random.default_rng(8)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -336,7 +336,7 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_many_functionals_at_once_are_those_one_by_one() -> None:
-    """A batch of three agrees with single calls, including one without points."""
+    """A batch of three functionals agrees with single calls, including one without points."""
     rng = np.random.default_rng(9)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -352,7 +352,7 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
 
 
 def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> None:
-    """A point seen from two frames in one place has an undetermined depth; the poses are not affected."""
+    """A point seen by two frames in one place has undetermined depth and does not affect the poses."""
     rng = np.random.default_rng(10)
     whole = small()
     made = whole.noisy(0.3 * rng.standard_normal(whole.seen.pixels.shape))
@@ -377,7 +377,7 @@ def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> Non
 
 
 def test_a_map_in_two_pieces_is_refused() -> None:
-    """Two halves without common points have two gauges, and no covariance between them."""
+    """A map in two parts without common points has two gauges and is refused."""
     whole = small(12, 300, 6)
     seen = whole.seen
     left = np.bincount(seen.point_idx, seen.image_idx < 6) / whole.scene.track_lengths
