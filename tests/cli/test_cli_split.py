@@ -142,6 +142,7 @@ def test_the_cambridge_folder_is_complete(split_area: Path) -> None:
 
 
 def test_run_again_it_is_left_as_it_is(split_area: Path) -> None:
+    """An unchanged rerun reports the stage as unchanged and does not rewrite dataset.h5."""
     before = (split_area / SPLIT / "dataset.h5").stat().st_mtime_ns
     again = run("split", "--area", split_area)
     assert again.exit_code == 0, again.output
@@ -214,6 +215,7 @@ def test_an_interrupted_split_goes_on_and_comes_out_the_same(
 
 
 def test_the_audit_passes_again_and_changes_nothing(split_area: Path) -> None:
+    """A second audit passes and modifies no file but the lock."""
     before = {p: p.stat().st_mtime_ns for p in split_area.rglob("*") if p.is_file()}
     result = run("audit", "--area", split_area)
     assert result.exit_code == 0, result.output
@@ -225,6 +227,7 @@ def test_the_audit_passes_again_and_changes_nothing(split_area: Path) -> None:
 
 
 def test_an_audit_without_a_split_says_what_to_run(finished_area: Path) -> None:
+    """An audit without a split is rejected; the message names the command to run."""
     result = run("audit", "--area", finished_area)
     assert result.exit_code == 1
     assert "spn-data split" in result.stderr
@@ -395,6 +398,7 @@ def test_checks_and_fields_are_documented(split_area: Path) -> None:
 
 
 def test_where_nothing_is_mapped_nothing_is_left_behind(tmp_path: Path) -> None:
+    """A split of a missing area is rejected and creates nothing."""
     result = run("split", "--area", tmp_path / "new")
     assert result.exit_code == 1
     assert "1-frames is missing; run spn-data reconstruct first" in result.stderr
