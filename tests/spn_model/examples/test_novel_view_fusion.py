@@ -1,4 +1,4 @@
-"""Views fused of several training images: their surface, their colours, where they are taken from."""
+"""Tests of novel views fused from several training images: surface, colours and camera poses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def sources(data: TrainingSet) -> SourceImages:
 
 
 def above(pitch_deg: float = -60.0) -> Poses:
-    """Higher than any training image of the hall, and looking down more steeply."""
+    """Return a pose higher than any training image of the hall, with a steeper pitch."""
     angles = rotations_from_angles(np.array([[10.0, pitch_deg, 0.0]]))
     return Poses.from_rotations([[10.0, 4.0, 8.0]], angles)
 
@@ -54,13 +54,13 @@ def view(data, sources, pose, *, shrink=2, surface_of=None):
 
 
 def unknown_surfaces(data: TrainingSet):
-    """As if no training image had a triangle: nothing but the ground is left to see."""
+    """Return empty surfaces for all training images, so that only the ground remains visible."""
     blind = np.full((90, 160), np.nan, np.float32)
     return lambda row: Surface(blind, 2, data.poses[row : row + 1], data.intrinsics[row])
 
 
 def shown_by(pose: Poses, shrink: int) -> tuple[np.ndarray, np.ndarray]:
-    """Image and points (h, w, 3) of a small true one: the means of its pixels' parts, and their middles."""
+    """Return the true reduced image (block means) and the points at its pixel centres, shape (h, w, 3)."""
     image, _ = seen_by(pose)
     height, width = (side // shrink for side in image.shape[:2])
     parts = image[: height * shrink, : width * shrink].astype(float)
@@ -72,7 +72,7 @@ def shown_by(pose: Poses, shrink: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("shrink", [1, 2, 3])
 def test_a_fused_view_is_what_a_camera_there_would_see(data, sources, shrink):
-    """From above the training images: points within 1 cm and most of 10 cm, colours as the truth has them."""
+    """In a view from above, the median point error is below 1 cm and colours match the truth."""
     pose = above()
     image, seen = view(data, sources, pose, shrink=shrink)
     expected, points = shown_by(pose, shrink)
@@ -89,7 +89,7 @@ def test_a_fused_view_is_what_a_camera_there_would_see(data, sources, shrink):
 
 
 def test_ground_is_seen_where_no_triangle_is(data, sources):
-    """Without any triangle the floor is drawn, exactly at its height, and no wall is."""
+    """Without triangles, the floor is rendered at its exact height, and no wall is."""
     image, seen = view(data, sources, above(), surface_of=unknown_surfaces(data))
     known = np.isfinite(seen.inverse_depth)
     assert known.mean() > 0.5
@@ -101,7 +101,7 @@ def test_ground_is_seen_where_no_triangle_is(data, sources):
 
 
 def test_without_up_there_is_no_ground(data):
-    """What is not known to be level is not drawn as such."""
+    """If the up direction is unknown, no ground is rendered."""
     image, seen = _without_up(data)
     assert np.isnan(seen.inverse_depth).all()
     assert (image == FILL).all()
@@ -118,7 +118,7 @@ def _without_up(data: TrainingSet) -> tuple[np.ndarray, Surface]:
 
 
 def test_what_two_sources_deny_is_not_painted_onto_the_ground(data, sources, monkeypatch):
-    """A thing without map points, before one source's ground, is left out of the view."""
+    """An object without map points in one source image is not painted onto the ground."""
     pose = above()
     blind = unknown_surfaces(data)
     first = int(sources.rows[sources.best(pose, CAMERA.matrix, data.size, 16)[0]])
@@ -131,11 +131,11 @@ def test_what_two_sources_deny_is_not_painted_onto_the_ground(data, sources, mon
     green = (misled == [0, 255, 0]).all(axis=2)
     assert green.mean() < 0.02
     changed = (plain != misled).any(axis=2)
-    assert changed.mean() > 0.02  # the source was one of the view's
+    assert changed.mean() > 0.02  # the source was used for the view
 
 
 def test_what_a_mask_hides_is_not_drawn(data, sources, monkeypatch):
-    """Sources give no colours where they do not show the scene."""
+    """Masked pixels of source images do not contribute colours."""
     pose = above()
     monkeypatch.setattr(data, "valid", lambda row: np.zeros(data.size[::-1], bool))
     image, seen = view(data, sources, pose)
@@ -144,7 +144,7 @@ def test_what_a_mask_hides_is_not_drawn(data, sources, monkeypatch):
 
 
 def test_a_camera_that_sees_nothing_of_the_scene_gets_an_empty_view(data, sources):
-    """No source is chosen, all pixels are filled."""
+    """A camera that sees nothing of the scene has no source images, and its view is empty."""
     away = Poses.from_rotations([[10.0, -50.0, 3.0]], rotations_from_angles([[180.0, 0.0, 0.0]]))
     assert sources.best(away, CAMERA.matrix, data.size, 16) == []
     image, seen = view(data, sources, away)
@@ -153,7 +153,7 @@ def test_a_camera_that_sees_nothing_of_the_scene_gets_an_empty_view(data, source
 
 
 def test_the_best_source_of_its_own_place_is_the_image_itself(data, sources):
-    """And no source is taken twice."""
+    """The best source at a training pose is nearly always that image, and no source is repeated."""
     hits = 0
     for k in range(len(data)):
         best = sources.best(data.poses[k : k + 1], CAMERA.matrix, data.size, 16)
@@ -163,7 +163,7 @@ def test_the_best_source_of_its_own_place_is_the_image_itself(data, sources):
 
 
 def test_a_map_point_hides_what_lies_around_and_behind_it():
-    """Nothing before it, beside it, or about as far as it is."""
+    """A map point occludes what is clearly behind it and near it in the image, and nothing else."""
     one = Occluders.from_points(np.array([[100.0, 50.0]]), np.array([5.0]), (320, 180), 6)
     at = np.array([[100.0, 50.0], [106, 50], [100, 50], [100, 50], [120, 50]])
     depth = np.array([9.0, 9, 5.2, 3, 9])
@@ -171,7 +171,10 @@ def test_a_map_point_hides_what_lies_around_and_behind_it():
 
 
 def facades_and_ground(rng: np.random.Generator, ground: int) -> np.ndarray:
-    """Points of four walls of 12 m around a yard of 40 m, and of its ground at height -1.1, in its middle."""
+    """Return points of four 12 m walls around a 40 m yard, and of ground at height -1.1 m.
+
+    Ground points are only in the middle of the yard.
+    """
     walls = rng.uniform([-20, -20, -0.5], [20, 20, 11], (4000, 3))
     side = rng.integers(4, size=4000)
     walls[np.arange(4000), side // 2] = np.where(side % 2, 20.0, -20.0)
@@ -180,7 +183,7 @@ def facades_and_ground(rng: np.random.Generator, ground: int) -> np.ndarray:
 
 
 def test_ground_is_found_among_many_more_points_of_facades():
-    """Its height to 2 cm; near its points in plan, and nowhere else."""
+    """Ground height is found to 2 cm among facade points, and holds only near ground points."""
     found = fit_level_ground(facades_and_ground(np.random.default_rng(0), 600), 18.0)
     assert found.height == pytest.approx(-1.1, abs=0.02)
     assert found.is_at_or_below(np.array([[0, 0, -1.0], [0, 0, 0.0]])).tolist() == [True, False]
@@ -193,7 +196,7 @@ def test_ground_is_found_among_many_more_points_of_facades():
 
 
 def test_a_scene_without_level_ground_has_none():
-    """Neither facades alone nor a slope, nor a scene of impossible size, are level ground."""
+    """Facades alone, a slope and a scene of implausible size have no level ground."""
     rng = np.random.default_rng(0)
     walls = facades_and_ground(rng, 0)
     assert fit_level_ground(walls, 18.0) is None
@@ -205,7 +208,7 @@ def test_a_scene_without_level_ground_has_none():
 
 
 def test_high_places_look_down_at_the_scene(data, sources):
-    """Level cameras above the middle training image, within the options, at all pitches from 30°."""
+    """Overhead cameras have no roll, stay within the options, and cover a wide range of pitches."""
     centers, scene = data.poses.centers, sources.samples
     options = NovelViewOptions(side_m=1.5, height_m=6.0)
     rng = np.random.default_rng(0)
@@ -219,12 +222,12 @@ def test_high_places_look_down_at_the_scene(data, sources):
     assert (rotations[:, 1, 2] <= 0).all()  # the image's upper edge is up
     assert np.linalg.det(rotations) == pytest.approx(1)
     pitch = np.degrees(np.arcsin(-rotations[:, 2, 2]))
-    assert pitch.min() > 20  # where places lie there
+    assert pitch.min() > 20  # below 30 if the scene has no points at steeper pitches
     assert np.histogram(pitch, [25, 50, 70, 90])[0].min() > 30
 
 
 def test_a_camera_may_look_straight_down():
-    """The azimuth is then drawn, and no number is unknown."""
+    """A nadir view has a valid rotation; a camera below the whole scene raises ValueError."""
     below = np.array([[3.0, 4.0, 0.0]])
     place = overhead_pose(
         np.random.default_rng(1), np.array([[3.0, 4.0, 5.0]]), below, NovelViewOptions(side_m=0.0)
@@ -236,7 +239,7 @@ def test_a_camera_may_look_straight_down():
 
 
 def test_a_stage_begins_with_few_views(data):
-    """At its beginning a batch is drawn from the first 32 views alone, near its end from all."""
+    """Batches use only the first 32 views at the beginning of a stage, and all near its end."""
     options = SceneStageOptions(views_share=1.0, views=72, size_min=0.4, size_max=0.5)
     numbers: dict[float, set[int]] = {}
     for progress in (0.0, 0.5, 0.9):
@@ -255,7 +258,7 @@ def test_a_stage_begins_with_few_views(data):
 
 
 def test_views_are_kept_within_their_memory(data, monkeypatch):
-    """Fewer are made where they would take more, of images spread over all of them."""
+    """The number of views is reduced to fit the memory limit."""
     monkeypatch.setattr("spn_model.models.scene_examples._VIEW_BYTES", 7 * 160 * 90 * 10)
     examples = SceneExamples(
         data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, UNKNOWN_COUNT
@@ -266,7 +269,7 @@ def test_views_are_kept_within_their_memory(data, monkeypatch):
 
 
 def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
-    """After some attempts; its targets are the image's own."""
+    """If views show too little, the training image and its own targets are used instead."""
     monkeypatch.setattr("spn_model.models.scene_examples._LEAST_SHOWN", 1.1)
     examples = SceneExamples(
         data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, UNKNOWN_COUNT
@@ -280,7 +283,7 @@ def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_held_out_views_are_images_of_the_data_size_with_exact_poses(data, shrink):
-    """Each is what a camera at its pose sees; none is among those that batches are drawn from."""
+    """Held-out views match the true images at their poses, and none is used for training."""
     options = SceneStageOptions(views_share=1.0, views=8)
     examples = SceneExamples(data, options, CENTER, SPREAD, shrink, UNKNOWN_COUNT)
     views = examples.held_out_views(5)
@@ -305,7 +308,7 @@ def test_held_out_views_are_images_of_the_data_size_with_exact_poses(data, shrin
 
 
 def test_shares_of_high_views_are_as_told(data):
-    """All, none, and none where up is not known."""
+    """The share of overhead views follows `views_high`: all of them, or none."""
     highest = data.poses.centers[:, 2].max()
 
     def heights(**options: float) -> np.ndarray:
@@ -319,6 +322,6 @@ def test_shares_of_high_views_are_as_told(data):
 
 @pytest.mark.parametrize(("images", "views"), [(100, 32), (6000, 50), (UNKNOWN_COUNT, 1000)])
 def test_a_short_stage_makes_few_views(data, images, views):
-    """One for 120 images that it draws: a view takes the time of ten of them."""
+    """A stage makes one view per 120 images drawn, as a view takes the time of ten images."""
     examples = SceneExamples(data, SceneStageOptions(views_share=1.0), CENTER, SPREAD, 2, images)
     assert examples._view_count == views

@@ -1,4 +1,4 @@
-"""Pose regressors behind the seam: what they are shown is true, what is frozen stays, and they learn it."""
+"""Tests of the pose regression model: training examples, frozen layers, covariances and learning."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> TrainingSet:
 def made(
     network: str = "squeezeposenet", width: int = NARROW, **options: object
 ) -> RegressionModel:
-    """With published weights where they come with the package, else weights drawn by the seed."""
+    """Return a model with published weights if they are part of the package, else random ones."""
     values = {"network": network, "width": width, "network_options": options}
     model = make("regression", values, seed=0)
     assert isinstance(model, RegressionModel)
@@ -69,7 +69,7 @@ def begun(data: TrainingSet, stage: dict[str, object], **options: object) -> Reg
 
 
 def train(model: RegressionModel, data: TrainingSet, steps: int, rate: float) -> list[float]:
-    """Steps on all images at once; the rate rises for 20 steps, and falls along a cosine. The losses."""
+    """Train on all images at once, with warm-up and cosine decay, and return the losses."""
     groups = [{**group, "lr": rate * group["rate"]} for group in model.parameter_groups()]
     optimizer = torch.optim.AdamW(groups, weight_decay=0, fused=True)
     schedule = torch.optim.lr_scheduler.LambdaLR(
@@ -94,7 +94,7 @@ def all_images(data: TrainingSet) -> np.ndarray:
 
 
 def worst(model: RegressionModel, data: TrainingSet) -> tuple[float, float]:
-    """Largest errors on the training images, in metres and degrees."""
+    """Return the largest errors on the training images, in metres and degrees."""
     found = model.estimate(all_images(data), data.intrinsics)
     error_m, error_deg = pose_errors(found.poses, data.poses)
     return float(error_m.max()), float(error_deg.max())
@@ -111,7 +111,7 @@ def changed(model: RegressionModel, before: dict[str, torch.Tensor]) -> set[str]
 
 
 def test_it_learns_sixteen_images(data):
-    """Augmentation and dropout off, learned weights: every one of 16 images to 0.1 m and 1 degree."""
+    """Without augmentation and dropout, all 16 images are learned to 0.1 m and 1 degree."""
     model = begun(data, LEARNED)
     start_m, start_deg = worst(model, data)
     assert start_m > 4
@@ -128,7 +128,7 @@ def test_it_learns_sixteen_images(data):
     [({"beta": 500.0}, 350, 5e-4), ({"loss": "reprojection"}, 500, 5e-4)],
 )
 def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
-    """The paper's loss with its beta, and the reprojection error alone."""
+    """The paper's beta-weighted loss and the reprojection loss alone also overfit 16 images."""
     model = begun(data, {**STILL, **stage})
     train(model, data, steps, rate)
     error_m, error_deg = worst(model, data)
@@ -145,7 +145,7 @@ def test_other_losses_learn_sixteen_images_too(data, stage, steps, rate):
     ],
 )
 def test_large_networks_learn_four_images(four, network, stages):
-    """From weights drawn at random: every one of 4 images to 0.5 m and 3 degrees."""
+    """From random weights, large networks learn all 4 images to 0.5 m and 3 degrees."""
     model = made(network, width=64)
     model.fit(four)
     for stage, steps, rate in stages:
@@ -157,19 +157,19 @@ def test_large_networks_learn_four_images(four, network, stages):
 
 
 def test_it_starts_at_the_mean_pose(data):
-    """Before training every image has the mean of the training centres, and about their mean orientation."""
+    """Before training, estimates are at the mean training centre, near the mean orientation."""
     found = begun(data, {}).estimate(all_images(data), data.intrinsics)
     assert found.poses.centers == pytest.approx(
         np.tile(data.poses.centers.mean(axis=0), (16, 1)), abs=1e-5
     )
     assert pose_errors(found.poses, data.poses)[1].max() < 45
-    # As unsure as the training poses are spread, and by one radian.
+    # The initial uncertainty is the spread of the training poses, and one radian.
     spread = ((data.poses.centers - data.poses.centers.mean(axis=0)) ** 2).sum(axis=1).mean()
     assert np.diag(found.covariance[0]) == pytest.approx([spread] * 3 + [1] * 3, rel=1e-4)
 
 
 def test_fitting_keeps_the_pretrained_features(data):
-    """Features are the same before and after the normalisations are measured: they start as the identity."""
+    """Features do not change when normalisation layers are initialised, as these start as the identity."""
     model = made()
     images = model.normalised(torch.from_numpy(all_images(data)[:, ::2, ::2].copy()))
     with torch.no_grad():
@@ -182,14 +182,14 @@ def test_fitting_keeps_the_pretrained_features(data):
         after = model.network.regressor.trunk(images)[0]
     assert len(layers) == 25
     assert torch.allclose(without, after, rtol=1e-4, atol=1e-4)
-    # A fresh normalisation in eval mode would be the identity too, but not what its statistics call for.
+    # A fresh layer in eval mode would also be the identity, but without measured statistics.
     for layer in layers:
         assert layer.running_mean.abs().max() > 0.1
         assert torch.equal(layer.bias, layer.running_mean)
 
 
 def test_another_data_set_moves_the_targets_alone(data, four):
-    """A network that was fitted before keeps its normalisations and heads, and aims about the new centre."""
+    """Fitting a trained network to another data set changes only its target centre, scale and hemisphere."""
     model = begun(data, LEARNED)
     train(model, data, 2, 1e-3)
     state = {k: v.clone() for k, v in model.network.state_dict().items()}
@@ -201,7 +201,7 @@ def test_another_data_set_moves_the_targets_alone(data, four):
 
 @pytest.mark.parametrize("batch_statistics", [False, True])
 def test_a_frozen_trunk_stays_as_it_is(data, batch_statistics):
-    """Not a weight and not a statistic of it moves, while the added layers learn."""
+    """Weights and statistics of a frozen trunk do not change while the added layers learn."""
     stage = {**STILL, "freeze_trunk": True, "batch_statistics": batch_statistics}
     model = begun(data, stage)
     before = trunk_state(model)
@@ -214,7 +214,7 @@ def test_a_frozen_trunk_stays_as_it_is(data, batch_statistics):
 
 @pytest.mark.parametrize("batch_statistics", [False, True])
 def test_stored_statistics_move_only_where_that_is_chosen(data, batch_statistics):
-    """Training all layers changes every weight; running statistics only with batch_statistics."""
+    """Training all layers changes all weights, but running statistics only with batch_statistics."""
     model = begun(data, {**STILL, "batch_statistics": batch_statistics})
     before = trunk_state(model)
     train(model, data, 2, 1e-2)
@@ -224,7 +224,7 @@ def test_stored_statistics_move_only_where_that_is_chosen(data, batch_statistics
 
 
 def test_dropout_can_be_off(data):
-    """Off, the same batch has the same loss; on, it has not."""
+    """The loss of a batch is deterministic if dropout is disabled, and random otherwise."""
     for dropout in (False, True):
         model = begun(data, {"augmentation": False, "dropout": dropout})
         nn.init.normal_(model.network.regressor.x.weight)
@@ -236,7 +236,7 @@ def test_dropout_can_be_off(data):
 
 @pytest.mark.parametrize("width", [0, 160])
 def test_a_turned_camera_sees_what_its_label_says(data, width):
-    """Rendered at its pose, an example looks as it does, wherever the real camera saw the place."""
+    """Rendering the scene at an example's pose reproduces the example, wherever the camera saw it."""
     model = begun(data, {"look": False, "tilt_deg": 15.0, "roll_deg": 20.0}, width=width)
     rows = np.array([2, 7])
     batch = model.batch(data, rows, np.random.default_rng(1), 0.5)
@@ -256,7 +256,7 @@ def test_a_turned_camera_sees_what_its_label_says(data, width):
 
 
 def test_a_batch_is_a_function_of_its_arguments(data):
-    """The same draws give the same batch, others another; the reprojection error is 0 at the true poses."""
+    """Equal seeds give equal batches, other seeds differ, and points are within the rotated image."""
     model = begun(data, {"loss": "reprojection", "points": 50})
     rows = np.array([3, 3, 8])
     one, same, other = (
@@ -268,7 +268,7 @@ def test_a_batch_is_a_function_of_its_arguments(data):
     assert one["images"].shape == (3, 36, NARROW, 3)
     assert one["points"].shape == (3, 50, 3)
     assert one["seen"].sum(dim=1).min() > 20
-    # Every point lies inside the turned image, by the data set's own K.
+    # Every point projects into the rotated image, with the data set's own K.
     poses = model.network.targets.decode(one["x"].numpy(), one["q"].numpy())
     for k in range(3):
         xyz = (
@@ -280,7 +280,7 @@ def test_a_batch_is_a_function_of_its_arguments(data):
 
 @pytest.mark.parametrize("network", ["squeezeposenet", "posenet"])
 def test_stored_features_are_those_of_their_images(data, network):
-    """Features of the cache are what the trunk makes of the variant, with its own label."""
+    """Cached features equal those that the trunk computes for the variant, with its own label."""
     model = begun(data, CACHED, network=network)
     rows = np.array([4, 0, 11])
     batch = model.batch(data, rows, np.random.default_rng(0), 0.0)
@@ -304,7 +304,7 @@ def test_stored_features_are_those_of_their_images(data, network):
 
 
 def test_variants_of_stored_features_differ(data):
-    """With 3 variants of each image, draws of one row find 3 different labels, each with its features."""
+    """With 3 variants per image, one row yields 3 different labels, each with its own features."""
     model = begun(data, {**CACHED, "cached_features": 3})
     batch = model.batch(data, np.full(40, 5), np.random.default_rng(0), 0.0)
     labels = {tuple(q) for q in batch["q"].tolist()}
@@ -313,7 +313,7 @@ def test_variants_of_stored_features_differ(data):
 
 
 def test_positions_count_in_metres(data):
-    """The paper's loss of a batch is that of the estimates in metres, however large the inner unit is."""
+    """The paper's loss is computed in metres, however large the internal unit is."""
     model = begun(data, STILL)
     with torch.no_grad():
         model.network.regressor.x.bias.copy_(torch.tensor([0.5, -1.0, 0.25]))
@@ -328,7 +328,7 @@ def test_positions_count_in_metres(data):
 
 
 def test_stating_uncertainty_changes_no_pose(data):
-    """Gradients of all layers but `uncertainty` are those of the paper's loss alone."""
+    """The likelihood affects only the `uncertainty` layer; other gradients are those of the paper's loss."""
     model = begun(data, STILL)
     network = model.network
     nn.init.normal_(network.regressor.x.weight, std=0.01)
@@ -345,7 +345,7 @@ def test_stating_uncertainty_changes_no_pose(data):
 
 
 def test_stated_covariances_become_those_of_the_errors(data):
-    """Poses held, `uncertainty` alone learns: squared distances of the errors become those they should be."""
+    """Training only `uncertainty` makes covariances match the errors, and covariance scales multiply."""
     model = begun(data, {**CACHED, "cached_features": 4})
     for group in model.parameter_groups():
         if group["name"] != "uncertainty":
@@ -370,7 +370,7 @@ def test_stated_covariances_become_those_of_the_errors(data):
 
 
 def test_its_state_is_the_whole_member(data):
-    """Made anew from its options and given its state, it estimates the same, one image or many at a time."""
+    """A model rebuilt from options and state gives the same estimates, for single images and batches."""
     model = begun(data, LEARNED)
     train(model, data, 3, 1e-3)
     model.set_covariance_scale(3.0)
@@ -387,7 +387,7 @@ def test_its_state_is_the_whole_member(data):
 
 
 def test_an_answer_that_is_no_pose_is_said_to_be_none(data):
-    """NaN and a reason, not a pose."""
+    """A NaN output gives a NaN pose with a reason."""
     model = begun(data, STILL)
     with torch.no_grad():
         model.network.regressor.x.bias[1] = torch.nan
@@ -398,7 +398,7 @@ def test_an_answer_that_is_no_pose_is_said_to_be_none(data):
 
 
 def test_dropout_tells_a_covariance_too(data):
-    """Kendall and Cipolla's sampling gives a full covariance, and a mean near the estimate."""
+    """Monte-Carlo dropout (Kendall and Cipolla) gives a full covariance and a mean near the estimate."""
     model = begun(data, LEARNED)
     train(model, data, 20, 1e-3)
     images, matrices = all_images(data)[:2], data.intrinsics[:2]
@@ -425,7 +425,7 @@ def test_dropout_tells_a_covariance_too(data):
     ],
 )
 def test_wrong_stages_are_refused(data, stage, said):
-    """Names, values and combinations of a recipe's stage that cannot be, with what is wrong."""
+    """Invalid names, values and combinations of stage options are rejected with a specific message."""
     model = made("posenet", width=64)
     model.fit(data)
     with pytest.raises(InputError, match=said):
@@ -443,13 +443,13 @@ def test_wrong_stages_are_refused(data, stage, said):
     ],
 )
 def test_wrong_networks_are_refused(options, said):
-    """The same of what makes a network."""
+    """Invalid model options are rejected with a specific message."""
     with pytest.raises(InputError, match=said):
         make("regression", options)
 
 
 def test_what_cannot_be_trained_on_is_refused(tmp_path, data):
-    """No points for the reprojection error, images of an unknown camera, images that are too small."""
+    """Missing points for the reprojection loss, an unknown camera and tiny images are rejected."""
     with Dataset(write_box(tmp_path / "dataset.h5", train=2, points=0)) as dataset:
         bare = TrainingSet(dataset.groups["train"])
     bare.has_points = False
@@ -468,7 +468,7 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, data):
 
 
 def test_input_is_sized_alike_in_training_and_estimates(data):
-    """A width gives images in proportion, smaller or larger; 0 leaves them as they are."""
+    """A width rescales images proportionally, up or down; 0 keeps their size."""
     for width, size in ((60, (34, 60)), (0, (180, 320)), (400, (225, 400))):
         model = made(width=width)
         model.begin_stage(STILL, data)

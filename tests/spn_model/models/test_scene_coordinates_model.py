@@ -1,4 +1,4 @@
-"""The scene-coordinate model: what it is shown is true, it learns it, and says when it sees nothing."""
+"""Tests of the scene-coordinate model: training examples, learning, and images without a pose."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def fitted(
 
 
 def test_a_batch_depends_on_its_arguments_alone(data):
-    """The same rows, generator and progress give the same tensors, whatever batches came before."""
+    """Equal rows, generator and progress give equal tensors, whatever batches were drawn before."""
     first, second = fitted(data, VIEWS), fitted(data, VIEWS)
     for k in range(4):
         second.batch(data, np.arange(4), np.random.default_rng(100 + k), 0.9)
@@ -78,7 +78,10 @@ def test_a_batch_depends_on_its_arguments_alone(data):
 
 
 def test_images_follow_the_zoom(data):
-    """Turns and zooms grow at a stage's beginning; small images are more of them, at most twice as many."""
+    """Augmentation ramps up at a stage's beginning, and image sizes follow the zoom.
+
+    A batch holds more images if they are small, at most twice as many.
+    """
     rows = np.arange(6)
     small = fitted(data, STILL | {"size_min": 0.5, "size_max": 0.5})
     batch = small.batch(data, rows, np.random.default_rng(0), 0.5)
@@ -111,10 +114,10 @@ def test_images_follow_the_zoom(data):
     ids=["surfaces", "views", "reduced views", "moved images", "reduced moved images", "points"],
 )
 def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
-    """A pose made of the targets alone is that of a camera that would take this very image.
+    """The pose decoded from the targets is that of a camera that would take this image.
 
-    For turned and zoomed images its centre is the training camera's: 2 cm in a hall of 20 m. What lies at
-    the image's edges, where the training image ends, is left out of the comparison.
+    For rotated and zoomed images its centre is the training camera's to 2 cm, in a hall of 20 m. The image's
+    edges, beyond which the training image shows nothing, are left out of the comparison.
     """
     zoom = 0.8
     model = fitted(
@@ -144,7 +147,7 @@ def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
         expected, _ = seen_by(found.poses, lens)
         off = np.abs(image.astype(float) - expected).max(axis=2)
         rows_of, columns_of = (np.argwhere(known).T * 8 + 7)[:, :]
-        if stage.get("surfaces", True):  # points lie up to half a cell beside its middle
+        if stage.get("surfaces", True):  # points are up to half a cell off its centre
             assert np.median(off[rows_of, columns_of]) < 12
         moved.append(np.linalg.norm(found.poses.centers[0] - data.poses.centers[row]))
     if stage.get("views_share"):
@@ -154,7 +157,7 @@ def test_targets_are_what_the_cells_show(data, stage, known_share, shrink):
 
 
 def test_far_points_are_no_targets(data):
-    """A point at the end of the world has no cell, one of the hall keeps its own."""
+    """Points far outside the scene are no targets, while near points are."""
     model = fitted(data, STILL)
     everywhere = model.batch(data, np.arange(6), np.random.default_rng(0), 0.5)["known"]
     model.network.spread.mul_(0.25)
@@ -166,7 +169,7 @@ def test_far_points_are_no_targets(data):
 
 
 def test_a_batch_without_targets_teaches_nothing(data):
-    """Its loss is 0 and so are all gradients, rather than not a number."""
+    """A batch without targets has a loss of 0 and zero gradients, not NaN."""
     model = fitted(data, STILL)
     batch = model.batch(data, np.arange(2), np.random.default_rng(0), 0.5)
     loss, figures = model.loss(batch | {"known": torch.zeros_like(batch["known"])})
@@ -177,7 +180,7 @@ def test_a_batch_without_targets_teaches_nothing(data):
 
 
 def test_frozen_layers_are_in_no_group(data):
-    """SqueezeNet's first layers stay as published, its others learn at their own rate."""
+    """Frozen SqueezeNet layers are in no parameter group; the others get their own learning rate."""
     model = fitted(data, {"freeze_layers": 13})
     assert [group["name"] for group in model.parameter_groups()] == ["added"]
     model.begin_stage({"freeze_layers": 5, "features_rate": 0.1}, data)
@@ -188,7 +191,7 @@ def test_frozen_layers_are_in_no_group(data):
 
 
 def test_published_weights_are_loaded(data):
-    """Shipped features replace what the seed drew; the head stays as drawn, and differs by seed."""
+    """Pretrained features replace random ones; the head keeps the random weights of its seed."""
     model, other = (SceneCoordinatesModel.make({}, seed) for seed in (0, 1))
     head, features = model.network.fine.weight.clone(), model.network.features[0].weight.clone()
     model.load_pretrained("squeezenet1_1-features")
@@ -210,23 +213,23 @@ def test_published_weights_are_loaded(data):
     ],
 )
 def test_stages_that_make_no_sense_are_refused(data, stage, message):
-    """An option that is not known, of another type or out of bounds is told by name."""
+    """An unknown option, a wrong type or a value out of range is rejected by name."""
     with pytest.raises(InputError, match=message):
         SceneCoordinatesModel.make({}).begin_stage(stage, data)
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
-    """Where each cell shows what the image shows at its stated pixel, the pose is exact."""
+    """Coordinates seen at each cell's stated pixel decode to the exact pose, for reduced images too."""
     model = fitted(data, STILL, shrink=shrink)
     images = torch.zeros(1, 3, 180, 320)
     rows, columns = model.network(images)[1].shape[2:]
     first, stride = model.network.first_cell_px, model.network.stride_px
-    # An image of its own pixels' places: cell 0 lies on pixel 7 of the reduced one, cell 1 on pixel 15.
+    # An image whose values are pixel positions: cells 0 and 1 are at pixels 7 and 15 of the reduced one.
     places = (torch.arange(320) + 0.5).expand(1, 3, 180, 320)
     seen = model.network.reduced(places)[0, 0, 0]
     assert [float(seen[7]), float(seen[15])] == [first, first + stride]
-    # A camera of which each pixel is a cell.
+    # A camera with one pixel per cell.
     near = Camera(
         "PINHOLE",
         columns,
@@ -243,14 +246,14 @@ def test_cells_of_reduced_images_lie_where_they_are_said_to(data, shrink):
 
 
 def test_images_that_are_too_small_once_reduced_are_refused(data):
-    """The message tells the size, and what to do."""
+    """The error for an image too small after reduction states its size and the remedy."""
     model = fitted(data, STILL, shrink=2)
     with pytest.raises(InputError, match=r"100 x 180, reduced by 2, .* or shrink = 1"):
         model.estimate(np.zeros((1, 180, 100, 3), np.uint8), CAMERA.matrix[None])
 
 
 def test_the_page_tells_all_options_and_their_defaults():
-    """docs/scene-coordinates.md has each option of a stage, with its default."""
+    """docs/scene-coordinates.md lists each stage option with its default."""
     page = (Path(__file__).parents[3] / "docs" / "scene-coordinates.md").read_text()
     told = {}
     for line in page.splitlines():
@@ -265,7 +268,7 @@ def test_the_page_tells_all_options_and_their_defaults():
 
 
 def test_options_of_decoding_make_the_model():
-    """What `options` returns builds the same model; an unknown option is refused."""
+    """The model's `options` rebuild the same model; an unknown option is rejected."""
     model = SceneCoordinatesModel.make({"cells": 300, "shrink": 1})
     assert SceneCoordinatesModel.make(model.options).network.shrink == 1
     assert SceneCoordinatesModel.make(model.options).decoding == model.decoding
@@ -275,7 +278,7 @@ def test_options_of_decoding_make_the_model():
 
 
 def test_images_without_points_cannot_be_learnt_from(tmp_path):
-    """Too few map points are told, with what to do."""
+    """Too few map points raise an error that states the remedy."""
     with Dataset(write_box(tmp_path / "few.h5", train=2, points=20)) as dataset:
         few = TrainingSet(dataset.groups["train"])
     with pytest.raises(InputError, match=r"see 40 map points.*train another network"):
@@ -283,7 +286,7 @@ def test_images_without_points_cannot_be_learnt_from(tmp_path):
 
 
 def test_an_image_of_nothing_has_no_pose(data):
-    """Neither a grey image nor an unknown camera makes a pose: NaN, each with its reason."""
+    """A uniform grey image and an unknown camera give NaN, each with its reason."""
     model = fitted(data, STILL)
     grey = np.full((2, 180, 320, 3), 128, np.uint8)
     intrinsics = np.stack([CAMERA.matrix, np.full((3, 3), np.nan)])
@@ -295,14 +298,14 @@ def test_an_image_of_nothing_has_no_pose(data):
 
 
 def estimates(true: Poses, errors: np.ndarray, covariance: np.ndarray) -> PoseEstimates:
-    """Estimates that err by (N, 6) from the truth."""
+    """Return estimates that differ from the truth by errors of shape (N, 6)."""
     turned = rotations_from_vectors(-errors[:, 3:]) @ true.rotations
     poses = Poses.from_rotations(true.centers - errors[:, :3], turned)
     return PoseEstimates(poses, covariance, np.full(len(errors), ""))
 
 
 def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
-    """Errors twice as large as stated give a factor of 4, whatever a few wrong poses do."""
+    """Errors twice as large as stated give a factor of 4, despite a few outliers."""
     rng = np.random.default_rng(0)
     n = 400
     true = Poses.from_rotations(rng.normal(size=(n, 3)), np.repeat(np.eye(3)[None], n, axis=0))
@@ -319,7 +322,7 @@ def test_covariances_are_scaled_by_what_is_seen_on_other_images(data):
 
 
 def test_the_scale_of_covariances_is_part_of_the_state(data):
-    """Setting it twice multiplies; covariances of decoded poses grow by it; a state carries it along."""
+    """Covariance scales multiply, apply to decoded poses, and are saved in the network's state."""
     model = fitted(data, STILL)
     _, shown = seen_by(data.poses[:1])
     coordinates = shown[7::8, 7::8].transpose(2, 0, 1).astype(np.float32)
@@ -337,14 +340,14 @@ def test_the_scale_of_covariances_is_part_of_the_state(data):
 
 
 def test_bfloat16_is_for_processors_that_have_it():
-    """A device of unknown kind computes in float32; the answer for this processor is a plain bool."""
+    """bfloat16 support is a plain bool for this processor, and False for an unknown device."""
     assert bfloat16_is_fast("cpu") in (True, False)
     assert not bfloat16_is_fast("abacus")
 
 
 @pytest.mark.slow
 def test_it_learns_sixteen_images_by_heart(data):
-    """Shown 16 images without augmentation it finds them to 0.1 m and 1 degree."""
+    """The model overfits 16 images without augmentation to 0.1 m and 1 degree."""
     model = fitted(data, STILL)
     model.bfloat16 = bfloat16_is_fast("cpu")
     groups = [{**group, "lr": 0.0} for group in model.parameter_groups()]

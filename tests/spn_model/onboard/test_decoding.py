@@ -1,4 +1,4 @@
-"""Poses from scene coordinates: exact, robust, honest about themselves, and light enough for a drone."""
+"""Tests of decoding scene coordinates into poses: accuracy, robustness, covariance and dependencies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def decoded(xyz: np.ndarray, log_scale: np.ndarray, options: DecodingOptions | N
 
 
 def scene(seed: int) -> np.ndarray:
-    """(3, h, w) exact coordinates of cells, at uneven depths."""
+    """Return exact coordinates of the cells, shape (3, h, w), at random depths."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(GRID[0]) * 8 + 7.5, np.arange(GRID[1]) * 8 + 7.5)
     rays = np.stack([(x - 240) / 328, (y - 135) / 328, np.ones_like(x)])
@@ -36,14 +36,14 @@ def scene(seed: int) -> np.ndarray:
 
 
 def laplace(rng: np.random.Generator, scale: np.ndarray) -> np.ndarray:
-    """(3, h, w) errors whose density falls with exp(-length / scale)."""
+    """Return errors, shape (3, h, w), with density proportional to exp(-length / scale)."""
     direction = rng.normal(size=(3, *scale.shape))
     direction /= np.linalg.norm(direction, axis=0)
     return direction * rng.gamma(3.0, scale)
 
 
 def test_exact_coordinates_give_the_exact_pose():
-    """Half pixels, axes and signs: 1e-6 m and degrees, far from the world's origin."""
+    """Exact coordinates give the pose to 1e-6 m and 1e-6 degrees, far from the world's origin."""
     estimate = decoded(scene(0), np.full(GRID[::-1], -3.0))
     error_m, error_deg = pose_errors(estimate.poses, TRUE)
     assert error_m[0] < 1e-6
@@ -52,7 +52,7 @@ def test_exact_coordinates_give_the_exact_pose():
 
 
 def test_most_cells_may_be_wrong():
-    """Six of ten cells somewhere else, as sure of themselves as the others, leave the pose as it is."""
+    """With 60 % outliers of equal confidence the pose stays accurate."""
     rng = np.random.default_rng(1)
     xyz = scene(1)
     wrong = rng.random(GRID[::-1]) < 0.6
@@ -65,7 +65,7 @@ def test_most_cells_may_be_wrong():
 
 
 def test_the_surest_cells_are_taken():
-    """Cells that say that they know nothing may hold anything."""
+    """Cells with a large predicted scale do not affect the pose."""
     xyz, log_scale = scene(2), np.full(GRID[::-1], -3.0)
     xyz[:, :20] = 1e4
     log_scale[:20] = 3.0
@@ -74,7 +74,7 @@ def test_the_surest_cells_are_taken():
 
 
 def test_certainty_weighs():
-    """Where half of the cells are 20 times better and say so, the pose is better than if they were silent."""
+    """If half of the cells are 20 times better, using their predicted scales gives a better pose."""
     rng = np.random.default_rng(3)
     told, silent = [], []
     for seed in range(10):
@@ -87,7 +87,7 @@ def test_certainty_weighs():
 
 
 def test_covariance_is_that_of_the_errors():
-    """Independent errors of the stated scale: normalised squares of the pose's error average near 6.
+    """For independent errors of the predicted scale, the mean NEES is near 6.
 
     The order is centre, then rotation vector in the camera frame with R_true = exp(v) R.
     """
@@ -103,7 +103,7 @@ def test_covariance_is_that_of_the_errors():
 
 
 def test_cells_above_the_largest_scale_are_left_out():
-    """Scales are compared with the limit themselves, at 0.99 and 1.01 times a limit of 0.2 m."""
+    """Cells are excluded by comparing the scale itself with the limit, here at 0.99 and 1.01 times 0.2 m."""
     log_scale = np.full(GRID[::-1], np.log(0.99 * 0.2))
     log_scale[:20] = np.log(1.01 * 0.2)
     options = DecodingOptions(cells=log_scale.size, largest_scale=0.2)
@@ -129,7 +129,7 @@ def test_covariance_accounts_for_the_slope_of_the_influence_function():
 
 
 def test_covariance_knows_which_way_is_weak():
-    """Before a flat wall a slide hides behind a turn: camera moved right, points turned right."""
+    """In front of a flat wall, sideways translation and rotation are strongly correlated."""
     x, y = np.meshgrid(np.arange(GRID[0]) * 8 + 7.5, np.arange(GRID[1]) * 8 + 7.5)
     xyz = np.stack([(x - 240) / 328, (y - 135) / 328, np.ones_like(x)]) * 10.0
     scale = np.full(GRID[::-1], 0.1)
@@ -143,7 +143,7 @@ def test_covariance_knows_which_way_is_weak():
 
 
 def test_wider_scatter_than_stated_widens_the_covariance():
-    """Cells that are four times worse than they say are not believed."""
+    """Errors four times larger than predicted increase the covariance."""
     rng = np.random.default_rng(5)
     said = np.full(GRID[::-1], 0.02)
     honest = decoded(scene(5) + laplace(rng, said), np.log(said), STILL).covariance
@@ -152,7 +152,7 @@ def test_wider_scatter_than_stated_widens_the_covariance():
 
 
 def test_neighbours_that_err_alike_count_less():
-    """The covariance grows with the number of cells that tell as much as one."""
+    """The covariance is proportional to the number of cells per independent observation."""
     log_scale = np.full(GRID[::-1], -3.0)
     xyz = scene(6) + laplace(np.random.default_rng(6), np.exp(log_scale))
     one = decoded(xyz, log_scale, STILL).covariance
@@ -161,14 +161,14 @@ def test_neighbours_that_err_alike_count_less():
 
 
 def test_nonsense_gives_no_pose():
-    """Random coordinates raise GeometryError with the count, instead of some pose."""
+    """Random coordinates raise GeometryError with the number of inliers instead of giving a pose."""
     xyz = np.random.default_rng(7).normal(0, 10, (3, *GRID[::-1]))
     with pytest.raises(GeometryError, match=r"\d+ of 700 cells agree on a pose, need \d+"):
         decoded(xyz, np.zeros(GRID[::-1]), DecodingOptions(min_inliers=60))
 
 
 def test_cells_without_a_number_are_left_out():
-    """NaN coordinates are no cells; where too few are left, the error says how many."""
+    """Non-finite coordinates are ignored; if too few cells remain, the error states their number."""
     xyz, log_scale = scene(8), np.full(GRID[::-1], -3.0)
     xyz[:, 5:9] = np.nan
     error_m, _ = pose_errors(decoded(xyz, log_scale).poses, TRUE)
@@ -180,7 +180,7 @@ def test_cells_without_a_number_are_left_out():
 
 
 def test_decoding_needs_neither_torch_nor_pycolmap():
-    """On board there is NumPy and OpenCV."""
+    """Decoding can be imported without torch, pycolmap and scipy."""
     code = (
         "import sys\n"
         "sys.modules['torch'] = sys.modules['pycolmap'] = sys.modules['scipy'] = None\n"

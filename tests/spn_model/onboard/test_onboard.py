@@ -1,4 +1,4 @@
-"""On board: poses of a flying camera without torch, pycolmap, h5py or scipy; bundles may be hostile."""
+"""Tests of the onboard program, which runs without torch, pycolmap, h5py or scipy on untrusted bundles."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.worlds.box_world import seen_by, write_box
 from tests.worlds.bundle_world import LENS, learnt
 
 ROOT = Path(__file__).resolve().parents[3]
-# A finder that comes first refuses what is not on board.
+# An import finder, inserted first, blocks packages that are not available on board.
 BLOCKED = """
 import sys
 class Absent:
@@ -80,7 +80,7 @@ def truth(hall: Path) -> Poses:
 
 @pytest.fixture(scope="module")
 def flown(truth: Poses) -> list[np.ndarray]:
-    """BGR images of the lens with distortion, at the training poses."""
+    """Return BGR images from a camera with lens distortion at the training poses."""
     return [seen_by(truth[k : k + 1], LENS)[0][..., ::-1].copy() for k in range(len(truth))]
 
 
@@ -91,7 +91,7 @@ def camera_file(tmp_path: Path) -> Path:
 
 
 def test_a_flying_cameras_image_is_located(bundle, flown, truth):
-    """Through a distorted lens that the network has never seen, at both precisions, BGR and RGB."""
+    """An image from an unseen, distorted lens is located at both precisions, as BGR and RGB."""
     for int8, limit_m in ((False, 0.3), (True, 0.5)):
         localizer = Localizer(bundle, int8=int8)
         for k, image in enumerate(flown):
@@ -106,7 +106,7 @@ def test_a_flying_cameras_image_is_located(bundle, flown, truth):
 
 
 def test_an_image_without_a_pose_has_a_reason(bundle, flown, tmp_path):
-    """Where too few cells agree there is no pose, no covariance, and words that say why."""
+    """If too few cells agree, pose and covariance are NaN and the reason is stated."""
     folder = tmp_path / "bundle"
     shutil.copytree(bundle, folder)
     edited(lambda d: d["decoding"]["options"].update(min_inliers=500))(folder)
@@ -117,18 +117,18 @@ def test_an_image_without_a_pose_has_a_reason(bundle, flown, tmp_path):
 
 
 def test_the_view_on_board_is_that_of_the_data_set(flown):
-    """From 1280 x 720 to 480 x 270, images equal those of spn_data.geometry.rendering to a grey level."""
+    """Onboard rendering from 1280 x 720 to 480 x 270 matches the data set's to about one grey level."""
     lens = Camera("OPENCV", 1280, 720, np.array([820, 822, 645, 355, -0.11, 0.06, 1e-3, -5e-4]))
     view = canonical_camera([lens], RenderingOptions())
     assert (view.width, view.height) == (480, 270)
     image = cv2.resize(flown[0], (1280, 720), interpolation=cv2.INTER_CUBIC)
     noise = np.random.default_rng(0).normal(0, 12, image.shape)
-    image = np.clip(image + noise, 0, 255).astype(np.uint8)  # detail as fine as a pixel
+    image = np.clip(image + noise, 0, 255).astype(np.uint8)  # pixel-level detail
     wanted = PinholeRenderer(lens, view).render(image).astype(float)
     found = PinholeRenderer(lens, view, sample_step_px=SAMPLE_STEP_PX).render(image).astype(float)
     assert 0 < np.abs(found - wanted).mean() < 1.5
     assert np.percentile(np.abs(found - wanted), 99) < 6
-    # Neither brighter nor darker: of means of 2 x 2, OpenCV rounds halves up, which is an eighth.
+    # No brightness bias beyond OpenCV's rounding: it rounds halves up in 2 x 2 means, which adds 1/8.
     assert abs((found - wanted).mean()) < 0.15
     smooth = [cv2.GaussianBlur(part, (0, 0), 2) for part in (found, wanted)]
     shift, _ = cv2.phaseCorrelate(smooth[0][..., 1], smooth[1][..., 1])
@@ -136,7 +136,7 @@ def test_the_view_on_board_is_that_of_the_data_set(flown):
 
 
 def test_images_are_rendered_with_the_coarser_step(bundle, flown):
-    """The localizer's own view is that of the test above, not the data set's slower one."""
+    """The localizer renders with the coarser sampling step, not the data set's slower one."""
     lens, localizer = LENS.scaled(896, 504), Localizer(bundle)
     image = cv2.resize(flown[0], (896, 504), interpolation=cv2.INTER_CUBIC)
     found = localizer.view(image, lens)[0][..., ::-1]
@@ -146,7 +146,7 @@ def test_images_are_rendered_with_the_coarser_step(bundle, flown):
 
 
 def test_another_size_of_the_same_shape_is_scaled(bundle, flown, truth):
-    """A camera file of 1280 x 720 serves images of 640 x 360, and no images of another shape."""
+    """A camera file is scaled to images of the same aspect ratio; other ratios are rejected."""
     localizer = Localizer(bundle)
     found = localizer.localize(flown[1], LENS.scaled(1280, 720))
     assert pose_errors(found.poses, truth[1:2])[0] < 0.3
@@ -169,7 +169,7 @@ def run_blocked(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def sources(flown: list[np.ndarray], tmp_path: Path) -> tuple[Path, Path]:
-    """A photo of the first pose, and a video of all four at 2 frames a second."""
+    """Return a photo at the first pose and a video of all four at 2 frames per second."""
     photo, video = tmp_path / "photo one,1.png", tmp_path / "flight.avi"
     photo.write_bytes(cv2.imencode(".png", flown[0])[1].tobytes())
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 2.0, (640, 360))
@@ -180,7 +180,7 @@ def sources(flown: list[np.ndarray], tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_the_program_needs_three_packages(bundle, sources, camera_file, truth):
-    """With torch, pycolmap, h5py, scipy and PyAV absent, images and videos become rows of CSV."""
+    """Images and videos become CSV rows without torch, pycolmap, h5py, scipy and PyAV installed."""
     done = run_blocked(str(bundle), *map(str, sources), "--camera", str(camera_file), "--int8")
     assert done.returncode == 0, done.stderr
     rows = list(csv.DictReader(io.StringIO(done.stdout)))
@@ -195,7 +195,7 @@ def test_the_program_needs_three_packages(bundle, sources, camera_file, truth):
         )
         assert pose_errors(found, truth[k : k + 1])[0] < 0.5
         assert float(row["cov_00"]) > 0
-        assert row["lat_deg"] == ""  # the hall has no place on the globe
+        assert row["lat_deg"] == ""  # the hall is not georeferenced
         assert row["reason"] == ""
     loaded = done.stderr.rpartition("LOADED ")[2].split()
     assert {"numpy", "cv2", "onnxruntime"} <= set(loaded)
@@ -203,7 +203,7 @@ def test_the_program_needs_three_packages(bundle, sources, camera_file, truth):
 
 
 def test_json_lines_hold_the_same(bundle, sources, camera_file):
-    """Each line is an object with the whole covariance."""
+    """JSON lines hold the poses of the CSV and the full covariance matrix."""
     arguments = (str(bundle), str(sources[1]), "--camera", str(camera_file))
     done = run_blocked(*arguments, "--format", "jsonl")
     assert done.returncode == 0, done.stderr
@@ -229,7 +229,7 @@ def test_json_lines_hold_the_same(bundle, sources, camera_file):
 def test_a_source_that_is_none_is_told_in_one_line(
     bundle, camera_file, tmp_path, name, content, told
 ):
-    """Exit code 1 and no traceback."""
+    """A missing or unreadable source gives exit code 1, a one-line error and no traceback."""
     if content is not None:
         (tmp_path / name).write_bytes(content)
     done = run_blocked(str(bundle), str(tmp_path / name), "--camera", str(camera_file))
@@ -241,7 +241,7 @@ def test_a_source_that_is_none_is_told_in_one_line(
 
 
 def test_a_damaged_image_has_a_row_and_the_next_follows(bundle, flown, camera_file, tmp_path):
-    """Text, cut PNG and JPEG, another shape, and an early end of a video cost no other row."""
+    """A damaged image gets a row with a reason and does not affect the rows of others."""
     jpeg = cv2.imencode(".jpg", flown[0])[1].tobytes()
     png = cv2.imencode(".png", flown[0])[1].tobytes()
     square = cv2.imencode(".png", np.ascontiguousarray(flown[0][:, :360]))[1].tobytes()
@@ -270,7 +270,7 @@ def test_a_damaged_image_has_a_row_and_the_next_follows(bundle, flown, camera_fi
 
 
 def test_a_video_that_ends_early_says_so(tmp_path, monkeypatch):
-    """Frames that the container promises and the decoder does not give are told after the last one."""
+    """If fewer frames can be decoded than the container announces, an error follows the last frame."""
 
     class Cut:
         def __init__(self, *_: object):
@@ -296,7 +296,7 @@ def test_a_video_that_ends_early_says_so(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("tail", [b"", b"\0" * 40, b"\xff\xda\x00"])
 def test_a_whole_jpeg_is_not_taken_for_a_cut_one(flown, tmp_path, tail):
-    """Progressive, with a thumbnail of its own, or with bytes after its end."""
+    """Complete JPEG files are read: progressive, with a thumbnail, or with trailing bytes."""
     for options in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]):
         jpeg = cv2.imencode(".jpg", flown[0], options)[1].tobytes()
         thumbnail = cv2.imencode(".jpg", flown[0][::8, ::8])[1].tobytes()
@@ -309,7 +309,7 @@ def test_a_whole_jpeg_is_not_taken_for_a_cut_one(flown, tmp_path, tail):
 
 
 def test_an_image_without_texture_gets_no_pose_on_board(bundle, flown):
-    """A network would answer black, fog and a covered lens with a pose and an ordinary covariance."""
+    """Black, white, fogged and blurred images get a reason instead of a pose."""
     localizer = Localizer(bundle)
     noise = np.random.default_rng(0).normal(10, 4, flown[0].shape)
     for image, told in (
@@ -326,7 +326,7 @@ def test_an_image_without_texture_gets_no_pose_on_board(bundle, flown):
 
 
 def test_a_place_on_the_globe_is_told():
-    """Where the world has an origin, a line holds latitude, longitude and height; without a pose none."""
+    """If the world has an origin, a line has latitude, longitude and height, except without a pose."""
     origin = GeoOrigin(-33.86, 151.2, 12.5, HeightReference.TAKEOFF)
     poses = Poses(np.array([[100.0, -50.0, 20.0]]), np.array([[1.0, 0, 0, 0]]))
     located = Located(poses, np.diag([1.0, 2, 3, 4, 5, 6]))
@@ -346,7 +346,7 @@ def test_a_place_on_the_globe_is_told():
 
 
 def test_the_columns_are_documented():
-    """docs/export.md has a row for each column of the CSV."""
+    """docs/export.md has a row for each CSV column."""
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     table = text.split("| column | meaning |")[1].split("\n\n")[0]
     names = re.findall(r"`(\w+)`", "\n".join(line.split(" | ")[0] for line in table.splitlines()))
@@ -365,7 +365,7 @@ def edited(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
 
 
 def with_graph(model: onnx.ModelProto | bytes) -> Callable[[Path], None]:
-    """Another graph, which bundle.json says is the right one."""
+    """Replace the graph and update its hash in bundle.json."""
 
     def apply(folder: Path) -> None:
         path = folder / "model.onnx"
@@ -383,7 +383,7 @@ def with_graph(model: onnx.ModelProto | bytes) -> Callable[[Path], None]:
 
 
 def reading(location: str = "") -> onnx.ModelProto:
-    """A graph whose weight lies in another file, if one is named."""
+    """Return a graph that keeps its weight in another file, if a location is given."""
     weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4])
     if location:
         weight.data_location = TensorProto.EXTERNAL
@@ -398,7 +398,7 @@ def reading(location: str = "") -> onnx.ModelProto:
 
 
 def within(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A graph with another one in a branch of an If."""
+    """Return a graph that contains another one in a branch of an If node."""
     node = helper.make_node("If", ["c"], ["y"], then_branch=model.graph, else_branch=model.graph)
     graph = helper.make_graph([node], "outer", [], list(model.graph.output))
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
@@ -465,7 +465,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
 
 @pytest.mark.parametrize("name", list(HOSTILE))
 def test_a_bundle_that_is_wrong_is_refused(bundle, tmp_path, name):
-    """Damage, lies and links are told as FormatError before anything is computed."""
+    """Damage, false metadata and links raise FormatError before any computation."""
     damage, told = HOSTILE[name]
     (tmp_path / "secret.bin").write_bytes(bytes(16))
     folder = tmp_path / "bundle"
@@ -477,7 +477,7 @@ def test_a_bundle_that_is_wrong_is_refused(bundle, tmp_path, name):
 
 
 def test_what_is_no_bundle_is_told(bundle, tmp_path):
-    """An empty folder, and a bundle without the graph that is asked for."""
+    """An empty folder and a bundle without the requested graph raise InputError."""
     with pytest.raises(InputError, match=r"it has no bundle\.json"):
         read_bundle(tmp_path)
     folder = tmp_path / "bundle"
@@ -499,7 +499,7 @@ def test_what_is_no_bundle_is_told(bundle, tmp_path):
     ],
 )
 def test_a_playlist_is_not_followed(sources, name, text):
-    """A playlist refers to other files or hosts: it is refused, whatever its name."""
+    """A playlist, which refers to other files or hosts, is rejected whatever its name."""
     _, video = sources
     assert len(list(frames(video))) == 4
     playlist = video.parent / name
@@ -511,7 +511,7 @@ def test_a_playlist_is_not_followed(sources, name, text):
 
 
 def test_frames_are_read_upright_and_bounded(tmp_path, flown, monkeypatch):
-    """A photo gives itself, once; a file beyond all reason is not read."""
+    """A photo yields one frame, equal to the image; an oversized file is rejected."""
     path = tmp_path / "a.png"
     path.write_bytes(cv2.imencode(".png", flown[0])[1].tobytes())
     [(number, time_s, image)] = frames(path)
@@ -523,7 +523,7 @@ def test_frames_are_read_upright_and_bounded(tmp_path, flown, monkeypatch):
 
 
 def test_benchmark_times_both_graphs(bundle, hall, tmp_path):
-    """`benchmark` tells each step, size and memory; of frames of the data set, and of given ones."""
+    """`benchmark` reports time per step, file size and memory of both graphs on data set frames."""
     area = tmp_path / "area"
     (area / "5-split").mkdir(parents=True)
     shutil.copy(hall, area / "5-split" / "dataset.h5")
@@ -535,19 +535,19 @@ def test_benchmark_times_both_graphs(bundle, hall, tmp_path):
     assert set(told) == {"float32", "int8"}
     for one in told.values():
         assert one["frame"] == [1280, 720]
-        assert one["located"] > 0.7  # upsampled images of what the network knows
+        assert one["located"] > 0.7  # upsampled training images
         assert one["threads"] == 1
         spent = one["milliseconds"]
         assert 0 < spent["graph"]["p50"] <= spent["graph"]["p95"]
         assert set(spent) == set(one["cpu_milliseconds"])
         assert spent["total"]["p50"] > spent["preprocessing"]["p50"] + spent["decoding"]["p50"]
-        assert 0.7 < one["overhead"] < 1.4  # of few poses
+        assert 0.7 < one["overhead"] < 1.4  # measured on few poses
         assert 40 < one["memory_mb"] < 400
     assert told["int8"]["file_mb"] < told["float32"]["file_mb"]
 
 
 def test_benchmark_of_given_frames(bundle, flown, camera_file, tmp_path):
-    """Frames need their camera; a bundle that fails is told as the program on board says it."""
+    """Given frames need a camera, and the onboard program's error is passed on."""
     frame = tmp_path / "f.png"
     frame.write_bytes(cv2.imencode(".png", flown[0])[1].tobytes())
     arguments = ["benchmark", str(bundle), "--frame", str(frame), "--poses", "2"]
@@ -565,7 +565,7 @@ def test_benchmark_of_given_frames(bundle, flown, camera_file, tmp_path):
 
 
 def test_images_with_few_of_16_bits_are_refused(tmp_path):
-    """An image of 12 bits in 16 would be nearly black for the network; one of 16 bits is read."""
+    """A 12-bit image stored in 16 bits is rejected; a full 16-bit image is read."""
     values = np.linspace(0, 65535, 64 * 48).astype(np.uint16).reshape(48, 64)
     cv2.imwrite(str(tmp_path / "whole.png"), values)
     cv2.imwrite(str(tmp_path / "few.png"), values >> 4)
