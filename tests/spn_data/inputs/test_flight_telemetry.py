@@ -1,4 +1,4 @@
-"""Logs in the folder of a video or of photos, on the clock of the images."""
+"""Telemetry logs in the folder of a video or photos, put on the clock of the images."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def telemetry_in(folder: Path, **options: Any) -> Telemetry:
 
 
 def write_video(path: Path, created: str | None, frames: int = 6) -> None:
-    """Write a flat video at one frame per second."""
+    """Write a video of uniform frames at one frame per second."""
     with av.open(str(path), "w") as container:
         if created is not None:
             container.metadata["creation_time"] = created
@@ -63,7 +63,7 @@ def write_photos(folder: Path, *, zone: str | None, hour: int = 12) -> None:
 
 
 def gpx(first: datetime, minutes: int, step_s: int = 1) -> str:
-    """Return a GPX with points that move east."""
+    """Return a GPX track that moves east."""
     point = '<trkpt lat="49.0" lon="{}"><time>{:%Y-%m-%dT%H:%M:%SZ}</time></trkpt>'
     seconds = range(0, 60 * minutes + 1, step_s)
     points = [point.format(8 + 1e-5 * s, first + timedelta(seconds=s)) for s in seconds]
@@ -78,7 +78,7 @@ def gpx(first: datetime, minutes: int, step_s: int = 1) -> str:
 def test_a_log_is_put_on_the_clock_of_its_video(
     tmp_path: Path, log: str, created: str | None, times_s: list[float]
 ) -> None:
-    """Times are UTC minus the creation time of the video; without one, the log starts with the video."""
+    """Log times are UTC minus the video's creation time; without one, the log starts with the video."""
     write_video(tmp_path / "flight.mp4", created)
     (tmp_path / log).write_text(LOGS[log])
     track = telemetry_in(tmp_path)
@@ -99,7 +99,7 @@ def test_a_log_is_put_on_the_clock_of_its_photos(tmp_path: Path) -> None:
 
 
 def test_a_clock_without_zone_is_not_taken_as_utc(tmp_path: Path) -> None:
-    """Photos at 12:00 on a clock without zone are not at 12:00 UTC of a log from 08:00 to 14:00."""
+    """Photos at 12:00 without time zone do not match 12:00 UTC in a log from 08:00 to 14:00."""
     write_photos(tmp_path, zone=None)
     (tmp_path / "log.gpx").write_text(gpx(datetime(2026, 5, 1, 8), 360, 10))
     with pytest.raises(
@@ -116,7 +116,7 @@ def test_a_clock_without_zone_is_not_taken_as_utc(tmp_path: Path) -> None:
 
 
 def test_the_only_zone_that_fits_is_found(tmp_path: Path) -> None:
-    """A log of ten minutes covers the photos in one zone only, which a note names."""
+    """If only one time zone puts a ten-minute log over the photos, it is used and a note names it."""
     write_photos(tmp_path, zone=None)
     (tmp_path / "log.gpx").write_text(gpx(datetime(2026, 5, 1, 9, 55), 10))
     track = telemetry_in(tmp_path)
@@ -126,7 +126,7 @@ def test_the_only_zone_that_fits_is_found(tmp_path: Path) -> None:
 
 
 def test_a_log_without_zone_is_not_taken_as_utc(tmp_path: Path) -> None:
-    """A CSV in local time beside a video with a creation time gets the only zone that fits."""
+    """A CSV in local time gets the only zone that fits the creation time of its video."""
     write_video(tmp_path / "flight.mp4", "2026-05-01T10:00:01Z")
     text = LOGS["flight.csv"].replace("(utc)", "").replace(" 10:", " 12:")
     (tmp_path / "flight.csv").write_text(text)
@@ -154,7 +154,7 @@ def test_a_log_without_zone_is_not_taken_as_utc(tmp_path: Path) -> None:
 def test_a_log_of_another_time_is_refused_before_mapping(
     tmp_path: Path, created: str, words: str
 ) -> None:
-    """If no frame gets a fix, the distance in time and its likely reason are told, unless accepted."""
+    """If no frame gets a fix, the error gives the time difference and its likely cause, unless accepted."""
     write_video(tmp_path / "flight.mp4", created)
     (tmp_path / "flight.gpx").write_text(LOGS["flight.gpx"].replace("10:00:03", "10:00:00"))
     with pytest.raises(InputError, match=r"flight.gpx: 0 of \d+ images get a fix.*" + words):
@@ -167,7 +167,7 @@ def test_a_log_of_another_time_is_refused_before_mapping(
 
 
 def test_subtitles_that_start_late_are_refused(tmp_path: Path) -> None:
-    """Subtitles from an editor's timeline at 1:00:00 name the offset, with which they are used."""
+    """Subtitles from an editor's timeline at 1:00:00 are refused with the offset that makes them fit."""
     write_video(tmp_path / "flight.mp4", None)
     record = "{}\n01:00:0{},000 --> 01:00:59,000\n[latitude: 50.5] [longitude: 8.25{}]\n\n"
     (tmp_path / "flight.srt").write_text("".join(record.format(k, k, k) for k in range(6)))
@@ -179,7 +179,7 @@ def test_subtitles_that_start_late_are_refused(tmp_path: Path) -> None:
 
 
 def test_partial_fixes_are_said(tmp_path: Path) -> None:
-    """If a log covers a part of the video, a note counts the images with a fix."""
+    """If a log covers only part of the video, a note counts the images with a fix."""
     write_video(tmp_path / "flight.mp4", "2026-05-01T10:00:01Z")
     (tmp_path / "flight.gpx").write_text(LOGS["flight.gpx"])
     track = telemetry_in(tmp_path)
@@ -189,7 +189,7 @@ def test_partial_fixes_are_said(tmp_path: Path) -> None:
 
 
 def test_a_log_without_dates_is_not_left_out_silently(tmp_path: Path) -> None:
-    """A log in seconds beside photos is refused, as nothing relates their clocks."""
+    """A log in seconds is refused for photos because nothing relates their clocks."""
     write_photos(tmp_path, zone="+02:00")
     (tmp_path / "log.csv").write_text("time_s,lat,lon\n0,49,8\n1,49,8.001\n")
     with pytest.raises(
@@ -199,7 +199,7 @@ def test_a_log_without_dates_is_not_left_out_silently(tmp_path: Path) -> None:
 
 
 def test_inputs_whose_clocks_differ(shared_cases: Path) -> None:
-    """Real and copied inputs whose clocks differ are refused with the offset, or paired with a sigma."""
+    """Inputs on different clocks are refused with the reason, and a GPX log with 5 s intervals is used."""
     cases = shared_cases / "input"
     with pytest.raises(InputError, match=r"cannot be paired .* zones fit"):
         telemetry_in(cases / "02-photos-local-time-gpx-utc" / "photos")
@@ -211,7 +211,7 @@ def test_inputs_whose_clocks_differ(shared_cases: Path) -> None:
 
 
 def test_ass_subtitles_beside_a_video_are_on_its_clock(tmp_path: Path) -> None:
-    """An .ass file of the video's name is its telemetry, as an .srt is."""
+    """An .ass file with the name of the video is read as its telemetry, as an .srt file is."""
     write_video(tmp_path / "MAX_0001.mp4", "2026-05-01T10:00:01Z")
     line = (
         "Dialogue: 0,0:00:0{}.00,0:00:09.00,Default,,0,0,0,,GPS(W: -20.5, N: 48.25, 1)\\NReH:20\n"

@@ -1,4 +1,4 @@
-"""Comparison of labels with the GNSS fixes of their flight, which they do not use."""
+"""Comparison of labels with the independent GNSS fixes of their flight."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def labelled(failed: int = 0) -> Labels:
 def track(
     geo: GeoFit, offset_m: tuple[float, float, float], *, late_s: float = 0.0, kind: str = "dji-srt"
 ) -> Telemetry:
-    """Return fixes at 10 Hz with a constant offset from the flight; their clock is `late_s` behind."""
+    """Return fixes at 10 Hz with a constant offset from the flight and a clock `late_s` behind."""
     time_s = np.arange(-20, 10 * N) * 0.1
     rng = np.random.default_rng(4)
     enu = positions(time_s + late_s) + offset_m + rng.normal(0, 0.05, (len(time_s), 3))
@@ -77,7 +77,7 @@ def check(labels: Labels, telemetry: Telemetry, geo: GeoFit) -> GnssCheck:
 
 
 def test_a_shared_offset_is_told_apart_from_scatter() -> None:
-    """One metre east and half a metre low, with centimetres of noise; it is no contradiction."""
+    """An offset of 1 m east and 0.5 m down is separated from centimetre noise and is no contradiction."""
     geo = geo_fit(3)
     found = check(labelled(), track(geo, (1.0, 0.0, -0.5)), geo)
     assert (found.offset_e_m, found.offset_n_m) == pytest.approx((1.0, 0.0), abs=0.05)
@@ -90,7 +90,7 @@ def test_a_shared_offset_is_told_apart_from_scatter() -> None:
 
 
 def test_an_offset_beyond_what_gnss_can_err_is_a_contradiction() -> None:
-    """Thirty metres horizontally or vertically."""
+    """An offset of 30 m, horizontal or vertical, exceeds GNSS error and is a contradiction."""
     geo = geo_fit(3)
     for offset in ((30.0, 0.0, 0.0), (0.0, 0.0, 30.0)):
         found = check(labelled(), track(geo, offset), geo)
@@ -106,7 +106,7 @@ def test_a_clock_that_is_behind_is_no_scatter() -> None:
 
 
 def test_heights_that_count_from_elsewhere_are_not_compared() -> None:
-    """Fixes above sea level against an area above the ellipsoid: horizontally only."""
+    """Fixes above sea level and an area above the ellipsoid are compared horizontally only."""
     geo = geo_fit(3)
     amsl = replace(track(geo, (0.5, 0.0, 40.0)), abs_reference=HeightReference.AMSL)
     found = check(labelled(), amsl, geo)
@@ -117,7 +117,7 @@ def test_heights_that_count_from_elsewhere_are_not_compared() -> None:
 
 
 def test_heights_above_take_off_count_from_the_origin() -> None:
-    """Fixes half a metre too low show as -0.5 m, also if the origin is at a height of 115 m."""
+    """Fixes 0.5 m too low show as -0.5 m, also if the origin is at a height of 115 m."""
     geo = geo_fit(3)
     origin = replace(geo.origin, height_reference=HeightReference.TAKEOFF)
     absolute = track(geo, (0.0, 0.0, -0.5))

@@ -1,4 +1,4 @@
-"""Labels as values and as files; the hash of a map; a map that must not be written to."""
+"""Labels as values and files, the hash of a map, and the read-only map."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def labels(count: int = 4, name: str = "low") -> Labels:
 
 
 def test_poses_csv_gives_back_every_bit(tmp_path: Path) -> None:
-    """Numbers, quoted reasons and failed frames survive; writing again gives the same bytes."""
+    """Numbers, quoted reasons and failed frames survive, and writing again gives the same bytes."""
     made = labels()
     write_labels(tmp_path / "poses.csv", made)
     read = read_labels(tmp_path / "poses.csv")
@@ -106,7 +106,7 @@ def test_a_file_of_bytes_or_none_at_all_is_an_input_error(tmp_path: Path) -> Non
 
 
 def test_labels_move_with_their_world() -> None:
-    """A similarity transforms centres, rotations and covariances; rotation covariances in the camera stay."""
+    """A similarity moves centres, rotations and covariances, except rotation covariances, in camera axes."""
     made = labels()
     has = made.registered
     b_from_a = Similarity(2.5, rotations_from_angles(np.array([[30.0, 10, -5]]))[0], np.ones(3))
@@ -175,7 +175,7 @@ def test_a_damaged_file_of_observations_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_hash_of_a_map_knows_every_byte_and_name(tmp_path: Path) -> None:
-    """A changed byte or a new, renamed or missing file changes the hash; file times do not."""
+    """A changed byte or a new, renamed or missing file changes the hash, but file times do not."""
     folder = tmp_path / "map"
     folder.mkdir()
     (folder / "a").write_bytes(b"12")
@@ -207,7 +207,7 @@ def test_points_are_found_by_their_id_and_strangers_are_not() -> None:
 
 
 def test_the_share_of_an_image_counts_cells() -> None:
-    """There are 64 cells; repeated pixels count once, and border pixels belong to the last cells."""
+    """Coverage uses 64 cells; repeated pixels count once, and border pixels belong to the last cells."""
     assert covered_share(np.zeros((0, 2)), 640, 480) == 0
     assert covered_share(np.array([[1.0, 1], [2, 2], [640, 480]]), 640, 480) == 2 / 64
     x, y = np.meshgrid(np.arange(40, 640, 80), np.arange(30, 480, 60))
@@ -249,7 +249,7 @@ def test_a_damaged_database_of_a_map_is_told_in_one_line(database: Path) -> None
 
 
 def test_a_frozen_map_finds_its_own_frames_by_what_they_look_like(finished_area: Path) -> None:
-    """Each frame is most similar to itself; its points are those that the model observes in it."""
+    """Each frame is most similar to itself, and its points are those that the model observes in it."""
     folder = finished_area / MODEL
     with FrozenMap.open(folder, folder / "database.db") as frozen:
         for k, name in enumerate(frozen.scene.names):

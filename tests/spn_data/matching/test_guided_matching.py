@@ -1,4 +1,4 @@
-"""Guided matching: the same as masked exhaustive matching, and more matches than without the lines."""
+"""Guided matching equals masked exhaustive matching and finds more matches than unguided matching."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def test_it_finds_what_comparing_all_and_masking_finds(move) -> None:
     order = rng.permutation(len(b))
     found = match_guided(a, descriptors, b[order], noisy[order], fundamental, OPTIONS)
     expected = compared_all(a, descriptors, b[order], noisy[order], fundamental)
-    # Sums in another order may tip a tie or a limit.
+    # Another order of summation may change a tie or a comparison with a limit.
     assert len(expected ^ {(int(i), int(j)) for i, j in found}) <= 2
     assert np.mean(order[found[:, 1]] == found[:, 0]) > 0.99
     assert len(found) > 0.9 * len(a)
 
 
 def test_most_of_what_repeats_elsewhere_is_matched_along_the_line() -> None:
-    """Epipolar lines separate features from their twins, which fail the ratio test everywhere else.
+    """Features with a repeated twin fail the plain ratio test and are matched along epipolar lines.
 
     An eighth of the twins takes part in the ratio test of guided matching, too.
     """
@@ -91,7 +91,7 @@ def test_most_of_what_repeats_elsewhere_is_matched_along_the_line() -> None:
 
 
 def test_what_is_alike_everywhere_gives_few_matches() -> None:
-    """Bricks of two different walls give few matches, though some brick is always nearest on a line."""
+    """Two walls of similar bricks give few matches, though some brick is always nearest on a line."""
     rng = np.random.default_rng(7)
     bricks = rng.gamma(0.5, 40, size=(50, 128))
     a, b = (

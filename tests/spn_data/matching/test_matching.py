@@ -25,7 +25,7 @@ def texture() -> np.ndarray:
 
 
 def test_keypoints_lie_in_colmaps_pixel_frame() -> None:
-    """A blob centred on the corner of four pixels has its centre at a whole number."""
+    """A blob centred on the corner of four pixels has integer keypoint coordinates."""
     y, x = np.mgrid[0:200, 0:200] + 0.5
     image = (255 * np.exp(-((x - 80) ** 2 + (y - 120) ** 2) / (2 * 6.0**2))).astype(np.uint8)
     features = extract(image, None, FeatureOptions())
@@ -63,7 +63,7 @@ def test_an_empty_image_has_no_features() -> None:
 
 
 def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
-    """Matches equal those of a plain loop over all distances, on descriptors with near duplicates."""
+    """Matches equal those of a plain loop over all distances, also with near-duplicate descriptors."""
     rng = np.random.default_rng(0)
     a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
     b = np.clip(a[:500] + rng.normal(0, 15, size=(500, 128)), 0, 255).astype(np.uint8)
@@ -91,7 +91,7 @@ def test_a_comparison_that_grows_ends_in_the_matches_of_all_at_once() -> None:
     """The incremental matcher agrees at every size, even if one image has no more descriptors."""
     rng = np.random.default_rng(5)
     a = rng.gamma(0.5, 40, size=(700, 128)).clip(0, 255).astype(np.uint8)
-    of_a = np.concatenate([rng.permutation(400), np.arange(50)])  # the last ones a second time
+    of_a = np.concatenate([rng.permutation(400), np.arange(50)])  # the last 50 are repeats
     b = np.clip(a[of_a] + rng.normal(0, 15, size=(450, 128)), 0, 255).astype(np.uint8)
     matcher = PutativeMatcher(a, b)
     assert len(matcher.matches(MatchOptions())) == 0
@@ -113,7 +113,7 @@ def test_no_feature_is_matched_twice() -> None:
 def scene_pair(
     rng: np.random.Generator, outliers: int, n: int = 300
 ) -> tuple[Features, Features, Camera]:
-    """Create two views of n points with 0.3 px noise; the descriptors also give `outliers` false matches."""
+    """Create two views of n points with 0.3 px noise and descriptors that add `outliers` false matches."""
     camera = Camera.from_horizontal_fov(800, 600, 70)
     points = rng.uniform([-4, -3, 6], [4, 3, 14], size=(n, 3))
     views = []
@@ -154,7 +154,7 @@ def test_no_samples_are_drawn_to_find_fewer_inliers_than_verify_a_pair() -> None
 
 
 def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:
-    """The other features are not compared: there are fewer matches than all of them would give."""
+    """If the strongest features of two images do not match, the other features are not compared."""
     a, b, camera = scene_pair(np.random.default_rng(3), outliers=1500, n=1500)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
@@ -163,7 +163,7 @@ def test_of_images_with_nothing_in_common_the_strongest_features_tell() -> None:
 
 
 def test_of_images_that_overlap_the_features_on_wrong_lines_are_not_even_matched() -> None:
-    """Most of the outliers, a fifth of 1500, are removed before verification; true matches stay."""
+    """Most of 300 outliers among 1500 features are removed before verification, and true matches stay."""
     a, b, camera = scene_pair(np.random.default_rng(4), outliers=300, n=1500)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())

@@ -38,13 +38,13 @@ def test_neighbours_in_space_are_found_across_sequences_and_unknown_positions_pa
 
 
 def test_of_one_flight_neighbouring_lines_are_paired_and_what_lies_straight_on_is_not() -> None:
-    """Two opposite flight lines of five photos, 20 m apart: photo k is next to photo 9 - k."""
+    """On two opposite flight lines of five photos, 20 m apart, photo k is paired with photo 9 - k."""
     east = np.array([0.0, 30, 60, 90, 120])
     lines = [np.stack([e, np.full(5, n)], axis=1) for e, n in ((east, 0.0), (east[::-1], 20.0))]
     positions = np.column_stack([np.concatenate(lines), np.full(10, 50.0)])
     options = PairOptions(spatial_neighbors=1, spatial_max_m=60.0)
     found = spatial_pairs(np.array(["a"] * 10), positions, options)
-    assert found >= {(0, 9), (1, 8), (2, 7), (3, 6)}  # (4, 5) follow each other
+    assert found >= {(0, 9), (1, 8), (2, 7), (3, 6)}  # (4, 5) are consecutive
     assert all(i < 5 <= j for i, j in found)
 
 
@@ -58,7 +58,7 @@ def test_pairs_are_sorted_unique_and_ordered() -> None:
 
 
 def test_a_place_seen_again_is_found_by_appearance() -> None:
-    """Frame k + 20 has noisy copies of frame k's descriptors and is not paired with it in time."""
+    """Frame k + 20 has noisy descriptors of frame k and is paired with it by appearance."""
     rng = np.random.default_rng(1)
     first = [rng.gamma(0.5, 40, size=(300, 128)).clip(0, 255) for _ in range(20)]
     again = [np.clip(d[:200] + rng.normal(0, 4, size=(200, 128)), 0, 255) for d in first]

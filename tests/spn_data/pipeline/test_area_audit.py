@@ -1,4 +1,4 @@
-"""Audit of images of dataset.h5: copies of training images among the held-out ones."""
+"""Audit of the images in dataset.h5: copies of training images among held-out ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def textured(seed: int) -> np.ndarray:
 
 
 def verdict(path: Path, train: list[np.ndarray], test: list[np.ndarray]) -> tuple[str, str]:
-    """Verdict and first evidence of the check on a data set of these images."""
+    """Return verdict and first evidence of the check on a data set of these images."""
     info = DatasetInfo(units="m", origin=None, up_is_known=False, camera=None, has_images=True)
     with DatasetWriter(path, info, {"train": Role.TRAIN, "medium": Role.TEST}) as writer:
         for group, images in (("train", train), ("medium", test)):
@@ -41,7 +41,7 @@ def verdict(path: Path, train: list[np.ndarray], test: list[np.ndarray]) -> tupl
 
 
 def test_a_copy_of_a_training_image_fails_the_audit(tmp_path):
-    """The same pixels fail, similar ones are a notice, others pass; black images are not compared."""
+    """Identical pixels fail and similar ones give a notice; other and all-black images pass."""
     black, noisy = np.zeros((36, 64, 3), np.uint8), textured(1) // 2 + 30
     noisy[::2] += 1
     train = [textured(0), textured(1) // 2 + 30, black]

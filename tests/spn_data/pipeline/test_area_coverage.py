@@ -1,4 +1,4 @@
-"""Heights of waypoints in an area whose origin is not at its take-off."""
+"""Waypoint heights in an area whose origin is not at the take-off point."""
 
 from __future__ import annotations
 

@@ -20,14 +20,14 @@ MOST_S = 2.0  # of processor time; a quadratic search takes far longer
     ["a(" + " " * MANY + "b", " " * MANY + "b", "(" * MANY, "a (b" * MANY, "[" * MANY + "]" * MANY],
 )
 def test_a_long_header_cell_takes_no_time(cell):
-    """Blanks and brackets in a header cell are not searched again and again."""
+    """A header cell full of blanks and brackets is parsed in linear time."""
     start = time.process_time()
     assert list(parse_header([cell, "lat"])) == ["latitude"]
     assert time.process_time() - start < MOST_S
 
 
 def test_the_last_brackets_of_a_cell_hold_its_unit():
-    """Blanks around name, brackets and unit do not matter; other brackets belong to the name."""
+    """The last brackets of a header cell hold its unit; others belong to the name and blanks are ignored."""
     columns = parse_header([" OSD.height above takeoff [ ft ] ", "lat( deg )", "lon (x) (deg)"])
     assert {name: column.unit for name, column in columns.items()} == {
         "rel_alt": "ft",
@@ -44,7 +44,7 @@ def test_a_long_number_takes_no_time():
 
 
 def test_a_long_blank_line_of_a_recipe_takes_no_time(tmp_path):
-    """The line of a wrong key is found at once behind a line of blanks."""
+    """The line of a wrong key after a long line of blanks is found at once."""
     path = tmp_path / "r.toml"
     path.write_text(" " * MANY + "\nwrong = 1\nkind = 'regression'\n[[stages]]\n")
     start = time.process_time()

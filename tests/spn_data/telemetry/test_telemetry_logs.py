@@ -1,4 +1,4 @@
-"""GPX tracks, CSV logs, subtitle tracks in videos, and the choice among the readers."""
+"""GPX tracks, CSV logs, subtitle tracks in videos, and the choice of the reader."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def point(second, lat="-33.5", lon="-70.25", more=""):
 
 
 def test_dilutions_become_standard_deviations():
-    """Sigma is dilution times a 2 m range error, over two axes or three with a vertical factor of 1.5."""
+    """Sigma is dilution times a 2 m range error, over two axes, or three with a vertical factor of 1.5."""
     np.testing.assert_allclose(sigma_from_dop(hdop=1.0, vdop=1.2), (2**0.5, 2**0.5, 2.4))
     east, north, up = sigma_from_dop(pdop=1.7)
     assert up == pytest.approx(1.5 * east)
@@ -75,7 +75,7 @@ def test_gpx_with_geoid_heights_is_above_sea_level(tmp_path):
 
 
 def test_gpx_out_of_order_and_with_damaged_points(tmp_path):
-    """Points are sorted by time; equal times and damaged points are left out and counted."""
+    """Points are sorted by time; duplicates in time and damaged points are dropped and counted."""
     bad = (
         "<trkpt lat='x' lon='1'><time>2024-05-01T12:00:09Z</time></trkpt>",
         "<trkpt lat='1' lon='1'/>",
@@ -102,7 +102,7 @@ def test_gpx_out_of_order_and_with_damaged_points(tmp_path):
     ],
 )
 def test_unusable_gpx_is_refused(tmp_path, text, message):
-    """Broken, foreign, empty and hostile XML each give one line with the path and what was found."""
+    """Malformed, foreign, empty and hostile XML each give one line with the path and the reason."""
     with pytest.raises(InputError, match=message) as error:
         read_gpx(write(tmp_path, text, "a.gpx"))
     assert "\n" not in str(error.value)
@@ -128,7 +128,7 @@ def test_csv_of_our_own_names(tmp_path):
 
 
 def test_csv_of_airdata(tmp_path):
-    """Airdata's export has milliseconds, feet, UTC dates, its own names and marked recordings."""
+    """Airdata's export has milliseconds, feet, UTC dates, its own names and recording marks."""
     text = (
         "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),"
         "altitude_above_seaLevel(feet),speed(mph),isVideo, compass_heading(degrees),"
@@ -189,7 +189,7 @@ def test_csv_clocks(tmp_path, header, cells, time_s, utc_s, is_local):
     ],
 )
 def test_csv_heights(tmp_path, columns, row, rel_alt_m, abs_alt_m, reference):
-    """A height's reference comes from the column's name or an alt_reference column, or is unknown."""
+    """The height reference comes from the column name or an alt_reference column, or is unknown."""
     t = read_csv_log(write(tmp_path, f"time_s,lat,lon,{columns}\n0,1,2,{row}\n"))
     np.testing.assert_allclose(t.rel_alt_m, [rel_alt_m], equal_nan=True)
     np.testing.assert_allclose(t.abs_alt_m, [abs_alt_m], equal_nan=True)
@@ -205,7 +205,7 @@ def test_csv_heights(tmp_path, columns, row, rel_alt_m, abs_alt_m, reference):
     ],
 )
 def test_csv_accuracy(tmp_path, column, cell, sigma_m):
-    """Accuracies are taken as sigma of each axis, dilutions through the range error."""
+    """Accuracies are taken as sigma of each axis, and dilutions are scaled by the range error."""
     t = read_csv_log(write(tmp_path, f"time_s,lat,lon,{column}\n0,1,2,{cell}\n"))
     np.testing.assert_allclose(t.sigma_m[0], sigma_m, equal_nan=True)
 
@@ -223,7 +223,7 @@ def test_csv_of_a_spreadsheet(tmp_path):
 
 
 def test_csv_with_few_damaged_rows(tmp_path):
-    """Up to 5 % damaged rows are left out and counted; rows are sorted by time."""
+    """Up to 5 % damaged rows are dropped and counted; rows are sorted by time."""
     rows = [f"{i},50.0,8.0" for i in range(60)]
     rows[10], rows[20], rows[30] = "10,abc,8.0", "20,50.0", "15.5,50.0,8.0"
     t = read_csv_log(write(tmp_path, "time_s,lat,lon\n" + "\n".join(rows)))
@@ -257,7 +257,7 @@ def test_csv_with_few_damaged_rows(tmp_path):
     ],
 )  # fmt: skip
 def test_unusable_csv_is_refused(tmp_path, text, message):
-    """Each way for a log to be unusable gives one line with path, line and what was found."""
+    """Each kind of unusable log gives one line with path, line and reason."""
     with pytest.raises(InputError, match=message) as error:
         read_csv_log(write(tmp_path, text))
     assert "\n" not in str(error.value)
@@ -363,7 +363,7 @@ def test_a_path_that_looks_like_a_url_is_a_file(tmp_path, monkeypatch):
     "text", ["#EXTM3U\n#EXTINF:1,\na.mp4\n", "ffconcat version 1.0\nfile a.mp4\n"]
 )
 def test_a_playlist_named_as_a_video_is_refused(tmp_path, text):
-    """A playlist is not opened for its subtitles: it refers to other files."""
+    """A playlist is not opened for its subtitles because it refers to other files."""
     video(tmp_path / "a.mp4", RECORDS, "mov_text")
     (tmp_path / "b.mp4").write_text(text)
     with pytest.raises(InputError, match=r"b\.mp4: is not a video"):
@@ -371,14 +371,14 @@ def test_a_playlist_named_as_a_video_is_refused(tmp_path, text):
 
 
 def test_metadata_that_is_not_utf8_does_not_matter(tmp_path):
-    """A title in Latin-1 does not keep the subtitles from being read."""
+    """Subtitles are read even if the title is in Latin-1."""
     path = video(tmp_path / "a.mkv", RECORDS, "subrip", title="Zuerich")
     path.write_bytes(path.read_bytes().replace(b"Zuerich", b"Z\xfcrich "))
     assert len(read_subtitles(path)) == 5
 
 
 def test_the_reader_is_chosen_by_name_and_content(tmp_path):
-    """Suffix (in any case) and content choose the reader."""
+    """The file suffix, in any case, and the content determine the reader."""
     srt = "1\n00:00:00,000 --> 00:00:01,000\n" + KEYED.format(1)
     log = "time_s,lat,lon\n0,1,2\n"
     for name, text, kind in (
@@ -405,13 +405,13 @@ def test_the_reader_is_chosen_by_name_and_content(tmp_path):
     ],
 )
 def test_unsupported_files_are_refused(tmp_path, name, message):
-    """An unsupported file is refused with a list of what is supported."""
+    """An unsupported file is refused with a list of supported types."""
     with pytest.raises(InputError, match=message):
         read_telemetry(tmp_path / name)
 
 
 def test_a_video_without_track_is_refused(tmp_path):
-    """A video given as telemetry but without a subtitle track is refused."""
+    """A video given as telemetry without a subtitle track is refused."""
     with pytest.raises(InputError, match="has no subtitle track"):
         read_telemetry(video(tmp_path / "a.mp4", [], None))
 
@@ -434,7 +434,7 @@ def test_csv_of_px4(tmp_path):
 @pytest.mark.parametrize("start", [112574307, 1_200_000_000])  # 112 s, and 20 min after the start
 @pytest.mark.parametrize("name", ["timestamp", "time"])
 def test_microseconds_since_the_start_are_no_dates(tmp_path, start, name):
-    """Steps of 200,000 are no seconds, however large the numbers are; named with their unit they are read."""
+    """Steps of 200,000 without a unit are not taken as seconds; with their unit they are read."""
     text = f"{name},lat,lon\n" + "".join(f"{start + 200000 * k},48.2,11.6\n" for k in range(5))
     with pytest.raises(InputError, match=r"time_us"):
         read_csv_log(write(tmp_path, text))
@@ -444,7 +444,7 @@ def test_microseconds_since_the_start_are_no_dates(tmp_path, start, name):
 
 
 def test_csv_in_integers(tmp_path):
-    """Integers of 1e-7 degrees are recognised, with heights in millimetres beside them."""
+    """Coordinates in integers of 1e-7 degrees are recognised, and so are heights in millimetres."""
     t = read_csv_log(
         write(
             tmp_path,
@@ -457,7 +457,10 @@ def test_csv_in_integers(tmp_path):
 
 
 def test_of_equal_columns_the_one_that_parses_counts(tmp_path):
-    """A flight record's time as text before its time in seconds, and a flag in words, are no damage."""
+    """If several columns have the same meaning, the one that parses is used.
+
+    Cases: time as text before time in seconds, and a flag in words.
+    """
     text = (
         "sep=,\nCUSTOM.updateTime [local],OSD.flyTime,OSD.flyTime [s],OSD.latitude,OSD.longitude,"
         "OSD.height [ft],GIMBAL.pitch,GIMBAL.yaw,GIMBAL.yaw [360],CAMERA.isVideo\n"
@@ -475,7 +478,7 @@ def test_of_equal_columns_the_one_that_parses_counts(tmp_path):
 
 
 def test_an_optional_column_never_kills_a_log(tmp_path):
-    """A column of words is left out with a note, and so is a single damaged value."""
+    """A column of words and a single damaged optional value are dropped with a note."""
     rows = [f"{k},48.2,11.6,broken,{'x' if k == 7 else k}.5" for k in range(10)]
     t = read_csv_log(write(tmp_path, "time_s,lat,lon,hdop,rel_alt\n" + "\n".join(rows)))
     assert len(t) == 10
@@ -491,7 +494,7 @@ def test_an_optional_column_never_kills_a_log(tmp_path):
     [(("-600", "-590"), -60.0), (("-60", "-59"), NAN), (("-60.5", "-59.0"), -60.5)],
 )
 def test_csv_of_litchi(tmp_path, pitch, pitch_deg):
-    """Tenths of degrees are recognised by their size, and integers that could be either are left out."""
+    """Tenths of degrees are recognised by their size, and ambiguous integers are dropped."""
     text = "latitude,longitude,altitude(m),ascent(m),time(millisecond),isTakingVideo,gimbalPitch\n"
     text += "".join(f"48.2,11.6,{20 + k}.0,{20 + k}.0,{100 * k},1,{pitch[k]}\n" for k in range(2))
     t = read_csv_log(write(tmp_path, text))
@@ -502,7 +505,7 @@ def test_csv_of_litchi(tmp_path, pitch, pitch_deg):
 
 
 def test_csv_of_flytrex(tmp_path):
-    """Ascent is the height above take-off, altitude another one."""
+    """Ascent is the height above take-off, and altitude has another reference."""
     text = "latitude,longitude,altitude(feet),ascent(feet),time(millisecond),datetime(utc)\n"
     text += "48.2,11.6,1640.42,65.617,334100.0,2016-07-23 22:50:10.000000\n"
     t = read_csv_log(write(tmp_path, text))
@@ -521,7 +524,7 @@ def test_csv_of_flytrex(tmp_path):
     ],
 )
 def test_logs_of_other_programs(shared_cases, name, duration_s):
-    """Exports of other programs that once failed or were misread are read in place and duration."""
+    """Exports of other programs that once failed or were misread give the right place and duration."""
     t = read_csv_log(shared_cases / "input" / name)
     assert t.time_s[-1] - t.time_s[0] == pytest.approx(duration_s, abs=0.01)
     np.testing.assert_allclose(t.lat_lon_deg[0], (48.2654, 11.6712), atol=1e-6)

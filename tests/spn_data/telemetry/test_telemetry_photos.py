@@ -1,4 +1,4 @@
-"""EXIF and XMP of photos: real ones, photos of our own with known tags, and damaged ones."""
+"""EXIF and XMP of photos: real ones, synthetic ones with known tags, and damaged ones."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_real_photo_of_the_first_pass(shared_data):
 
 
 def test_real_photo_with_xmp(shared_data):
-    """DJI's XMP gives height above take-off and the gimbal, which looks straight down."""
+    """DJI's XMP gives height above take-off and the gimbal angles, here straight down."""
     photo = read_photo(shared_data / "photos-dji-xmp" / "DJI_0018.JPG")
     assert photo.relative_altitude_m == 39.8
     assert photo.gimbal_deg == (45.0, -89.9, 0.0)
@@ -81,7 +81,7 @@ def test_two_passes_are_one_track_with_a_pause(shared_data):
 
 
 def test_hemispheres_and_clock_with_zone(tmp_path):
-    """South and west are negative; an offset gives UTC; fractions of a second are kept."""
+    """South and west are negative, an offset tag gives UTC, and fractions of a second are kept."""
     exif = {
         piexif.ExifIFD.DateTimeOriginal: "2024:05:01 12:00:00",
         piexif.ExifIFD.SubSecTimeOriginal: "250",
@@ -134,7 +134,7 @@ def test_stated_accuracy(tmp_path, gps, xmp, sigma_m):
 
 
 def test_xmp_position_serves_where_exif_has_none(tmp_path):
-    """Without EXIF position XMP's counts, also under its misspelt name; with one, EXIF's counts."""
+    """XMP's position, even under its misspelt name, is used only if EXIF has none."""
     xmp = "d:GpsLatitude='-33.5' d:GpsLongtitude='+70.5' d:AbsoluteAltitude='+88.5' d:AltitudeType='RtkAlt'"
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps={}, xmp=xmp))
     assert (photo.lat_deg, photo.lon_deg, photo.altitude_m) == (-33.5, 70.5, 88.5)
@@ -189,7 +189,7 @@ def test_no_photos_are_no_records():
 
 
 def test_mixed_references_are_unknown():
-    """Photos whose altitudes have different references have none in common."""
+    """Photos whose altitudes have different references have no common reference."""
     both = [
         photo("a", altitude_m=1.0, altitude_reference=HeightReference.AMSL),
         photo("b", altitude_m=1.0),
@@ -211,7 +211,7 @@ def test_mixed_references_are_unknown():
     ],
 )  # fmt: skip
 def test_damaged_metadata_is_left_out(tmp_path, gps, xmp, words):
-    """Damaged tags give no invented value and do not stop the photo from being used."""
+    """Damaged tags give no invented value, and the photo is still used."""
     found = read_photo(jpeg(tmp_path / "a.jpg", gps=GPS | gps, xmp=xmp))
     assert found.width == 40
     assert math.isnan(found.lat_deg) == bool(gps)
@@ -241,7 +241,7 @@ def test_what_is_no_photo_is_refused(tmp_path):
 
 
 def test_every_cut_and_flip_of_a_photo_is_survived(tmp_path, shared_data):
-    """Cut short or with damaged bytes, a photo is read or refused, and never breaks the reader."""
+    """A truncated photo or one with damaged bytes is read or refused without crashing the reader."""
     whole = (shared_data / "photos-dji-xmp" / "DJI_0018.JPG").read_bytes()[:30_000]
     rng = np.random.default_rng(3)
     path = tmp_path / "a.jpg"
@@ -266,7 +266,7 @@ def test_a_large_photo_is_not_decoded(tmp_path):
 
 
 def test_a_position_without_letters_is_said(tmp_path):
-    """Latitude and longitude without N/S and E/W are no position, and the note says what to write."""
+    """Latitude and longitude without N/S and E/W give no position, and a note says what to write."""
     unsigned = {k: v for k, v in GPS.items() if k % 2 == 0 or k > 4}
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps=unsigned))
     assert np.isnan([photo.lat_deg, photo.lon_deg]).all()
@@ -287,7 +287,7 @@ def test_a_position_without_letters_is_said(tmp_path):
     ],
 )
 def test_the_zone_of_the_camera_clock(tmp_path, zone_tag, stamp, fix, utc):
-    """UTC is known from any of the offset tags, or from the time of the fix if it differs by a zone."""
+    """UTC is known from any offset tag, or from the time of the fix if it differs by a time zone."""
     exif = {piexif.ExifIFD.DateTimeOriginal: "2026:05:01 12:00:00"}
     if zone_tag:
         exif[zone_tag] = stamp
@@ -303,7 +303,7 @@ def test_the_zone_of_the_camera_clock(tmp_path, zone_tag, stamp, fix, utc):
 
 
 def test_photos_in_another_order_than_their_names_are_said():
-    """Photos sorted by time keep their times, and a note names the first that its name puts elsewhere."""
+    """Photos sorted by time keep their times, and a note names the first out of name order."""
     photos = [photo("DJI_0999.JPG", local_s=10.0), photo("DJI_0001.JPG", local_s=12.0)]
     t = telemetry_from_photos(photos)
     assert t.time_s.tolist() == [0.0, 2.0]
@@ -311,7 +311,7 @@ def test_photos_in_another_order_than_their_names_are_said():
 
 
 def test_gimbal_angles_of_zero_in_all_photos_are_left_out():
-    """Photos of a camera that looks down, whose drone wrote zeros, have no gimbal angles."""
+    """Gimbal angles that are exactly zero in all photos are dropped with a note."""
     photos = [photo(f"{i}.jpg", local_s=float(i), gimbal_deg=(0.0, 0.0, 0.0)) for i in range(3)]
     t = telemetry_from_photos(photos)
     assert np.isnan(t.gimbal_deg).all()

@@ -91,7 +91,7 @@ def test_real_file_gives_its_own_values(shared_data, name):
     ],
 )
 def test_date_stamps_are_read_to_their_last_digit(shared_data, name, utc_s):
-    """Each dialect's date stamp becomes seconds, with its milli- and microseconds."""
+    """Each dialect's date stamp becomes seconds, including its milli- and microseconds."""
     assert read_dji_srt(shared_data / "srt" / name).utc_s[0] == pytest.approx(utc_s, abs=2e-6)
 
 
@@ -158,7 +158,7 @@ P4_RTK = (
          (39.906217, 116.391305), 91.2, (NAN, NAN, NAN)),
         ("GPS(39.9,16.4,69.800) BAROMETER:-3.5M", (39.9, 16.4), -3.5, (NAN, NAN, NAN)),
         ("HOME(E: 120.0, S: 20.0)\nGPS(W: 120.5, S: 20.25, 001.01m)", (-20.25, -120.5), NAN, (NAN,) * 3),
-        # HOME decides the order, against the height in third place.
+        # HOME decides the order although the height is in third place.
         ("HOME(149.0,-20.0)\nGPS(49.5,-20.5,16.5)", (-20.5, 49.5), NAN, (NAN, NAN, NAN)),
         ("[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 1.5 abs_alt: 2.5]",
          (NAN, NAN), 1.5, (NAN, NAN, NAN)),
@@ -166,7 +166,7 @@ P4_RTK = (
     ],
 )  # fmt: skip
 def test_dialect(body, lat_lon, rel_alt_m, gimbal_deg):
-    """Every known way of writing position, height and gimbal angles is read correctly."""
+    """Every known notation of position, height and gimbal angles is read correctly."""
     t = one(body)
     np.testing.assert_allclose(t.lat_lon_deg[0], lat_lon, atol=1e-12, equal_nan=True)
     np.testing.assert_allclose(t.rel_alt_m[0], rel_alt_m, atol=1e-12, equal_nan=True)
@@ -189,7 +189,7 @@ def test_layout_does_not_matter(tmp_path, encoding):
 
 
 def test_lines_are_counted_as_an_editor_counts_them(tmp_path):
-    """In a file with CRLF the line in a message is the one that an editor shows."""
+    """In a file with CRLF, the line in a message is the one that an editor shows."""
     path = tmp_path / "a.srt"
     path.write_bytes((record(KEYED) + record("GPS(x,1,2)")).replace("\n", "\r\n").encode())
     assert any("the first at line 6: GPS is 'x'" in note for note in read_dji_srt(path).notes)
@@ -206,14 +206,14 @@ def times_of(starts):
 
 
 def test_equal_and_stray_times_are_left_out():
-    """A record whose time repeats, steps back, or leaps far ahead is left out, not its neighbours."""
+    """A record whose time repeats, steps back or jumps far ahead is dropped, not its neighbours."""
     t = times_of([0.0, 1.0, 1.0, 0.9, 2.0, 900.0, 3.0, 4.0])
     np.testing.assert_allclose(t.time_s, [0.0, 1.0, 2.0, 3.0, 4.0])
     assert any("left out: 3, the first at line 10" in note for note in t.notes)
 
 
 def test_times_that_start_over_end_the_recording():
-    """If a second recording is appended, its records are not mixed into the first."""
+    """Records of an appended second recording are not mixed into the first."""
     t = times_of([0.0, 1.0, 2.0, 3.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     np.testing.assert_allclose(t.time_s, [0.0, 1.0, 2.0, 3.0])
     assert any("start over at line 18: the 6 records" in note for note in t.notes)
@@ -237,7 +237,7 @@ def test_without_subtitle_times_and_dates_the_durations_count():
 
 
 def test_garbage_among_good_records_is_counted():
-    """Damaged records are left out and counted with the first line; the good ones stay."""
+    """Damaged records are dropped and counted with the first line; the good ones stay."""
     good = [record(KEYED, f"00:00:{i:02d},000", i) for i in range(1, 9)]
     good[3] = "4\n00:00:04,000 --> 00:00:05,000\n[latitude: 50.x] [longitude: 8.25]\n\n"
     good[5] = "\x01\x02 not a record ~~~\n\n"
@@ -275,7 +275,7 @@ def test_heights_below_land_are_said():
     ],
 )
 def test_unusable_file_is_refused_with_place_and_reason(text, message):
-    """A file without any usable record is refused in one line with file, line and what was found."""
+    """A file without any usable record is refused in one line with file, line and reason."""
     with pytest.raises(InputError, match=f"^{message}") as error:
         parse_dji_srt(text, source="x.srt")
     assert "\n" not in str(error.value)
@@ -311,13 +311,13 @@ def test_a_hostile_file_takes_no_time():
     ],
 )
 def test_a_letter_and_a_minus_say_the_same(position, lat_lon):
-    """West or south with a minus is still west or south."""
+    """West or south with a minus sign is still west or south."""
     np.testing.assert_allclose(one(position).lat_lon_deg, [lat_lon])
 
 
 @pytest.mark.parametrize("position", ["GPS(E: -20.5, N: 48.25, 3)", "GPS(N: 20.5, N: 48.25, 3)"])
 def test_letters_that_contradict_are_refused(position):
-    """East with a minus, or two latitudes, is no position."""
+    """East with a minus sign, or two latitudes, gives no position."""
     with pytest.raises(InputError, match=r"contradict each other|not one latitude"):
         one(position)
 
@@ -328,7 +328,7 @@ def test_a_height_named_reh_is_above_take_off():
 
 
 def test_a_damaged_number_loses_its_record_only():
-    """A number like -20.-5000 loses its record; the others stay."""
+    """A damaged number such as -20.-5000 drops only its own record."""
     body = "GPS(W: {}, N: 48.25, -37) ReH:20"
     t = parse_dji_srt(
         "".join(
@@ -342,7 +342,7 @@ def test_a_damaged_number_loses_its_record_only():
 
 
 def test_a_position_far_from_home_is_left_out():
-    """A position that names its hemisphere and HOME in the same record must be in one place."""
+    """A record with hemispheres whose position is far from its HOME is dropped."""
     t = one("HOME(20.5000, 48.2654)\nGPS(W: 20.5000, N: 48.2654, -37) ReH:20")
     assert not t.has_fix.any()
     assert any("HOME in the same record is in another place: 1" in note for note in t.notes)
@@ -351,10 +351,10 @@ def test_a_position_far_from_home_is_left_out():
 @pytest.mark.parametrize(
     ("fix", "home", "distance_m", "lat_lon"),
     [
-        # 0.001 degrees of longitude at 48 degrees north are 74.1 m, of latitude 111.2 m.
+        # 0.001 degrees of longitude at 48 degrees north is 74.1 m, of latitude 111.2 m.
         ("GPS(11.672200, 48.265401, 103.55)", "HOME(11.671200, 48.265401)", 74.0, (48.265401, 11.6722)),
         ("GPS(48.265401, 11.672200, 17)", "HOME(48.265401, 11.671200)", 74.0, (48.265401, 11.6722)),
-        # Without a distance, RTK is the Phantom 4 RTK's and longitude first.
+        # Without a distance, RTK means a Phantom 4 RTK, with longitude first.
         ("RTK(11.672200, 48.265401, 103.55)", "HOME(11.671200, 48.265401)", 0.0, (48.265401, 11.6722)),
     ],
 )  # fmt: skip
@@ -366,7 +366,7 @@ def test_home_and_its_distance_decide_the_order(fix, home, distance_m, lat_lon):
 
 
 def test_zeros_in_all_records_are_no_measurement():
-    """Gimbal angles and heights that are exactly zero in all records are left out, each with a note."""
+    """Gimbal angles and heights that are exactly zero in all records are dropped, each with a note."""
     zero = "[latitude: 50.5] [longitude: 8.2{}] [rel_alt: {} abs_alt: 160.0] [gb_yaw: {}"
     zero += " gb_pitch: 0.0 gb_roll: 0.0]"
     rows = [record(zero.format(i, "0.000", "0.0"), f"00:00:0{i},000", i) for i in range(3)]
@@ -382,7 +382,7 @@ def test_zeros_in_all_records_are_no_measurement():
 
 
 def test_the_wrong_side_of_the_earth(shared_cases):
-    """Files whose positions once came out east instead of west, or exchanged, are read right."""
+    """Files once read as east instead of west, or with axes swapped, are read correctly."""
     west = read_dji_srt(shared_cases / "input" / "01-west-letter-and-minus" / "MAX_0001.srt")
     np.testing.assert_allclose(west.lat_lon_deg[0], (48.2654, -20.5))
     assert set(west.rel_alt_m.tolist()) == {20.0}
@@ -391,7 +391,7 @@ def test_the_wrong_side_of_the_earth(shared_cases):
 
 
 def test_autel_writes_ass_beside_a_video(tmp_path):
-    """Dialogue lines of an .ass file are records on the video's clock; one without a time is left out."""
+    """Dialogue lines of an .ass file are records on the video's clock; one without a time is dropped."""
     line = (
         "Dialogue: 0,{},0:00:02.00,Default,,0,0,0,,GPS(W: -20.5, N: 48.25, -37)\\NReH:20 ISO:100\n"
     )

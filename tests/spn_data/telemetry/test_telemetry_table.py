@@ -67,7 +67,7 @@ def test_parts_of_one_recording_are_joined_and_overlap_is_dropped() -> None:
 
 
 def test_a_change_of_focal_length_or_digital_zoom_shows(shared_data: Path) -> None:
-    """A real file has 24 mm throughout; optical or digital zoom doubles it if the record says so."""
+    """A real file has 24 mm throughout; optical or digital zoom in a record doubles its focal length."""
     real = read_dji_srt(shared_data / "srt" / "air3S.SRT")
     assert np.array_equal(real.zoom, np.full(len(real), 24.0))
     record = "{0}\n00:00:0{0},000 --> 00:00:0{0},900\n[latitude: 1.5] [longitude: 2.5] {1}\n\n"

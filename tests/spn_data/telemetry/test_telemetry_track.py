@@ -56,7 +56,7 @@ def test_no_value_is_made_up_outside_the_neighbouring_records():
 
 
 def test_a_gap_gives_no_position():
-    """There is no position inside a gap longer than the limit, but there is at its edges."""
+    """Inside a gap longer than the limit there is no position, but at its edges there is."""
     at = track([0.0, 1.0, 2.0, 10.0, 11.0]).at(np.array([1.9, 2.0, 2.1, 6.0, 9.9, 10.0, 10.1]))
     np.testing.assert_array_equal(at.has_fix, [True, True, False, False, False, True, True])
 
@@ -72,13 +72,13 @@ def test_records_without_a_fix_are_a_gap_of_the_position_only():
 
 
 def test_edges_stay_sharp_late_in_a_long_flight():
-    """An hour into a flight a time 10 ms beyond the edge of a gap is still in the gap."""
+    """An hour into a flight, a time 10 ms beyond the edge of a gap is still in the gap."""
     at = track([3600.0, 3601.0, 3700.0, 3701.0]).at(np.array([3601.0, 3601.01]))
     np.testing.assert_array_equal(at.has_fix, [True, False])
 
 
 def test_ends_hold_for_half_an_interval():
-    """Before the first and after the last record their value holds for half an interval, no more."""
+    """Before the first and after the last record, their value holds for half an interval only."""
     at = track([0.0, 1.0, 2.0], rel_alt_m=[3.0, 4.0, 5.0]).at(np.array([-0.6, -0.4, 2.4, 2.6]))
     np.testing.assert_array_equal(at.rel_alt_m, [np.nan, 3.0, 5.0, np.nan])
 
@@ -95,7 +95,7 @@ def test_no_record_gives_no_value():
 
 
 def test_hovering_stays_in_place():
-    """Equal positions interpolate to the same position exactly."""
+    """Equal positions interpolate to exactly the same position."""
     at = track([0.0, 1.0, 2.0], lat_lon_deg=np.full((3, 2), 47.123456)).at(np.linspace(0, 2, 41))
     np.testing.assert_allclose(at.lat_lon_deg, 47.123456, rtol=0, atol=1e-13)
 
@@ -106,7 +106,7 @@ def test_hovering_stays_in_place():
         (359.0, 1.0, 0.5, 0.0),
         (350.0, 20.0, 0.25, 357.5),
         (10.0, 350.0, 0.75, 355.0),
-        (0.0, 90.0, 0.25, 22.5),  # uniform along the arc, where a chord would give 18.4
+        (0.0, 90.0, 0.25, 22.5),  # uniform along the arc; a chord would give 18.4
     ],
 )
 def test_heading_turns_along_the_shorter_arc(first, second, fraction, expected):
@@ -124,13 +124,13 @@ def test_pitch_and_roll_keep_their_sign():
 
 
 def test_the_date_line_is_no_jump():
-    """A flight across longitude 180 stays there instead of crossing the Earth."""
+    """A flight across longitude 180 is interpolated there instead of around the Earth."""
     t = track([0.0, 1.0], lat_lon_deg=[(-17.0, 179.999), (-17.0, -179.997)])
     np.testing.assert_allclose(t.at(np.array([0.5])).lat_lon_deg[0], (-17.0, -179.999), atol=1e-9)
 
 
 def test_shifted_and_select_keep_rows_together():
-    """Shifting moves times alone; selecting keeps each record's values together."""
+    """Shifting changes times only, and selecting keeps each record's values together."""
     t = track([0.0, 1.0, 2.0], rel_alt_m=[5.0, 6.0, 7.0]).shifted(0.5).select(np.array([2, 0]))
     np.testing.assert_allclose(t.time_s, [2.5, 0.5])
     np.testing.assert_allclose(t.rel_alt_m, [7.0, 5.0])
@@ -155,7 +155,7 @@ def test_summary_counts_fixes_gaps_and_rate():
 
 
 def test_photos_seconds_apart_are_no_gaps():
-    """Regular photos every 6 s have no gap, a pause of 60 s is one."""
+    """Regular photos every 6 s have no gap, and a pause of 60 s is one."""
     time_s = np.concatenate([np.arange(0, 60, 6.0), np.arange(120, 180, 6.0)])
     assert summarize(track(time_s)).gaps == ((54.0, 120.0),)
 
@@ -168,14 +168,14 @@ def test_a_source_without_any_fix_is_one_gap():
 
 
 def test_coordinate_step_is_read_from_the_decimals():
-    """Four decimals are steps of 11.1 m, six of 0.11 m; nothing known gives NaN."""
+    """Four decimals are steps of 11.1 m and six of 0.11 m; if none are known, the step is NaN."""
     assert coordinate_step_m(np.array([[48.0771, -121.7458]])) == pytest.approx(11.12, abs=0.01)
     assert coordinate_step_m(np.array([[48.077123, -121.5]])) == pytest.approx(0.1112, abs=1e-4)
     assert np.isnan(coordinate_step_m(np.full((2, 2), np.nan)))
 
 
 def test_increasing_sorts_and_keeps_the_first_of_equal_times():
-    """Records are sorted; of two with the same time the first in the file is kept; both get a note."""
+    """Records are sorted, and of two with the same time the first is kept; both cases get a note."""
     index, notes = time_order(np.array([2.0, 1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(index, [1, 0, 3])
     assert len(notes) == 2

@@ -1,4 +1,4 @@
-"""Batches on a real Dask cluster: two workers on loopback, in an empty folder, without access to the area."""
+"""Batches on a real Dask cluster: two local workers in an empty folder, without access to the area."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ sys.addaudithook(refuse)
 
 
 class Cluster:
-    """A scheduler and its workers, which end with the block."""
+    """Scheduler and workers, stopped at the end of the block."""
 
     def __init__(self, folder: Path, stack: ExitStack):
         self._folder, self._stack = folder, stack
@@ -108,7 +108,7 @@ def triple(x: int) -> int:
 
 
 def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -> None:
-    """The worker is killed after the fifth of forty results, with batches running and results waiting."""
+    """If a worker is killed after the fifth of forty results, every result still arrives exactly once."""
     started.add_worker()
     started.add_worker()
     results: list[str] = []
@@ -118,7 +118,7 @@ def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -
         if len(results) == 5:
             started.workers[0].kill()
 
-    # A function that the workers have: they cannot import the tests.
+    # A standard library function, because workers cannot import the tests.
     batches = [(str(k), ("{}", k)) for k in range(40)]
     run_on_cluster(started.address, str.format, iter(batches), store)
     assert sorted(map(int, results)) == list(range(40))
@@ -132,7 +132,7 @@ def test_the_error_of_a_call_is_raised_here(started: Cluster) -> None:
 
 
 def test_a_worker_with_other_code_is_refused(started: Cluster, tmp_path: Path) -> None:
-    """One line of one file differs."""
+    """A worker whose code differs in one line of one file is refused."""
     other = tmp_path / "other" / "spn_data"
     shutil.copytree(PACKAGE, other)
     with (other / "features.py").open("a") as file:
@@ -182,7 +182,7 @@ def test_without_dask_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 def killing_one(
     started: Cluster, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> Iterator[list[str]]:
-    """Kill the first worker after a number of stored results; yield what was stored."""
+    """Kill the first worker after a number of stored results, and yield what was stored."""
     stored: list[str] = []
 
     def counted(method: Callable[..., None]) -> Callable[..., None]:
@@ -204,7 +204,7 @@ def killing_one(
 def test_a_cluster_gives_the_labels_that_this_machine_gives(
     started: Cluster, flight2: Path, finished_area: Path, tmp_path: Path
 ) -> None:
-    """The flight is another one; the workers can read neither the map nor the flight's frames."""
+    """A cluster whose workers cannot read the map or frames gives the same labels as one machine."""
     near, far = (Path(shutil.copytree(finished_area, tmp_path / name)) for name in ("near", "far"))
     for _ in range(2):
         started.add_worker(blind_to=far)
@@ -225,7 +225,7 @@ def test_a_cluster_makes_the_model_that_this_machine_makes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The model is identical bit for bit, although one of two workers is killed during feature extraction."""
+    """The model is identical bit for bit, even if a worker is killed during feature extraction."""
     area = tmp_path / "area"
     for _ in range(2):
         started.add_worker(blind_to=area)

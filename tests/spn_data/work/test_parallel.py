@@ -1,4 +1,4 @@
-"""Batches in worker processes: nothing is lost or done twice, and a crash is reported."""
+"""Batches in worker processes: each runs exactly once, and a crash is reported."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     worker = int(pid_file.read_text())
     while time.monotonic() < deadline:
         try:
-            # A zombie has ended too: its parent is gone, and it may not have been reaped yet.
+            # A zombie has ended as well: its parent is gone, and it may not have been reaped yet.
             state = Path(f"/proc/{worker}/stat").read_text().rsplit(")", 1)[1].split()[0]
         except FileNotFoundError:
             return
@@ -163,7 +163,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_at_any_moment_ends_it_though_answers_are_under_way(tmp_path: Path) -> None:
-    """A worker that is killed while sending a large answer leaves half of it in the pipe."""
+    """Ctrl-C ends the run even if a killed worker leaves half of a large answer in the pipe."""
     script = tmp_path / "parent.py"
     script.write_text(
         "import signal, sys\n"
