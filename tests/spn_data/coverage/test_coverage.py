@@ -1,4 +1,4 @@
-"""Coverage: nearest frames, strata, view shares, and reflight planning."""
+"""Tests of coverage: nearest frames, strata, view shares, and reflight planning."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NORTH = (0.0, 0.0, 0.0)
 
 
 def looking(*rows: tuple[float, ...]) -> Poses:
-    """Poses of rows (x, y, z, heading, pitch, roll), angles that are left out being 0."""
+    """Return poses of rows (x, y, z, heading, pitch, roll), with omitted angles set to 0."""
     full = np.array([(*row, *NORTH)[:6] for row in rows], dtype=np.float64)
     return Poses.from_rotations(full[:, :3], rotations_from_angles(full[:, 3:]))
 
@@ -49,7 +49,7 @@ def both(a: Poses, b: Poses) -> Poses:
 
 @pytest.fixture(scope="module")
 def flights() -> dict[int, tuple[Poses, dict[str, Poses]]]:
-    """By seed: every eighth mapping pose, and the poses of the evaluation flights."""
+    """Return by seed every eighth mapping pose and the poses of the evaluation flights."""
     found = {}
     for seed in (1, 2, 3):
         paths = simulate_paths(preset("standard", seed=seed))
@@ -61,7 +61,7 @@ def flights() -> dict[int, tuple[Poses, dict[str, Poses]]]:
 
 class TestNearest:
     def test_strata_end_at_their_limits(self):
-        """2 m and 15 degrees are high, 5 m and 40 degrees medium, a little more is not; both must hold."""
+        """High ends at 2 m and 15 degrees, medium at 5 m and 40 degrees; both limits must hold."""
         queries = looking(
             (2, 0, 0), (2.001, 0, 0), (0, 0, 0, 14.999), (0, 0, 0, 15.001),
             (5, 0, 0), (5.001, 0, 0), (0, 0, 0, 39.999), (0, 0, 0, 40.001),
@@ -79,12 +79,12 @@ class TestNearest:
         assert found.tolist() == ["high", "medium", "low"]
 
     def test_limits_of_high_lie_within_those_of_medium(self):
-        """Options by which a frame could be high and not medium are refused."""
+        """Limits of high that exceed those of medium are refused."""
         with pytest.raises(ValueError, match="within those of medium"):
             CoverageOptions(high_m=6.0)
 
     def test_near_and_looking_elsewhere_is_not_near(self):
-        """The frame at the same place that looks the other way is not the nearest."""
+        """A frame at the same place that looks the opposite way is not the nearest."""
         mapping = looking((0, 0, 0, 180), (3, 0, 1, 10))
         found = nearest_frames(looking((0, 0, 0)), mapping)
         assert found.frame.tolist() == [1]
@@ -94,7 +94,7 @@ class TestNearest:
         assert found.height[0] == pytest.approx(-1)  # the query is 1 m below the frame
 
     def test_the_better_stratum_counts_before_the_smaller_sum(self):
-        """1.9 m and 14 degrees is high; 0.1 m and 16 degrees is less in sum, but medium: the best answer."""
+        """The better stratum takes precedence over the smaller sum of distance and angle."""
         found = nearest_frames(looking((0, 0, 0)), looking((1.9, 0, 0, 14), (0.1, 0, 0, 16)))
         assert found.stratum.tolist() == ["high"]
         assert found.frame.tolist() == [0]
@@ -102,13 +102,13 @@ class TestNearest:
         assert found.answer_angle_deg[0] == pytest.approx(16)
 
     def test_q_and_minus_q_are_one_direction(self):
-        """q and -q give the same result."""
+        """Quaternions q and -q give the same angle."""
         mapping = looking((0, 0, 0, 170))
         turned = Poses(mapping.centers, -mapping.quats_wxyz)
         assert nearest_frames(mapping, turned).angle_deg[0] < 1e-6
 
     def test_blocks_change_nothing(self, monkeypatch):
-        """Frames are compared in blocks of bounded memory; the result is that of all at once."""
+        """Comparing frames in blocks of bounded memory does not change the result."""
         rng = np.random.default_rng(0)
         rows = rng.uniform((-20, -20, 0, 0, -40, 0), (20, 20, 10, 360, 10, 0.1), (300, 6))
         queries, mapping = looking(*rows[:120]), looking(*rows[120:])
@@ -120,14 +120,14 @@ class TestNearest:
         assert set(whole.stratum) == {"medium", "low"} or set(whole.stratum) == {*Stratum}
 
     def test_frames_without_a_pose_have_no_stratum_and_cover_nothing(self):
-        """NaN among queries gives "", NaN among mapping frames is left out."""
+        """A query without pose has stratum ""; a mapping frame without pose is ignored."""
         queries, mapping = looking((1, 0, 0), (9, 0, 0)), looking((0, 0, 0), (9, 0, 0))
         queries.centers[0], queries.quats_wxyz[0] = np.nan, np.nan
         mapping.centers[1], mapping.quats_wxyz[1] = np.nan, np.nan
         assert coverage_strata(queries, mapping).tolist() == ["", "low"]
 
     def test_without_mapping_frames_there_is_no_answer(self):
-        """Without mapping frames an error is raised."""
+        """A map without frames raises GeometryError."""
         with pytest.raises(GeometryError, match="no mapping frame"):
             nearest_frames(looking((0, 0, 0)), looking((0, 0, 0))[:0])
 
@@ -136,12 +136,12 @@ class TestNearest:
         assert len(nearest_frames(looking((0, 0, 0))[:0], looking((0, 0, 0)))) == 0
 
     def test_heights_beyond_the_mapping_frames(self):
-        """Above the highest counts up, below the lowest down, between is zero."""
+        """Heights above the highest mapping frame are positive, below the lowest negative, else zero."""
         found = height_outside_range(np.array([-1.0, 2.0, 5.0, 8.5]), np.array([2.0, 7.0, 3.0]))
         assert found.tolist() == [-3.0, 0.0, 0.0, 1.5]
 
     def test_the_best_answer_on_shop_facade(self, shared_data):
-        """The public lists of ShopFacade give 0.75 m and 8.5 degrees, and 90 % within 2 m and 20 degrees."""
+        """ShopFacade's medians are 0.75 m and 8.5 degrees, with 90 % within 2 m and 20 degrees."""
         lists = [
             read_cambridge(shared_data / "cambridge" / "ShopFacade" / f"dataset_{part}.txt")
             for part in ("train", "test")
@@ -154,7 +154,7 @@ class TestNearest:
         assert np.mean(found.stratum == Stratum.HIGH) == pytest.approx(0.903, abs=0.001)
 
     def test_simulated_flights_are_what_their_names_say(self, flights):
-        """`medium` is mostly within 5 m and 40 degrees; `low` never is, and flies above all of the map."""
+        """`medium` is mostly within 5 m and 40 degrees; `low` never is, and flies above the map."""
         for mapping, evaluation in flights.values():
             medium = coverage_strata(evaluation["medium"], mapping)
             assert np.mean(medium != Stratum.LOW) > 0.7
@@ -165,13 +165,13 @@ class TestNearest:
 
 
 def wall(y: float, step: float = 0.25, half: float = 6.0) -> np.ndarray:
-    """Points of an upright wall that faces south, dense enough to fill every cell 5 m away."""
+    """Return points of an upright wall facing south, dense enough to fill every cell 5 m away."""
     x, z = np.meshgrid(np.arange(-half, half, step), np.arange(-half, half, step))
     return np.stack([x.ravel(), np.full(x.size, y), z.ravel()], axis=1)
 
 
 def seen_from(xyz: np.ndarray, *centers: tuple[float, float, float]) -> SeenMap:
-    """All points seen by each of some frames."""
+    """Return a map in which all points are seen from each of the centres."""
     places, points = np.array(centers, dtype=np.float64), np.arange(len(xyz))
     return SeenMap.build(
         xyz,
@@ -183,7 +183,7 @@ def seen_from(xyz: np.ndarray, *centers: tuple[float, float, float]) -> SeenMap:
 
 class TestViews:
     def test_a_wall_that_fills_the_view_is_covered(self):
-        """Every cell holds a point that was seen from where the camera is; half a wall covers half."""
+        """A wall seen from nearby covers the whole view; half a wall covers half of it."""
         here = looking((0, 0, 0))
         assert view_shares(here, [CAMERA], seen_from(wall(5), (0.3, 0, 0)))[0] == 1.0
         right = wall(5)[wall(5)[:, 0] > 0]
@@ -197,7 +197,7 @@ class TestViews:
 
     @pytest.mark.parametrize(("turn_deg", "share"), [(38.0, 1), (42.0, 0)])
     def test_points_seen_from_another_side_do_not_count(self, turn_deg, share):
-        """A point far away that was seen from 38 degrees aside counts, from 42 degrees aside not."""
+        """A point counts if it was seen from 38 degrees to the side, but not from 42 degrees."""
         point = np.array([[0.0, 10.0, 0.0]])
         angle = np.deg2rad(turn_deg)
         aside = (10 * np.sin(angle), 10 - 10 * np.cos(angle), 0.0)
@@ -208,20 +208,20 @@ class TestViews:
         ("range_m", "share"), [(4.9, 0), (5.1, 1), (10.0, 1), (19.9, 1), (20.1, 0)]
     )
     def test_points_seen_from_another_distance_do_not_count(self, range_m, share):
-        """A point at 10 m that was seen from half to twice as far counts, from nearer or farther not."""
+        """A point at 10 m counts if it was seen from between half and twice that distance."""
         point = np.array([[0.0, 10.0, 0.0]])
         found = view_shares(looking((0, 0, 0)), [CAMERA], seen_from(point, (0, 10 - range_m, 0)))
         assert found[0] * 16 * 9 == pytest.approx(share)
 
     def test_one_of_several_sightings_is_enough(self):
-        """Of frames that saw a point, one alike in direction and distance suffices."""
+        """One mapping frame similar in direction and distance is enough for a point to count."""
         point = np.array([[0.0, 10.0, 0.0]])
         frames = [(40.0, 10.0, 0.0), (0.0, 30.0, 0.0), (0.5, 1.0, 0.0)]
         found = view_shares(looking((0, 0, 0)), [CAMERA], seen_from(point, *frames))
         assert found[0] > 0
 
     def test_points_behind_a_wall_do_not_count(self):
-        """What other frames saw beyond a wall is hidden by it: the wall itself was seen by nobody near."""
+        """Points behind a nearer wall are occluded, and the wall was not seen from nearby."""
         beyond = wall(20, half=18)
         near = wall(5)
         xyz = np.concatenate([near, beyond])
@@ -233,7 +233,7 @@ class TestViews:
         assert view_shares(looking((0, 0, 0)), [CAMERA], open_view)[0] > 0.9
 
     def test_two_stray_points_hide_nothing(self):
-        """Fewer than three points in a cell are no wall: maps hold points that are wrong."""
+        """Two wrong points in a cell do not occlude the points behind them."""
         beyond = wall(20, half=21)
         stray = np.repeat([[0.1, 1.0, 0.1]], 2, axis=0)
         for count, share in ((2, 1.0), (3, None)):
@@ -249,9 +249,9 @@ class TestViews:
             assert found[0] == (share if share else pytest.approx(1.0, abs=0.04))
 
     def test_a_lens_that_folds_back_shows_no_ghosts(self):
-        """Points far outside the image that a strong lens polynomial leads back into it are not in view."""
+        """Points that a strong distortion polynomial folds back into the image are not in view."""
         lens = Camera("SIMPLE_RADIAL", 1600, 900, np.array([800.0, 800.0, 450.0, -0.15]))
-        ghost = np.array([[2.6, 1.0, 0.0]])  # 69 degrees aside, the image ends at about 50
+        ghost = np.array([[2.6, 1.0, 0.0]])  # 69 degrees off axis; the image ends at about 50
         pixel = lens.project(ghost @ looking((0, 0, 0)).rotations[0].T)[0]
         assert 0 <= pixel[0] < 1600
         assert 0 <= pixel[1] < 900
@@ -259,7 +259,7 @@ class TestViews:
         assert view_shares(looking((0, 0, 0)), [lens], seen)[0] == 0.0
 
     def test_each_pose_has_its_own_camera(self):
-        """A narrow lens sees less of a wall that is too small for a wide one."""
+        """A narrow camera is fully covered by a small wall, but a wide one is not."""
         narrow = Camera.from_horizontal_fov(1600, 900, 30.0)
         here = looking((0, 0, 0), (0, 0, 0))
         found = view_shares(here, [CAMERA, narrow], seen_from(wall(5, 0.1, half=1.5), (0, 0, 0)))
@@ -267,13 +267,13 @@ class TestViews:
         assert found[1] == 1.0
 
     def test_sightings_of_frames_without_a_pose_do_not_count(self):
-        """A frame whose centre is unknown saw from nowhere."""
+        """Sightings from a frame without a centre are ignored."""
         point = np.array([[0.0, 10.0, 0.0]])
         seen = SeenMap.build(point, np.full((1, 3), np.nan), np.zeros(1, int), np.zeros(1, int))
         assert view_shares(looking((0, 0, 0)), [CAMERA], seen)[0] == 0.0
 
     def test_what_is_skipped_for_speed_changes_nothing(self, monkeypatch):
-        """Shares are equal where no block is ruled out and every point is looked at."""
+        """Shares are the same without the shortcuts that skip blocks and points."""
         rng = np.random.default_rng(4)
         xyz = np.concatenate([wall(9, 0.6, 12), rng.uniform(-15, 15, (3000, 3))])
         frames = rng.uniform(-8, 8, (40, 3))
@@ -291,7 +291,7 @@ class TestViews:
 class TestReflightPlan:
     @pytest.mark.parametrize("wanted", [Stratum.HIGH, Stratum.MEDIUM])
     def test_frames_at_the_stops_close_all_gaps(self, flights, wanted):
-        """With mapping frames added at the stops, no frame stays below what is wanted, on all seeds."""
+        """With mapping frames added at the stops, all frames reach the wanted stratum."""
         enough = {"high"} if wanted is Stratum.HIGH else {"high", "medium"}
         for mapping, evaluation in flights.values():
             queries = both(evaluation["medium"], evaluation["low"])
@@ -325,31 +325,31 @@ class TestReflightPlan:
         np.testing.assert_allclose(found.angles_deg[:, 1:], [[-10, 0]] * 2, atol=1e-9)
 
     def test_stops_that_became_superfluous_are_left_out(self):
-        """The stop in the middle serves most and is chosen first; the two next to it make it redundant."""
+        """The middle stop, chosen first, is dropped when its neighbours make it redundant."""
         queries = looking(*[(x, 0, 3) for x in (0.0, -1.3, 1.3, -0.9, 0.9, -2.5, 2.5)])
         found = plan_reflight(queries, np.full(7, "low"))
         assert sorted(found.poses.centers[:, 0].tolist()) == [-1.3, 1.3]
 
     def test_turning_costs_by_degrees_per_metre(self):
-        """Three metres and 20 degrees cost 5 m at 10 degrees per metre."""
+        """At 10 degrees per metre, a move of 3 m and 20 degrees costs 5 m."""
         there = looking((3, 0, 0, 20, 0, 0))
         assert _costs(looking((0, 0, 0)), there, 10.0)[0, 0] == pytest.approx(5.0)
 
     def test_what_is_covered_needs_no_stop(self):
-        """Frames of the wanted stratum are not served; none left gives no stop."""
+        """Frames that already have the wanted stratum need no stop."""
         found = plan_reflight(looking((0, 0, 0), (50, 0, 0)), np.array(["high", "high"]))
         assert len(found) == 0
         assert found.query_stop.tolist() == [-1, -1]
 
     def test_a_camera_is_level_unless_the_frame_is_much_rolled(self):
-        """A roll of 2 degrees is left out, one of 90 degrees (an upright phone) is kept."""
+        """A roll of 2 degrees is set to zero; one of 90 degrees (an upright phone) is kept."""
         queries = looking((0, 0, 0, 10, -5, 2), (20, 0, 0, 10, -5, 90))
         found = plan_reflight(queries, np.array(["low", "low"]))
         assert sorted(np.round(found.angles_deg[:, 2], 6).tolist()) == [0.0, 90.0]
         assert set(coverage_strata(queries, found.poses).tolist()) == {"high"}
 
     def test_the_order_is_a_short_path(self):
-        """Stops along a shuffled line come back in their order along it, from one end to the other."""
+        """Stops along a shuffled line are ordered from one end to the other."""
         order = np.random.default_rng(3).permutation(30)
         queries = looking(*[(5.0 * k, 0.0, 3.0) for k in order])
         found = plan_reflight(queries, np.full(30, "low"))
@@ -358,7 +358,7 @@ class TestReflightPlan:
         assert len(set(np.sign(steps))) == 1
 
     def test_the_path_is_shorter_than_by_the_nearest_next_stop(self, monkeypatch):
-        """Turning stretches round saves a tenth of the way among scattered stops."""
+        """Reversing stretches of the path makes it 10 % shorter than the greedy order."""
         rng = np.random.default_rng(2)
         queries = looking(*np.column_stack([rng.uniform(0, 80, (60, 2)), np.full(60, 5.0)]))
         ways = []
@@ -369,7 +369,7 @@ class TestReflightPlan:
         assert ways[0] < 0.9 * ways[1]
 
     def test_crossing_paths_are_untangled(self):
-        """On a loop, the path is no longer than the loop, where always the nearest stop would jump across."""
+        """On a loop of stops, the path is no longer than the loop."""
         angle = np.linspace(0, 2 * np.pi, 41)[:-1]
         rng = np.random.default_rng(0)
         radius = 20 + rng.uniform(-1.5, 1.5, 40)
@@ -394,7 +394,7 @@ class TestTable:
         return assess_coverage(Queries(names, queries, [CAMERA] * 3, reason), mapping, options)
 
     def test_failed_frames_are_counted_and_have_a_row(self, tmp_path):
-        """Three frames, one of them failed, are three rows and a count; medians are over the two others."""
+        """A failed frame is counted and gets a row, but does not enter the medians."""
         found = self.table(options=CoverageOptions())
         summary = found.summary()
         assert (summary["frames"], summary["failed"]) == (3, 1)
@@ -408,7 +408,7 @@ class TestTable:
         assert rows[3] == ["e/3.jpg", "failed", *[""] * (len(COLUMNS) - 3), "ambiguous"]
 
     def test_heights_that_were_never_mapped_are_reported(self):
-        """A frame 3 m above the highest mapping frame is named with that figure."""
+        """The note gives the number of frames above the mapping frames and by how much."""
         sentences = coverage_notes("e", self.table(options=CoverageOptions()))
         assert any("1 of 3 frames failed" in s for s in sentences)
         assert any(
@@ -416,7 +416,7 @@ class TestTable:
         )
 
     def test_without_metres_there_are_no_strata_and_no_heights(self):
-        """In units of the model distances stay, strata and heights are unknown."""
+        """In model units, distances are given but strata and heights are unknown."""
         found = self.table(has_up=False)
         assert set(found.stratum.tolist()) == {""}
         assert np.isnan(found.height).all()
@@ -425,7 +425,7 @@ class TestTable:
         assert not any("are above" in s for s in coverage_notes("e", found))
 
     def test_a_plan_of_another_place_is_reported(self):
-        """Frames kilometres away suggest a wrong sign in the coordinates."""
+        """Frames kilometres away from the map are reported."""
         found = self.table(options=CoverageOptions())
         far = replace(found, distance=found.distance + 7000.0)
         assert any("7 km away" in s for s in coverage_notes("e", far))

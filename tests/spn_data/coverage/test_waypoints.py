@@ -1,4 +1,4 @@
-"""Planned waypoints as CSV: what is read, what is refused and where, and what is written."""
+"""Tests of planned waypoints as CSV: what is read, what is refused and where, and what is written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spn_data.storage.files import write_csv
 
 LAT, LON = 49.0153, 8.4250
 TAKEOFF = WaypointFrame(GeoOrigin(LAT, LON, 0.0, HeightReference.TAKEOFF), 0.0)
-# An area above the ellipsoid whose zero is 2 m above the take-off point.
+# An area with ellipsoidal heights whose zero is 2 m above the take-off point.
 ELLIPSOID = WaypointFrame(GeoOrigin(LAT, LON, 112.0, HeightReference.ELLIPSOID), -2.0)
 HEADER = "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg"
 GOOD = f"{LAT},{LON},10,90,-30"
@@ -29,7 +29,7 @@ def read(tmp_path, text: str | bytes, place: WaypointFrame = TAKEOFF):
 
 class TestReading:
     def test_latitude_longitude_and_height_above_take_off(self, tmp_path):
-        """1e-4 degrees north is 11.12 m; heading east, 30 degrees down."""
+        """A latitude 1e-4 degrees north is 11.12 m north; heading and pitch are read as given."""
         found = read(tmp_path, f"{HEADER}\n{LAT + 1e-4},{LON},10,90,-30\n")
         np.testing.assert_allclose(found.poses.centers, [[0, 11.122, 10]], atol=2e-3)
         angles = angles_from_rotations(found.poses.rotations)
@@ -42,12 +42,12 @@ class TestReading:
         [("alt_ellipsoid_m", 120.0, 8.0), ("height_takeoff_m", 10.0, 8.0)],
     )
     def test_heights_by_what_they_count_from(self, tmp_path, column, value, up):
-        """120 m above an ellipsoid 112 m below zero is 8 m up; so is 10 m above a take-off at -2 m."""
+        """Ellipsoidal heights and heights above take-off are both converted to the area's zero."""
         text = f"lat_deg,lon_deg,{column},heading_deg,pitch_deg\n{LAT},{LON},{value},0,0\n"
         assert read(tmp_path, text, ELLIPSOID).poses.centers[0, 2] == pytest.approx(up, abs=1e-6)
 
     def test_east_north_up_roll_and_camera(self, tmp_path):
-        """x, y, z, a roll and the key of a camera, in any order, among unknown columns."""
+        """x, y, z, roll and camera key are read in any order, among unknown columns."""
         text = "note,Camera,z,y,x,roll,pitch,heading\nhello,wide,3,2,1,5,-10,350\n"
         found = read(tmp_path, text)
         assert found.poses.centers.tolist() == [[1.0, 2.0, 3.0]]
@@ -66,12 +66,12 @@ class TestReading:
         ids=["byte-order mark", "semicolons and decimal commas", "tabs and comments", "UTF-16"],
     )
     def test_what_spreadsheets_write_is_read(self, tmp_path, text):
-        """Byte-order marks, semicolons with decimal commas, tabs, comments and empty lines do no harm."""
+        """Byte-order marks, semicolons, decimal commas, tabs, comments and empty lines are accepted."""
         found = read(tmp_path, text)
         np.testing.assert_allclose(found.poses.centers, [[0, 0, 10]], atol=1e-6)
 
     def test_a_row_may_state_its_position_twice(self, tmp_path):
-        """x, y, z count; a row without them falls back on latitude and longitude."""
+        """x, y, z take precedence; a row without them uses latitude and longitude."""
         text = f"{HEADER},x,y,z\n{GOOD},0.1,0.1,10.1\n{GOOD},,,\n"
         found = read(tmp_path, text)
         np.testing.assert_allclose(found.poses.centers, [[0.1, 0.1, 10.1], [0, 0, 10]], atol=1e-6)
@@ -97,7 +97,7 @@ class TestRefusing:
         ],
     )
     def test_a_bad_row_is_named_with_its_line(self, tmp_path, rows, message):
-        """One bad row is an error with file and line; a quote that never ends swallows no row unseen."""
+        """The error for a bad row names file and line, also after an unclosed quote."""
         text = f"{HEADER}\n{rows}\n"
         with pytest.raises(InputError, match=rf"plan\.csv:{re.escape(message)}"):
             read(tmp_path, text)
@@ -112,12 +112,12 @@ class TestRefusing:
         ],
     )
     def test_missing_columns_are_named(self, tmp_path, header, message):
-        """The header has to say where and which way."""
+        """The error names the missing columns of position or direction."""
         with pytest.raises(InputError, match=message):
             read(tmp_path, f"{header}\n1,2,3,4,5\n")
 
     def test_heights_of_another_reference_are_refused(self, tmp_path):
-        """Heights above the sea are not those above take-off, nor above the ellipsoid."""
+        """Heights above sea level are refused because no geoid model is available."""
         text = f"lat_deg,lon_deg,alt_amsl_m,heading_deg,pitch_deg\n{LAT},{LON},10,0,0\n"
         with pytest.raises(
             InputError, match="alt_amsl_m, but the area needs height_takeoff_m; no geoid"
@@ -130,19 +130,19 @@ class TestRefusing:
             read(tmp_path, text, unknown)
 
     def test_positions_that_differ_are_refused(self, tmp_path):
-        """A latitude that was edited without x, y, z, or a file of an earlier origin, is noticed."""
+        """A row whose x, y, z contradict its latitude and longitude is refused."""
         with pytest.raises(InputError, match=r"plan\.csv:2: its two positions differ"):
             read(tmp_path, f"{HEADER},x,y,z\n{GOOD},3,0,10\n")
 
     def test_half_a_position_is_refused(self, tmp_path):
-        """x without y and z is a mistake, also where latitude and longitude are there."""
+        """x without y and z is refused even if latitude and longitude are given."""
         with pytest.raises(
             InputError, match=r"plan\.csv:2: has no position: x, y, z are incomplete"
         ):
             read(tmp_path, f"{HEADER},x,y,z\n{GOOD},0,,\n")
 
     def test_a_camera_is_a_key_not_a_path(self, tmp_path):
-        """Cells that are no key are refused before anything is looked up by them."""
+        """A camera cell that is not a valid key (such as a path) is refused."""
         with pytest.raises(InputError, match="not a valid camera key"):
             read(tmp_path, f"{HEADER},camera\n{GOOD},../../etc/passwd\n")
 
@@ -157,12 +157,12 @@ class TestRefusing:
         ids=["empty", "binary", "endless quote", "commas"],
     )
     def test_hostile_files_are_one_line(self, tmp_path, data, message):
-        """What is no plan is an error of one line."""
+        """Empty, binary and malformed files are refused with a one-line error."""
         with pytest.raises(InputError, match=message):
             read(tmp_path, data)
 
     def test_too_many_rows_are_refused(self, tmp_path, monkeypatch):
-        """Memory is bounded by the number of rows."""
+        """A file with more rows than the limit is refused, which bounds memory."""
         monkeypatch.setattr("spn_data.coverage.waypoints.MAX_WAYPOINTS", 2)
         with pytest.raises(InputError, match=r"plan\.csv:4: has more than 2 rows"):
             read(tmp_path, f"{HEADER}\n" + f"{GOOD}\n" * 3)
@@ -171,7 +171,7 @@ class TestRefusing:
 class TestWriting:
     @pytest.mark.parametrize("place", [TAKEOFF, ELLIPSOID], ids=["takeoff", "ellipsoid"])
     def test_what_is_written_is_read_back(self, tmp_path, place):
-        """Positions to half a millimetre, angles to 5e-4 degrees, by each way of stating a position."""
+        """Positions survive a round trip within 0.7 mm, for each way of giving a position."""
         rng = np.random.default_rng(1)
         centers = rng.uniform(-400, 400, (20, 3))
         angles = rng.uniform((0, -90, -20), (360, 40, 20), (20, 3))
@@ -190,7 +190,7 @@ class TestWriting:
             )
 
     def test_full_turns_and_negative_zeros_are_printed_plainly(self):
-        """359.9999 degrees is 0.000, and a roll of -1e-14 has no sign."""
+        """359.9999 degrees is written as 0.000, and a roll of -1e-14 without a sign."""
         columns = waypoint_columns(np.zeros((1, 3)), np.array([[359.9999, -0.0, -1e-14]]), TAKEOFF)
         assert columns["heading_deg"] == ["0.000"]
         assert columns["pitch_deg"] == ["0.000"]

@@ -1,4 +1,4 @@
-"""Lists of Cambridge Landmarks."""
+"""Tests of Cambridge Landmarks pose lists."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ COUNTS = dict(zip(REAL, (231, 103, 1532, 760), strict=True))
 def test_a_real_list_is_written_again_to_the_last_digit(
     name: str, shared_data: Path, tmp_path: Path
 ) -> None:
+    """Published lists are rewritten byte by byte, and read back with identical poses."""
     source = shared_data / "cambridge" / name
     found = read_cambridge(source)
     assert len(found) == COUNTS[name]
@@ -42,6 +43,7 @@ def test_a_real_list_is_written_again_to_the_last_digit(
 
 
 def test_the_outlier_in_great_court_is_reported_and_kept(shared_data: Path) -> None:
+    """The outlier position in GreatCourt is reported, but kept in the list."""
     found = read_cambridge(shared_data / "cambridge/GreatCourt/dataset_train.txt")
     row = found.names.index("seq5/frame00297.png")
     assert found.poses.centers[row, 0] == 3117382476.41
@@ -51,7 +53,7 @@ def test_the_outlier_in_great_court_is_reported_and_kept(shared_data: Path) -> N
 
 
 def test_a_position_is_far_beyond_20_times_what_is_usual() -> None:
-    """90 % are within 1; 15 may be a distant view, 30 is an outlier; nine centres are too few."""
+    """A position is an outlier beyond 20 times the usual spread; nine centres are too few."""
     usual = np.zeros((20, 3))
     usual[:, 0] = np.linspace(-1, 1, 20)
     for distance, is_far in ((15.0, False), (30.0, True)):
@@ -62,13 +64,14 @@ def test_a_position_is_far_beyond_20_times_what_is_usual() -> None:
 
 
 def test_an_ordinary_real_list_has_no_oddities(shared_data: Path) -> None:
+    """The other published lists have no anomalies."""
     for name in REAL:
         if name != "GreatCourt/dataset_train.txt":
             assert find_anomalies(read_cambridge(shared_data / "cambridge" / name)) == []
 
 
 def test_the_real_cameras_stand_upright_in_their_convention(shared_data: Path) -> None:
-    """World-to-camera, scalar first: only then do hand-held cameras all look level, sky on top."""
+    """Read as world-to-camera, scalar first, the hand-held cameras are level and upright."""
     found = read_cambridge(shared_data / "cambridge/ShopFacade/dataset_train.txt")
     down_in_world, forward_in_world = found.poses.rotations[:, 1], found.poses.rotations[:, 2]
     assert np.median(down_in_world[:, 2]) < -0.99
@@ -76,7 +79,7 @@ def test_the_real_cameras_stand_upright_in_their_convention(shared_data: Path) -
 
 
 def test_a_known_pose_has_its_known_line(tmp_path: Path) -> None:
-    """10 m up, level, to the north: a turn by 90 degrees about x, by hand."""
+    """A level camera looking north, 10 m up, is written as a 90-degree rotation about x."""
     poses = Poses.from_rotations(
         np.array([[0.0, 0.0, 10.0]]), rotations_from_angles(np.zeros((1, 3)))
     )
@@ -88,6 +91,7 @@ def test_a_known_pose_has_its_known_line(tmp_path: Path) -> None:
 def test_line_ends_of_windows_a_byte_order_mark_tabs_and_empty_lines_are_read(
     tmp_path: Path,
 ) -> None:
+    """Windows line ends, a byte-order mark, tabs and empty lines are accepted."""
     path = tmp_path / "list.txt"
     text = HEADER + ROW.replace(" ", "\t") + "\n \n"
     path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
@@ -97,6 +101,7 @@ def test_line_ends_of_windows_a_byte_order_mark_tabs_and_empty_lines_are_read(
 
 
 def test_a_list_of_no_images_is_read_as_such(tmp_path: Path) -> None:
+    """A list with only its header gives no images and no anomalies."""
     (tmp_path / "list.txt").write_text(HEADER)
     found = read_cambridge(tmp_path / "list.txt")
     assert len(found) == len(found.poses) == 0
@@ -106,6 +111,7 @@ def test_a_list_of_no_images_is_read_as_such(tmp_path: Path) -> None:
 def test_a_flipped_or_long_quaternion_is_reported_and_round_trips(
     tmp_path: Path,
 ) -> None:
+    """Quaternions of negative w or wrong length are reported and normalised, then stay stable."""
     path = tmp_path / "list.txt"
     rows = ["a/1.png 0 0 0 -0.5 0.5 0.5 0.5", "a/2.png 1 0 0 1.001 0 0 0", "a/3.png 1 0 0 1 0 0 0"]
     path.write_text(HEADER + "\n".join(rows))
@@ -153,6 +159,7 @@ def _with(old: str, new: str) -> bytes:
 def test_a_broken_list_is_refused_with_its_line(
     content: bytes, line: int, words: str, tmp_path: Path
 ) -> None:
+    """The error for a malformed list names file and line."""
     path = tmp_path / "list.txt"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
@@ -162,6 +169,7 @@ def test_a_broken_list_is_refused_with_its_line(
 
 
 def test_a_missing_list_or_a_folder_is_refused(tmp_path: Path) -> None:
+    """A missing list, or a folder in its place, is refused."""
     with pytest.raises(InputError, match="does not exist"):
         read_cambridge(tmp_path / "list.txt")
     with pytest.raises(InputError, match="is not a file"):
@@ -170,6 +178,7 @@ def test_a_missing_list_or_a_folder_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../a.png", "/a.png", "a b.png", "a//b.png", ""])
 def test_a_name_that_no_reader_takes_is_not_written(name: str, tmp_path: Path) -> None:
+    """Invalid names and unknown poses are refused before anything is written."""
     poses = Poses(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
     with pytest.raises(ValueError, match="is not a path"):
         write_cambridge(tmp_path / "list.txt", [name], poses)

@@ -1,4 +1,4 @@
-"""dataset.h5: round trips, constant memory, and rejection of damaged files."""
+"""Tests of dataset.h5: round trips, constant memory, and rejection of damaged files."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ INFO = DatasetInfo(
     notes=("same flight as training: optimistic",),
 )
 GROUPS = {"train": Role.TRAIN, "validation": Role.VALIDATION, "low": Role.TEST}
-PART = np.arange(27 * 48).reshape(27, 48) % 7 > 0  # pixels that a narrow camera sees
+PART = np.arange(27 * 48).reshape(27, 48) % 7 > 0  # pixels seen by a narrow camera
 
 
 def frame(group: str, k: int) -> DatasetFrame:
-    """Frame k of a group, with everything in it different; every third sees part of its image."""
+    """Return frame k of a group, with distinct values; some frames of `low` are partly masked."""
     rng = np.random.default_rng([k, *group.encode()])
     seen = k % 5
     return DatasetFrame(
@@ -71,7 +71,7 @@ COUNTS = {"train": 150, "validation": 3, "low": 70}
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set whose groups were written in turns."""
+    """Write a data set whose groups are appended in turn."""
     path = tmp_path_factory.mktemp("dataset") / "dataset.h5"
     with DatasetWriter(path, INFO, GROUPS) as writer:
         for k in range(max(COUNTS.values())):
@@ -82,7 +82,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_written_comes_back(written):
-    """Every value of every frame, to the last bit, in the order in which a group was given it."""
+    """Every value of every frame is read back exactly, in the order of writing."""
     with Dataset(written) as dataset:
         assert list(dataset.groups) == sorted(GROUPS)
         for name, group in dataset.groups.items():
@@ -109,7 +109,7 @@ def test_what_is_written_comes_back(written):
 
 
 def test_what_holds_for_the_whole_comes_back(written):
-    """Units, origin, camera, split, fingerprints and notes are in the root's attributes."""
+    """Units, origin, camera, split, fingerprints and notes are read back from the root's attributes."""
     with Dataset(written) as dataset:
         found = dataset.info
     assert found.to_attributes() == INFO.to_attributes()
@@ -119,7 +119,7 @@ def test_what_holds_for_the_whole_comes_back(written):
 
 
 def test_a_world_without_a_place_has_none():
-    """No origin is no origin, not latitude 0."""
+    """An unknown origin is read back as none, not as latitude 0."""
     bare = replace(INFO, origin=None, up_is_known=False, camera=None, units="model")
     found = DatasetInfo.from_attributes(bare.to_attributes())
     assert found.origin is None
@@ -129,7 +129,7 @@ def test_a_world_without_a_place_has_none():
 
 
 def test_masks_are_stored_once_a_camera_and_only_where_needed(written):
-    """A frame without invalid pixels has no mask; those of one camera share theirs."""
+    """Frames without invalid pixels have no mask; frames of one camera share theirs."""
     with Dataset(written) as dataset:
         assert dataset.groups["train"].all_valid
         assert dataset.groups["train"].valid(5) is None
@@ -143,7 +143,7 @@ def test_masks_are_stored_once_a_camera_and_only_where_needed(written):
 
 
 def test_only_training_groups_give_points_to_learn_from(written):
-    """Points of validation and evaluation frames are marked, and refused to a trainer that asks."""
+    """Points of validation and test groups are refused for training."""
     with Dataset(written) as dataset:
         assert len(dataset.groups["train"].training_points(4).ids) == 4
         for name in ("validation", "low"):
@@ -154,7 +154,7 @@ def test_only_training_groups_give_points_to_learn_from(written):
 
 
 def test_images_are_stored_one_a_chunk_as_they_are(written):
-    """A trainer reads one image by one read of its bytes."""
+    """Images are stored uncompressed, one per chunk, and can be read into a buffer."""
     with h5py.File(written) as file:
         images = file["train/images"]
         assert images.chunks == (1, 27, 48, 3)
@@ -166,7 +166,7 @@ def test_images_are_stored_one_a_chunk_as_they_are(written):
 
 
 def test_the_same_frames_make_the_same_bytes(tmp_path):
-    """The file contains no time stamps."""
+    """Writing the same frames twice gives identical bytes, without time stamps."""
     for name in ("a.h5", "b.h5"):
         with DatasetWriter(tmp_path / name, INFO, GROUPS) as writer:
             for k in range(70):
@@ -175,7 +175,7 @@ def test_the_same_frames_make_the_same_bytes(tmp_path):
 
 
 def test_poses_alone_make_a_data_set_too(tmp_path):
-    """Lists without images are kept; asking for an image says that there is none."""
+    """A data set without images is valid; asking for an image raises an error."""
     path = tmp_path / "poses.h5"
     with DatasetWriter(path, replace(INFO, has_images=False), {"train": Role.TRAIN}) as writer:
         nan = np.full((3, 3), np.nan)
@@ -190,7 +190,7 @@ def test_poses_alone_make_a_data_set_too(tmp_path):
 
 
 def test_groups_without_frames_are_there(tmp_path):
-    """A sequence of which every frame failed is an empty group."""
+    """A group without frames is kept as an empty group."""
     with DatasetWriter(tmp_path / "d.h5", INFO, GROUPS):
         pass
     with Dataset(tmp_path / "d.h5") as dataset:
@@ -200,7 +200,7 @@ def test_groups_without_frames_are_there(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_frames(tmp_path):
-    """After 400 frames of 1.5 MB the process holds less than 40 of them more than after 10."""
+    """Memory grows by less than 60 MB between 10 and 400 frames of 1.5 MB."""
     code = """
 import resource, sys
 import numpy as np
@@ -230,7 +230,7 @@ with DatasetWriter(Path(sys.argv[1]), INFO, {"train": Role.TRAIN}) as writer:
 
 
 def test_an_error_leaves_no_file(tmp_path):
-    """Neither the file nor an unfinished one is left, and the previous file is kept."""
+    """After an error, no unfinished file remains and the previous file is kept."""
     path = tmp_path / "dataset.h5"
     path.write_text("before")
     with pytest.raises(KeyError, match="no such"):
@@ -240,7 +240,7 @@ def test_an_error_leaves_no_file(tmp_path):
 
 
 def test_a_killed_run_leaves_what_the_next_replaces(tmp_path):
-    """A killed writer leaves at most a .part file; the next run succeeds."""
+    """A killed writer leaves only a .part file, which the next run replaces."""
     path = tmp_path / "dataset.h5"
     code = (
         "import os, sys; from pathlib import Path; from tests.spn_data.dataset.test_hdf5 import *\n"
@@ -257,7 +257,7 @@ def test_a_killed_run_leaves_what_the_next_replaces(tmp_path):
 
 
 def test_a_full_disk_is_reported(tmp_path):
-    """A full disk gives an error of one line and leaves no file."""
+    """A full disk gives a one-line error and leaves no file."""
     code = (
         "import signal, resource, sys; from pathlib import Path\n"
         "from tests.spn_data.dataset.test_hdf5 import *\n"
@@ -285,7 +285,7 @@ def test_a_full_disk_is_reported(tmp_path):
 
 
 def test_a_missing_folder_is_reported(tmp_path):
-    """No traceback of HDF5 reaches the user."""
+    """A missing output folder gives a StageError, not an HDF5 traceback."""
     from spn_data.errors import StageError
 
     with pytest.raises(StageError, match=r"cannot be written: No such file"):
@@ -293,14 +293,14 @@ def test_a_missing_folder_is_reported(tmp_path):
 
 
 def test_two_frames_of_one_name_are_refused(tmp_path):
-    """Names are unique across groups: a frame must not be used for both training and validation."""
+    """A frame name used in two groups is refused."""
     one = frame("train", 0)
     with pytest.raises(InputError, match="two frames are named"):
         write(tmp_path / "d.h5", [("train", one), ("validation", one)])
 
 
 def test_images_of_two_sizes_are_refused(tmp_path):
-    """All images of a group are one array, so they must have the same size."""
+    """Images of different sizes within a group are refused."""
     other = replace(
         frame("train", 1), image=np.zeros((20, 48, 3), np.uint8), point_pixels=np.zeros((1, 2))
     )
@@ -325,13 +325,13 @@ def test_images_of_two_sizes_are_refused(tmp_path):
     ],
 )
 def test_a_frame_that_breaks_the_format_is_our_mistake(tmp_path, changes, message):
-    """What the schema rules out is not written."""
+    """A frame that violates the schema raises ValueError."""
     with pytest.raises(ValueError, match=message):
         write(tmp_path / "d.h5", [("train", replace(frame("train", 2), **changes))])
 
 
 def damage(path: Path, change: str) -> None:
-    """Change a copy of a data set in one way."""
+    """Damage a data set in one way."""
     with h5py.File(path, "r+") as file:
         train = file["train"]
         if change == "version":
@@ -414,7 +414,7 @@ def damage(path: Path, change: str) -> None:
     ],
 )
 def test_a_damaged_or_hostile_file_is_refused(written, tmp_path, change, message):
-    """Nothing outside the file is read, claimed sizes are not trusted, and the reason is stated."""
+    """Damaged files, false sizes and links to other files are refused with the reason."""
     path = tmp_path / "damaged.h5"
     shutil.copy(written, path)
     damage(path, change)
@@ -440,7 +440,7 @@ def read_all(path: Path) -> None:
 
 
 def test_what_is_no_hdf5_file_is_refused(tmp_path):
-    """Text, nothing, a folder, a file that is not there."""
+    """A text, empty or missing file and a folder are refused."""
     (tmp_path / "text.h5").write_text("hello")
     (tmp_path / "empty.h5").touch()
     for name in ("text.h5", "empty.h5"):
@@ -476,7 +476,7 @@ print(refused)
 
 
 def test_random_damage_is_refused_or_harmless(written, tmp_path):
-    """Cut short or with bytes changed at random, a file is read or refused; the process lives on."""
+    """A truncated or randomly changed file is read or refused without crashing."""
     done = subprocess.run(
         [sys.executable, "-c", FUZZ, str(written), str(tmp_path / "d.h5"), "0", "60"],
         cwd=ROOT,
@@ -490,7 +490,7 @@ def test_random_damage_is_refused_or_harmless(written, tmp_path):
 
 
 def test_the_documented_schema_is_the_one_written(written):
-    """docs/dataset.md has a row for every dataset and attribute, and for no others."""
+    """docs/dataset.md describes exactly the datasets and attributes that are written."""
     text = (ROOT / "docs" / "dataset.md").read_text(encoding="utf-8")
     rows = {
         name
@@ -509,7 +509,7 @@ def test_the_documented_schema_is_the_one_written(written):
 
 @pytest.mark.slow
 def test_the_benchmark_measures_what_it_writes(finished_area, tmp_path):
-    """benchmarks/dataset.py writes as many frames as asked for, one process each, and leaves no data set."""
+    """benchmarks/dataset.py writes the requested numbers of frames and leaves only its figures."""
     program, figures = ROOT / "benchmarks" / "dataset.py", tmp_path / "figures.json"
     words = [str(finished_area), "--frames", "30", "60", "--folder", str(tmp_path)]
     subprocess.run(

@@ -1,4 +1,4 @@
-"""Import of Cambridge Landmarks folders: exact poses, and all anomalies reported."""
+"""Tests of importing Cambridge Landmarks folders: exact poses, and all anomalies reported."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run(folder: Path, target: Path, *, overwrite: bool = False, **options) -> Im
 
 @pytest.mark.parametrize("scene", ["ShopFacade", "GreatCourt"])
 def test_lists_come_back_as_they_were_printed(shared_data, tmp_path, scene):
-    """Text to HDF5 and back gives the same bytes, for every image of the published lists."""
+    """Published lists come back byte by byte from text through HDF5 to text."""
     folder = shared_data / "cambridge" / scene
     run(folder, tmp_path / "dataset.h5", keep_outliers=True)
     with Dataset(tmp_path / "dataset.h5") as dataset:
@@ -61,7 +61,7 @@ def test_lists_come_back_as_they_were_printed(shared_data, tmp_path, scene):
 
 
 def test_the_second_round_trip_is_identical(shared_data, tmp_path):
-    """What came out of a data set goes into another: the same poses, bit by bit."""
+    """Importing the exported lists gives bit-identical poses."""
     first = tmp_path / "first.h5"
     run(shared_data / "cambridge" / "ShopFacade", first)
     again = tmp_path / "again"
@@ -77,7 +77,7 @@ def test_the_second_round_trip_is_identical(shared_data, tmp_path):
 
 
 def test_lists_alone_say_what_they_lack(shared_data, tmp_path):
-    """Poses without images: no image, no focal length, no origin, no known up, and all of it is said."""
+    """Lists alone give no images, focal lengths, origin or up direction, and the notes say so."""
     done = run(shared_data / "cambridge" / "ShopFacade", tmp_path / "dataset.h5")
     assert done.counts == {"train": 231, "test": 103}
     assert not done.has_images
@@ -104,7 +104,7 @@ def test_lists_alone_say_what_they_lack(shared_data, tmp_path):
 
 
 def test_the_outlier_of_great_court_is_left_out_and_reported(shared_data, tmp_path):
-    """The frame three million kilometres away would ruin any training; leaving it out is reported."""
+    """The frame three million kilometres away is left out and reported."""
     done = run(shared_data / "cambridge" / "GreatCourt", tmp_path / "dataset.h5")
     assert done.counts == {"train": 1531, "test": 760}
     notes = [note for note in done.notes if OUTLIER in note]
@@ -116,7 +116,7 @@ def test_the_outlier_of_great_court_is_left_out_and_reported(shared_data, tmp_pa
 
 
 def poses() -> Poses:
-    """Six cameras side by side that look north."""
+    """Return six cameras in a row that look north."""
     centers = np.column_stack([np.arange(6) * 0.5, np.zeros(6), np.full(6, 2.0)])
     angles = np.column_stack([np.linspace(-6, 6, 6), np.full(6, -3.0), np.zeros(6)])
     return Poses.from_rotations(centers, rotations_from_angles(angles))
@@ -131,7 +131,7 @@ def world() -> np.ndarray:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A folder with lists, images and a model; each point is a bright dot on black."""
+    """Write a folder with lists, images and a model; each point is a bright dot on black."""
     folder = tmp_path / "scene"
     seen: list[tuple[int, int, np.ndarray]] = []
     for k, (center, rotation) in enumerate(zip(poses().centers, poses().rotations, strict=True)):
@@ -163,7 +163,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_images_lenses_and_points_of_a_folder_are_taken(scene, tmp_path):
-    """A folder with a model gives images in RGB, intrinsics, and points where the images show them."""
+    """A folder with a model gives RGB images, intrinsics, and points at their pixels."""
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
     assert done.counts == {"train": 4, "test": 2}
     assert done.has_images
@@ -178,7 +178,7 @@ def test_images_lenses_and_points_of_a_folder_are_taken(scene, tmp_path):
             points, image = group.points(k), group.image(k).astype(float)
             assert len(points.ids) > 20
             column, row = points.pixels.astype(int).T
-            assert (image[row, column, 0] > 40).all()  # the red dot, a quarter of it at least
+            assert (image[row, column, 0] > 40).all()  # a quarter of the red dot or more
             assert image[..., 2].max() == 0
             pose = group.poses[k : k + 1]
             in_camera = (points.xyz - pose.centers[0]) @ pose.rotations[0].T
@@ -187,7 +187,7 @@ def test_images_lenses_and_points_of_a_folder_are_taken(scene, tmp_path):
 
 
 def test_points_for_training_are_seen_by_two_training_frames(scene, tmp_path):
-    """One training frame alone gives no point; validation and test frames keep all of theirs."""
+    """Training points are seen by at least two training frames; test frames keep all their points."""
     run(scene, tmp_path / "dataset.h5", width_px=80)
     with Dataset(tmp_path / "dataset.h5") as dataset:
         train, test = dataset.groups["train"], dataset.groups["test"]
@@ -198,7 +198,7 @@ def test_points_for_training_are_seen_by_two_training_frames(scene, tmp_path):
 
 
 def test_a_model_of_another_world_is_refused(scene, tmp_path):
-    """A model whose poses are not the lists' is of another reconstruction, and so may be its cameras."""
+    """A model whose poses all differ from the lists is refused; two differing poses are only noted."""
     moved = Poses(poses().centers + np.array([0, 0, 5.0]), poses().quats_wxyz)
     for name, rows in (("train", TRAIN), ("test", TEST)):
         write_cambridge(
@@ -223,7 +223,7 @@ def test_a_model_of_another_world_is_refused(scene, tmp_path):
 
 
 def test_without_a_model_images_are_reduced_and_the_focal_length_is_unknown(scene, tmp_path):
-    """The image is the same as with the model; what is not known is NaN."""
+    """Without a model, images are the same and the intrinsics are NaN."""
     run(scene, tmp_path / "with.h5", width_px=80)
     (scene / "reconstruction.nvm").unlink()
     done = run(scene, tmp_path / "without.h5", width_px=80)
@@ -234,7 +234,7 @@ def test_without_a_model_images_are_reduced_and_the_focal_length_is_unknown(scen
 
 
 def test_a_missing_image_is_left_out_and_reported(scene, tmp_path):
-    """The other images are taken; one that was converted to JPEG is found."""
+    """A missing image is left out and reported; one converted to JPEG is found."""
     (scene / NAMES[1]).unlink()
     image = cv2.imread(str(scene / NAMES[2]))
     cv2.imwrite(str((scene / NAMES[2]).with_suffix(".jpg")), image)
@@ -245,7 +245,7 @@ def test_a_missing_image_is_left_out_and_reported(scene, tmp_path):
 
 
 def test_an_image_in_two_lists_is_refused(scene, tmp_path):
-    """What trains must not test."""
+    """An image in both the training and the validation list is refused."""
     write_cambridge(scene / "dataset_validation.txt", [NAMES[0]], poses()[:1])
     with pytest.raises(InputError, match=r"seq1/frame00000.png is also in dataset_train.txt"):
         run(scene, tmp_path / "dataset.h5")
@@ -253,7 +253,7 @@ def test_an_image_in_two_lists_is_refused(scene, tmp_path):
 
 
 def test_a_folder_without_a_training_list_is_refused(tmp_path):
-    """The message names the file that is missing."""
+    """The error names the missing training list."""
     with pytest.raises(InputError, match=r"dataset_train\.txt: does not exist"):
         run(tmp_path, tmp_path / "dataset.h5")
     with pytest.raises(InputError, match="is not a folder"):
@@ -261,7 +261,7 @@ def test_a_folder_without_a_training_list_is_refused(tmp_path):
 
 
 def test_a_damaged_image_is_refused_by_name(scene, tmp_path):
-    """No frame is made up, and no file is left."""
+    """A damaged image is refused by name, and no output file remains."""
     (scene / NAMES[5]).write_bytes(b"no image")
     with pytest.raises(InputError, match=r"frame00005.png: cannot be read as an image"):
         run(scene, tmp_path / "dataset.h5", width_px=80)
@@ -270,7 +270,7 @@ def test_a_damaged_image_is_refused_by_name(scene, tmp_path):
 
 @pytest.mark.parametrize("distortion", [-0.08, 0.06])
 def test_visualsfms_distortion_becomes_colmaps(distortion):
-    """The fitted camera leads each ray to where VisualSFM's model measures it, to a tenth of a pixel."""
+    """The fitted camera reproduces VisualSFM's distortion to a tenth of a pixel."""
     camera = camera_from_visualsfm(1670.0, distortion, 1920, 1080)
     x, y = np.meshgrid(np.linspace(0, 1920, 30), np.linspace(0, 1080, 20))
     pixels = np.column_stack([x.ravel(), y.ravel()])
@@ -278,18 +278,18 @@ def test_visualsfms_distortion_becomes_colmaps(distortion):
     ray = measured * (1 + distortion * (measured**2).sum(axis=1, keepdims=True))
     found = camera.project(np.column_stack([ray, np.ones(len(ray))]))
     assert np.abs(found - pixels).max() < 0.1
-    assert np.abs(ray - measured).max() * 1670 > 20  # it is no small matter
+    assert np.abs(ray - measured).max() * 1670 > 20  # the distortion is not negligible
 
 
 def test_a_lens_that_cannot_be_is_refused():
-    """A focal length of zero, or a distortion that folds the image, is no camera."""
+    """A zero or unknown focal length, or a distortion that folds the image, is refused."""
     for focal_px, distortion in ((0.0, 0.0), (np.nan, 0.0), (900.0, -0.9), (900.0, 3.0)):
         with pytest.raises(GeometryError):
             camera_from_visualsfm(focal_px, distortion, 1920, 1080)
 
 
 def test_the_command_tells_what_it_did(scene, tmp_path):
-    """Notes, counts, and a second run is refused until it may overwrite."""
+    """The command prints counts and notes; a second run needs --overwrite."""
     target = tmp_path / "scene.h5"
     words = ["import", str(scene), "--to", str(target), "--size", "80"]
     done = CliRunner().invoke(main, words)
@@ -303,7 +303,7 @@ def test_the_command_tells_what_it_did(scene, tmp_path):
 
 
 def test_every_option_of_import_is_documented():
-    """docs/dataset.md has a row for every option, with its default, and names every list."""
+    """docs/dataset.md lists every option with its default, and every pose list."""
     text = (Path(__file__).resolve().parents[3] / "docs" / "dataset.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^- `(--[a-z-]+)` \(([^)]*)\)", text, re.MULTILINE))
     options = {p.opts[-1]: p for p in import_.params if p.opts[-1].startswith("--")}
@@ -315,7 +315,7 @@ def test_every_option_of_import_is_documented():
 
 
 def test_lists_read_as_they_are(shared_data):
-    """The lists behind these tests are those published: 231 and 103, 1532 and 760 images."""
+    """The test data are the published lists of 231 and 103, 1532 and 760 images."""
     counts = [
         len(read_cambridge(shared_data / "cambridge" / scene / f"dataset_{name}.txt"))
         for scene in ("ShopFacade", "GreatCourt")
@@ -325,7 +325,7 @@ def test_lists_read_as_they_are(shared_data):
 
 
 def test_only_files_that_are_data_sets_are_replaced(scene, tmp_path):
-    """A mistyped --to does not cost the user a list, nor a photo."""
+    """A mistyped --to never overwrites a list or photo."""
     mistyped = scene / "dataset_train.txt"
     before = mistyped.read_bytes()
     with pytest.raises(InputError, match="is not the name of an HDF5 file"):
@@ -334,6 +334,7 @@ def test_only_files_that_are_data_sets_are_replaced(scene, tmp_path):
 
 
 def test_lists_without_a_frame_are_refused(tmp_path):
+    """A training list without images is refused."""
     write_cambridge(tmp_path / "dataset_train.txt", [], Poses(np.zeros((0, 3)), np.zeros((0, 4))))
     with pytest.raises(InputError, match="contains no training frame"):
         run(tmp_path, tmp_path / "dataset.h5")
@@ -341,7 +342,7 @@ def test_lists_without_a_frame_are_refused(tmp_path):
 
 
 def listed(folder: Path, name: str) -> list[list[str]]:
-    """Rows of a list as cells, to be changed and written again by `relist`."""
+    """Return the rows of a list as cells."""
     return [line.split() for line in (folder / f"dataset_{name}.txt").read_text().splitlines()[3:]]
 
 
@@ -388,13 +389,13 @@ def turned_about(axis: np.ndarray) -> Callable[[list[str]], list[str]]:
         (turned_about(np.array([0, 0, np.pi / 2])), "turned by 270 degrees about their optical"),
         (
             lambda cells: [cells[0], *(str(2 * float(v)) for v in cells[1:4]), *cells[4:]],
-            "no usual mistake of conventions explains that",  # on a line, the axes are unknown
+            "no usual mistake of conventions explains that",  # collinear centres do not fix the axes
         ),
         (turned_about(np.array([0.2, 0, 0])), "no usual mistake of conventions explains that"),
     ],
 )
 def test_a_list_in_another_convention_is_refused_by_its_name(scene, tmp_path, change, cause):
-    """Where list and model disagree in all frames, the message names what would make them agree."""
+    """If list and model disagree in all frames, the error names the convention that would explain it."""
     relist(scene, change)
     with pytest.raises(InputError, match=f"for 6 of 6 images; .*{cause}"):
         run(scene, tmp_path / "dataset.h5")
@@ -402,7 +403,7 @@ def test_a_list_in_another_convention_is_refused_by_its_name(scene, tmp_path, ch
 
 
 def test_some_frames_in_another_convention_are_refused_too(scene, tmp_path):
-    """Four of six conjugate quaternions are no noise; two frames elsewhere are only noted."""
+    """Four of six conjugate quaternions are refused; two displaced frames are only noted."""
     relist(scene, conjugate, names=("train",))
     with pytest.raises(InputError, match="for 4 of 6 images; they agree if the quaternions rotate"):
         run(scene, tmp_path / "dataset.h5")
@@ -434,21 +435,21 @@ def resize_all(scene: Path, factor: float, names=NAMES) -> None:
     ],
 )
 def test_images_of_another_size_than_the_models_are_refused(scene, tmp_path, factor, message):
-    """A focal length of the model would be wrong by the factor, and half of the points lost."""
+    """Images of another size than those of the model are refused."""
     resize_all(scene, factor)
     with pytest.raises(InputError, match=message):
         run(scene, tmp_path / "dataset.h5")
 
 
 def test_one_image_of_another_size_is_refused_by_name(scene, tmp_path):
-    """One thumbnail among the images is found."""
+    """A single thumbnail among the images is refused by name."""
     resize_all(scene, 0.5, NAMES[3:4])
     with pytest.raises(InputError, match=rf"{NAMES[3]}: the image is 80x45, but the model's"):
         run(scene, tmp_path / "dataset.h5")
 
 
 def test_an_image_of_another_shape_is_refused_by_name(scene, tmp_path):
-    """Without a model to compare with, the message names both images and what to do."""
+    """Without a model, the error names two images of different shape and suggests a remedy."""
     (scene / "reconstruction.nvm").unlink()
     cv2.imwrite(str(scene / NAMES[2]), np.zeros((160, 90, 3), np.uint8))
     message = (
@@ -459,7 +460,7 @@ def test_an_image_of_another_shape_is_refused_by_name(scene, tmp_path):
 
 
 def as_jpeg(scene: Path, orientation: int, *, rotate: int | None = None) -> None:
-    """Write all images as JPEG with an EXIF orientation, their pixels turned by `rotate`."""
+    """Rewrite all images as JPEG with an EXIF orientation, with pixels rotated by `rotate`."""
     exif = piexif.dump({"0th": {piexif.ImageIFD.Orientation: orientation}})
     for name in NAMES:
         image = cv2.imread(str(scene / name))
@@ -470,7 +471,7 @@ def as_jpeg(scene: Path, orientation: int, *, rotate: int | None = None) -> None
 
 
 def test_exif_is_applied_only_where_the_model_is_of_upright_images(scene, tmp_path):
-    """Measurements show which pixels the poses belong to; the points lie on the dots in both cases."""
+    """EXIF orientation is applied only if the model's measurements fit the upright images."""
     as_jpeg(scene, 6)
     done = run(scene, tmp_path / "stored.h5", width_px=160)
     assert any("read as stored, although the EXIF" in note for note in done.notes)
@@ -490,14 +491,14 @@ def test_exif_is_applied_only_where_the_model_is_of_upright_images(scene, tmp_pa
 
 
 def test_an_orientation_that_nothing_confirms_is_noted(scene, tmp_path):
-    """Half a turn leaves all measurements inside, and without a model there is none."""
+    """An EXIF orientation of 180 degrees, which the measurements cannot confirm, is noted."""
     as_jpeg(scene, 3)
     done = run(scene, tmp_path / "half.h5", width_px=80)
     assert any("nothing shows whether the poses are of the upright" in n for n in done.notes)
 
 
 def test_failed_frames_at_zero_are_left_out(scene, tmp_path):
-    """Two frames at 0 0 0 are no frames; one whose neighbours are near is kept and named."""
+    """Two frames at position 0 0 0 are left out as failed, and reported."""
     relist(scene, lambda c: [c[0], *"0001000"] if c[0] in NAMES[1:3] else c)
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
     assert done.counts == {"train": 2, "test": 2}
@@ -505,7 +506,7 @@ def test_failed_frames_at_zero_are_left_out(scene, tmp_path):
 
 
 def test_one_frame_at_zero_may_be_the_first_of_its_world(scene, tmp_path):
-    """It is kept near others and left out far from them."""
+    """A single frame at 0 0 0 is kept if other frames are near, and left out otherwise."""
     (scene / "reconstruction.nvm").unlink()
     relist(scene, lambda c: [c[0], c[1], "0", "0", *c[4:]])
     done = run(scene, tmp_path / "near.h5", width_px=80)
@@ -516,7 +517,7 @@ def test_one_frame_at_zero_may_be_the_first_of_its_world(scene, tmp_path):
 
 
 def test_positions_that_are_all_equal_are_noted(scene, tmp_path):
-    """A network learns no position from one place."""
+    """Positions that are all equal are noted, because a network cannot learn from them."""
     (scene / "reconstruction.nvm").unlink()
     relist(scene, lambda c: [c[0], "1", "2", "3", *c[4:]])
     done = run(scene, tmp_path / "dataset.h5", width_px=80)
@@ -524,7 +525,7 @@ def test_positions_that_are_all_equal_are_noted(scene, tmp_path):
 
 
 def test_a_copy_of_a_training_image_among_the_test_images_is_refused(scene, tmp_path):
-    """Equal pixels count, whatever the file's name and format; lossy copies are noted."""
+    """A test image with the pixels of a training image is refused; a lossy copy is noted."""
     (scene / "reconstruction.nvm").unlink()
     for k, name in enumerate(NAMES):
         cv2.imwrite(str(scene / name), textured(160, 90, k))
@@ -542,7 +543,7 @@ def test_a_copy_of_a_training_image_among_the_test_images_is_refused(scene, tmp_
 
 
 def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
-    """Images with a sixteenth of the brightness are nearly black, which training cannot tell."""
+    """Nearly black images are noted, also in the notes of the file."""
     (scene / "reconstruction.nvm").unlink()
     for k, name in enumerate(NAMES):
         cv2.imwrite(str(scene / name), textured(160, 90, k)[..., 0] // 16)
@@ -553,7 +554,7 @@ def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
 
 
 def test_coordinates_far_from_zero_are_refused_until_an_offset_is_subtracted(scene, tmp_path):
-    """UTM in float32 has steps of half a metre; the message gives an offset that mends it exactly."""
+    """UTM coordinates, too coarse in float32, are refused with the offset to subtract."""
     offset = np.array([563247.0, 5934791.0, 323.0])
     run(scene, tmp_path / "near.h5", width_px=80)
     relist(scene, lambda c: [c[0], *map(repr, (np.array(c[1:4], float) + offset).tolist()), *c[4:]])
@@ -575,7 +576,7 @@ def shift_model(scene: Path, offset: np.ndarray) -> None:
 
 
 def test_the_model_that_the_lists_belong_to_is_used(scene, tmp_path):
-    """A file holds several models; the one with the lists' poses counts, not the first."""
+    """Of several models in a file, the one whose poses match the lists is used."""
     path = scene / "reconstruction.nvm"
     right = path.read_text().split("\n", 2)[2].strip().removesuffix("0").strip()
     shift_model(scene, np.array([50.0, 0, 0]))
@@ -589,7 +590,7 @@ def test_the_model_that_the_lists_belong_to_is_used(scene, tmp_path):
 
 
 def test_names_are_matched_by_a_unique_ending_and_may_have_spaces():
-    """Absolute Windows paths, other suffixes and VisualSFM's quotation marks are found; twins are not."""
+    """Names match by unique path ending, across suffixes, Windows paths and VisualSFM's quotes."""
     given = [
         r"D:\scans\seq1\a.jpg",
         'D:/scans/my"seq/b.JPG',
@@ -605,7 +606,7 @@ def test_names_are_matched_by_a_unique_ending_and_may_have_spaces():
 
 
 def test_a_name_with_spaces_is_imported(scene, tmp_path):
-    """Folder and file with spaces, in list and model."""
+    """Folder and file names with spaces are found in both list and model."""
     spaced = {name: name.replace("seq", "my seq ") for name in NAMES}
     for name in NAMES:
         (scene / spaced[name]).parent.mkdir(exist_ok=True)
@@ -620,7 +621,7 @@ def test_a_name_with_spaces_is_imported(scene, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".bmp", ".webp"])
 def test_bmp_and_webp_are_read(scene, tmp_path, suffix):
-    """The listed file, and the converted one."""
+    """Images converted to BMP or WebP are found and read."""
     for name in NAMES:
         image = cv2.imread(str(scene / name))
         (scene / name).unlink()
@@ -648,7 +649,7 @@ def test_bmp_and_webp_are_read(scene, tmp_path, suffix):
     ],
 )
 def test_cases_from_outside_are_reported(shared_cases, tmp_path, case, message):
-    """Scenes that someone else spoiled are refused or noted in the words of the documentation."""
+    """Externally damaged scenes are refused or noted with the documented message."""
     folder = tmp_path / case
     shutil.copytree(shared_cases / "labels" / "base", folder)
     shutil.copytree(shared_cases / "labels" / case, folder, dirs_exist_ok=True)
@@ -665,7 +666,7 @@ def test_cases_from_outside_are_reported(shared_cases, tmp_path, case, message):
 
 
 def test_a_model_in_another_world_is_named():
-    """A scale, a turn and a shift of the whole model are distinguished from a mistake of conventions."""
+    """A similarity between list and model is distinguished from a wrong convention."""
     rng = np.random.default_rng(3)
     rotations = rotations_from_vectors(rng.normal(0, 1, (12, 3)))
     model = Poses.from_rotations(rng.normal(0, 5, (12, 3)), rotations)

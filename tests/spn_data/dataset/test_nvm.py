@@ -1,4 +1,4 @@
-"""Models in VisualSFM's format."""
+"""Tests of models in VisualSFM's NVM format."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ a/2.png 100 1 0 0 0 1 0 0 0 0
 
 
 def model(seed: int = 0, images: int = 5, points: int = 40) -> NvmModel:
-    """Points before cameras, seen without error by those that `seen` draws."""
+    """Return a random model whose points are measured without error."""
     random = np.random.default_rng(seed)
     poses = Poses(
         random.normal(0, 1, (images, 3)), canonical_quats(random.normal(0, 1, (images, 4)))
@@ -44,6 +44,7 @@ def model(seed: int = 0, images: int = 5, points: int = 40) -> NvmModel:
 
 
 def test_a_model_is_read_back_bit_by_bit(tmp_path: Path) -> None:
+    """A model is read back exactly, its quaternions to rounding."""
     written = model()
     write_nvm(tmp_path / "a.nvm", written)
     found = read_nvm(tmp_path / "a.nvm")
@@ -57,7 +58,7 @@ def test_a_model_is_read_back_bit_by_bit(tmp_path: Path) -> None:
 
 
 def test_a_point_is_where_its_line_of_text_says(tmp_path: Path) -> None:
-    """By hand: 0.5 right of and 10 before the first camera of focal length 100 is 5 px right of it."""
+    """The measurements of a hand-written file equal the projections of its point."""
     (tmp_path / "a.nvm").write_text(TEXT)
     found = read_nvm(tmp_path / "a.nvm")
     assert found.offsets_px.tolist() == [[5, 0], [-5, 0]]
@@ -69,6 +70,7 @@ def test_a_point_is_where_its_line_of_text_says(tmp_path: Path) -> None:
 
 
 def test_points_that_no_image_sees_are_left_out() -> None:
+    """Points without measurements are dropped and the others renumbered."""
     made = build_nvm_model(
         ("a.png",),
         Poses(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
@@ -82,7 +84,7 @@ def test_points_that_no_image_sees_are_left_out() -> None:
 
 
 def test_measurements_are_without_distortion_and_from_the_centre() -> None:
-    """A point's offset is focal length times x/z and y/z, whatever the lens and its principal point."""
+    """Offsets are f x/z and f y/z, without distortion or the principal point."""
     lens = Camera("OPENCV", 640, 480, np.array([500.0, 510, 330, 235, -0.1, 0.02, 1e-3, -2e-3]))
     points = np.array([[0.3, -0.2, 2.0], [0.0, 0.0, 1.0]])
     found = offsets_from_center(lens, lens.project(points), 700.0)
@@ -111,6 +113,7 @@ def test_measurements_are_without_distortion_and_from_the_centre() -> None:
 def test_a_broken_file_is_refused_with_its_line(
     old: str, new: str, line: int, words: str, tmp_path: Path
 ) -> None:
+    """The error for a malformed file gives the line."""
     path = tmp_path / "a.nvm"
     assert old in TEXT
     text = TEXT.replace(old, new, 1) if old != TEXT[20:] else "garbage"
@@ -121,7 +124,7 @@ def test_a_broken_file_is_refused_with_its_line(
 
 
 def test_an_absurd_count_takes_no_memory(tmp_path: Path) -> None:
-    """A hundred million points are claimed, none is there: the file's end is met at once."""
+    """A file that claims a hundred million points but has none is refused at its end."""
     path = tmp_path / "a.nvm"
     path.write_text("NVM_V3\n\n0\n\n100000000\n")
     with pytest.raises(InputError, match="the file ends where a point is expected"):
@@ -134,6 +137,7 @@ def test_an_absurd_count_takes_no_memory(tmp_path: Path) -> None:
 
 
 def test_what_can_not_be_read_back_is_not_written(tmp_path: Path) -> None:
+    """Names and values that cannot be read back are refused before writing."""
     whole = model()
     for names in (("a b.png", *whole.names[1:]), ("", *whole.names[1:])):
         broken = NvmModel(**{**vars(whole), "names": names})
