@@ -1,4 +1,4 @@
-"""Exports of an area, read back by readers that are not ours."""
+"""Tests of exports of an area, read back by independent readers."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def reader(name: str) -> ModuleType:
-    """A package of the extra `readers`; where it is missing, the test is skipped."""
+    """Import a package of the extra `readers`, or skip the test if it is not installed."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of foreign modules while they are imported
+        warnings.simplefilter("ignore")  # raised by other packages during import
         try:
             return importlib.import_module(name)
         except ImportError as error:
@@ -66,7 +66,7 @@ def reader(name: str) -> ModuleType:
 
 
 def add_evaluation(root: Path) -> None:
-    """An evaluation sequence `again`, near the mapping frames, of a lens of its own; one frame fails."""
+    """Add an evaluation sequence `again` near the mapping frames, with its own lens and one failed frame."""
     area = Area(root)
     known = read_labelled_area(area)
     rows = np.flatnonzero(known.mapping.registered)[:6]
@@ -112,7 +112,7 @@ def add_evaluation(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def area(finished_area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A georeferenced area with an evaluation sequence; no test may change it."""
+    """Return a georeferenced area with an evaluation sequence; tests must not change it."""
     root = tmp_path_factory.mktemp("exported") / "area"
     shutil.copytree(finished_area, root)
     add_evaluation(root)
@@ -121,7 +121,7 @@ def area(finished_area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def area_without_place(area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same without georegistration."""
+    """Return the same area without georegistration."""
     root = tmp_path_factory.mktemp("placeless") / "area"
     shutil.copytree(area, root)
     shutil.rmtree(root / "3-geo")
@@ -130,7 +130,7 @@ def area_without_place(area: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def exports(area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All formats of it."""
+    """Export the area in all formats."""
     target = tmp_path_factory.mktemp("exports") / "all"
     done = run("all", target, area)
     assert done.exit_code == 0, done.output
@@ -144,7 +144,7 @@ def labelled(area: Path) -> LabelledArea:
 
 @pytest.fixture(scope="module")
 def truth(area: Path) -> dict[str, np.ndarray]:
-    """World-from-camera (4, 4) of every exported frame, from the area's files without our arithmetic."""
+    """Return world-from-camera (4, 4) of every exported frame, computed without our own code."""
     found = {}
     for image in pycolmap.Reconstruction(str(area / "3-geo")).images.values():
         found[image.name] = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
@@ -170,7 +170,7 @@ def run(format_name: str, target: Path, area: Path, *more: str) -> Result:
 def test_tum_is_read_by_evo(
     exports: Path, labelled: LabelledArea, truth: dict[str, np.ndarray]
 ) -> None:
-    """evo's poses, camera to world, and its times."""
+    """evo reads the true poses (camera to world) and times."""
     read = reader("evo.tools.file_interface").read_tum_trajectory_file
     read_files = sorted((exports / "tum").glob("*.txt"))
     assert [path.stem for path in read_files] == ["again", "flight1"]
@@ -185,7 +185,7 @@ def test_tum_is_read_by_evo(
 
 
 def test_kapture_is_read_by_kapture(exports: Path, truth: dict[str, np.ndarray]) -> None:
-    """Its sensors, times, images and poses, world to sensor."""
+    """kapture reads the true poses (world to sensor), sensors and images."""
     kapture = reader("kapture")
     found = reader("kapture.io.csv").kapture_from_dir(str(exports / "kapture"))
     names = {name: (stamp, sensor) for stamp, sensor, name in kapture.flatten(found.records_camera)}
@@ -205,7 +205,7 @@ def test_kapture_is_read_by_kapture(exports: Path, truth: dict[str, np.ndarray])
 def test_colmap_models_are_read_by_pycolmap(
     name: str, exports: Path, area: Path, labelled: LabelledArea, truth: dict[str, np.ndarray]
 ) -> None:
-    """The map is as it was; evaluation frames have poses and see what they were registered with."""
+    """The map is unchanged, and evaluation frames have their poses, camera and observations."""
     found = pycolmap.Reconstruction(str(exports / name / "sparse" / "0"))
     source = pycolmap.Reconstruction(str(area / "3-geo"))
     images = {image.name: image for image in found.images.values()}
@@ -236,10 +236,10 @@ def test_colmap_models_are_read_by_pycolmap(
 def test_nerfstudio_is_as_its_documentation_says(
     exports: Path, area: Path, truth: dict[str, np.ndarray]
 ) -> None:
-    """Camera to world in OpenGL's axes: the map's points fall on the pixels where they were seen.
+    """Map points project to the pixels where they were seen, with OpenGL camera-to-world poses.
 
-    Derived anew from https://docs.nerf.studio/quickstart/data_conventions.html: x right, y up, z backwards,
-    OpenCV's distortion; the centre of the upper-left pixel is (0.5, 0.5) as in COLMAP.
+    Derived independently from https://docs.nerf.studio/quickstart/data_conventions.html: x right, y up, z
+    backwards, OpenCV's distortion; the centre of the upper-left pixel is (0.5, 0.5) as in COLMAP.
     """
     content = json.loads((exports / "nerfstudio" / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
@@ -272,7 +272,7 @@ def test_nerfstudio_is_as_its_documentation_says(
 
 
 def test_intrinsics_of_one_camera_stand_once(area: Path, tmp_path: Path) -> None:
-    """nerfstudio takes them from the top of the file where they are there."""
+    """Intrinsics of a single camera are written once, at the top of the file."""
     done = run("nerfstudio", tmp_path / "out", area, "--sequence", "again", "--no-images")
     assert done.exit_code == 0, done.output
     content = json.loads((tmp_path / "out" / "transforms.json").read_text())
@@ -283,7 +283,7 @@ def test_intrinsics_of_one_camera_stand_once(area: Path, tmp_path: Path) -> None
 
 
 def in_world(lon_lat_height: np.ndarray, area: Path) -> np.ndarray:
-    """East, north, up (N, 3) by COLMAP's own geodesy."""
+    """Return east, north, up (N, 3) by COLMAP's own geodesy."""
     origin = json.loads((area / "3-geo" / "geo.json").read_text())["origin"]
     transform = pycolmap.GPSTransform()
     there = np.array([origin["lat_deg"], origin["lon_deg"], origin["alt_m"]])
@@ -298,9 +298,9 @@ def test_geojson_is_read_by_geojson(
     truth: dict[str, np.ndarray],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Valid by RFC 7946; positions equal to a millimetre; headings along the optical axis."""
+    """GeoJSON is valid, with positions within a millimetre and headings along the optical axis."""
     geojson = reader("geojson")
-    # It rounds what it reads to six decimals, a tenth of a metre.
+    # By default, geojson rounds coordinates to six decimals (a tenth of a metre).
     monkeypatch.setattr(reader("geojson.geometry"), "DEFAULT_PRECISION", 15)
     found = geojson.loads((exports / "geojson" / "frames.geojson").read_text())
     assert found.is_valid, found.errors()
@@ -322,7 +322,7 @@ def test_geojson_is_read_by_geojson(
 
 
 def test_kml_is_read_by_fastkml(exports: Path, area: Path, truth: dict[str, np.ndarray]) -> None:
-    """A placemark a frame and a path a sequence; positions equal to a millimetre."""
+    """KML has a placemark per frame and a path per sequence, with positions within a millimetre."""
     fastkml = reader("fastkml")
     find_all = reader("fastkml.utils").find_all
     document = fastkml.KML.parse(str(exports / "kml" / "frames.kml"))
@@ -345,7 +345,7 @@ def test_kml_is_read_by_fastkml(exports: Path, area: Path, truth: dict[str, np.n
 def test_nvm_is_read_by_kapture(
     exports: Path, truth: dict[str, np.ndarray], tmp_path: Path
 ) -> None:
-    """kapture's importer finds the poses, points and measurements that stand in the file."""
+    """kapture's importer reads the poses, points and measurements of the NVM file."""
     kapture = reader("kapture")
     script = Path(sys.executable).parent / "kapture_import_nvm.py"
     if not script.is_file():
@@ -372,7 +372,7 @@ def test_nvm_is_read_by_kapture(
 
 
 def test_measurements_in_nvm_fit_its_points(exports: Path) -> None:
-    """Without distortion and from the centre: a point is seen where focal times x/z, y/z says."""
+    """NVM measurements are undistorted and relative to the centre: f x/z and f y/z."""
     found = read_nvm(exports / "nvm" / "reconstruction.nvm")
     assert not found.distortion.any()
     is_map = np.array([not name.startswith("again/") for name in found.names])
@@ -388,7 +388,7 @@ def test_measurements_in_nvm_fit_its_points(exports: Path) -> None:
 
 
 def test_each_folder_says_what_it_holds(exports: Path, area: Path) -> None:
-    """Units, origin, sequences with their roles, and the stages that it was made of."""
+    """export.json gives units, origin, sequences with roles, and the stages used."""
     origin = json.loads((area / "3-geo" / "geo.json").read_text())["origin"]
     stages = {"1-frames", "2-model", "3-geo", "4-eval/again"}
     for name in {*FORMATS} - {"all"}:
@@ -401,6 +401,8 @@ def test_each_folder_says_what_it_holds(exports: Path, area: Path) -> None:
 
 
 def test_an_export_touches_nothing_of_the_area(area: Path, tmp_path: Path) -> None:
+    """Exporting leaves every file of the area unchanged."""
+
     def fingerprints() -> dict[str, str]:
         return {
             str(path): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -417,6 +419,7 @@ def test_an_export_touches_nothing_of_the_area(area: Path, tmp_path: Path) -> No
 def test_a_failed_frame_is_nowhere_and_a_dense_one_only_where_it_was_asked_for(
     area: Path, exports: Path, tmp_path: Path
 ) -> None:
+    """Failed frames are never exported, and tracked frames only with --all-frames."""
     text = "".join(
         path.read_text() for path in exports.rglob("*") if path.suffix in (".txt", ".json", ".kml")
     )
@@ -432,6 +435,7 @@ def test_a_failed_frame_is_nowhere_and_a_dense_one_only_where_it_was_asked_for(
 
 
 def test_a_colmap_model_holds_the_map_whole_whatever_is_chosen(area: Path, tmp_path: Path) -> None:
+    """A COLMAP export contains the whole map whichever sequences are chosen."""
     for names, count in ((["again"], 4), (["flight1"], 0)):
         target = tmp_path / names[0]
         words = [word for name in names for word in ("--sequence", name)]
@@ -446,7 +450,7 @@ def test_a_colmap_model_holds_the_map_whole_whatever_is_chosen(area: Path, tmp_p
 def test_without_a_place_everything_says_that_it_is_no_metres(
     area_without_place: Path, tmp_path: Path
 ) -> None:
-    """GeoJSON and KML are left out of `all` and said to be, and refused alone; the rest says `model`."""
+    """Without georegistration, GeoJSON and KML are omitted and other formats state model units."""
     done = run("all", tmp_path / "out", area_without_place, "--no-images")
     assert done.exit_code == 0, done.output
     told = " ".join(done.output.split())
@@ -474,6 +478,7 @@ def test_without_a_place_everything_says_that_it_is_no_metres(
 def test_a_target_is_refused_unless_it_is_free_or_an_earlier_export(
     area: Path, tmp_path: Path
 ) -> None:
+    """Only new folders and earlier exports (with --overwrite) are accepted as target."""
     target = tmp_path / "out"
     target.mkdir()
     assert run("tum", target, area).exit_code == 0
@@ -500,6 +505,7 @@ def test_a_target_is_refused_unless_it_is_free_or_an_earlier_export(
 
 
 def test_what_can_not_be_exported_is_said(area: Path, tmp_path: Path) -> None:
+    """Unknown sequences, tracked frames in NVM, and a missing area are refused."""
     done = run("tum", tmp_path / "out", area, "--sequence", "../../etc")
     assert "there is no sequence '../../etc'; the area has: again, flight1" in done.output
     done = run("nvm", tmp_path / "out", area, "--all-frames")
@@ -510,7 +516,7 @@ def test_what_can_not_be_exported_is_said(area: Path, tmp_path: Path) -> None:
 
 
 def test_an_area_without_poses_is_refused(area: Path, tmp_path: Path) -> None:
-    """An evaluation sequence of which every frame failed."""
+    """An evaluation sequence without any registered frame is refused."""
     root = tmp_path / "area"
     shutil.copytree(area, root)
     path = root / EVALUATION / "again" / POSES
@@ -524,7 +530,7 @@ def test_an_area_without_poses_is_refused(area: Path, tmp_path: Path) -> None:
 
 
 def one_frame(reference: HeightReference, center: np.ndarray) -> ExportedFrames:
-    """A camera that looks north, level."""
+    """Return one level camera that looks north."""
     labels = Labels(
         names=np.array(["a&b/0.jpg"]),
         sequences=np.array(["a&b"]),
@@ -565,7 +571,7 @@ def one_frame(reference: HeightReference, center: np.ndarray) -> ExportedFrames:
 def test_heights_stand_where_their_reference_is_that_of_the_format(
     reference: HeightReference, mode: str, in_geojson: bool, tmp_path: Path
 ) -> None:
-    """GeoJSON's third coordinate counts from the ellipsoid, KML's absolute altitude from sea level."""
+    """Heights become coordinates or absolute altitudes only if the reference fits the format."""
     frames = one_frame(reference, np.array([0, 0, 12.5]))
     write_geojson(tmp_path, frames)
     (feature,) = json.loads((tmp_path / "frames.geojson").read_text())["features"]
@@ -582,7 +588,7 @@ def test_heights_stand_where_their_reference_is_that_of_the_format(
 
 
 def test_times_stay_apart_and_in_order() -> None:
-    """Photos of one second, or without times, follow by a microsecond."""
+    """Equal timestamps are spaced by a microsecond in their order."""
     assert timestamps_us(np.array([0, 0.5, 0.5, 0.5, 0.500001, 2])) == [
         *(0, 500000, 500001, 500002, 500003, 2000000)
     ]
@@ -594,7 +600,7 @@ def option_rows() -> Iterator[tuple[str, str]]:
 
 
 def test_every_option_and_format_is_documented() -> None:
-    """docs/exports.md has a row for each option and format, and none besides."""
+    """docs/exports.md has a row for each option and format, and no others."""
     command = main.commands["export"]
     flags = {p.opts[-1] for p in command.params if isinstance(p, click.Option)}
     assert {flag for flag, _ in option_rows()} == flags

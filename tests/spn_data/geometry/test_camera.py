@@ -1,4 +1,4 @@
-"""Cameras, with pycolmap and OpenCV as independent oracles."""
+"""Tests of cameras, with pycolmap and OpenCV as independent references."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _points() -> np.ndarray:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_projection_agrees_with_pycolmap(model):
-    """Parameter order, distortion and pixel origin are those of COLMAP."""
+    """Projection equals pycolmap's: parameter order, distortion and pixel origin."""
     theirs = pycolmap.Camera(model=model, width=1280, height=720, params=PARAMS[model])
     expected = np.array([theirs.img_from_cam(p) for p in _points()])
     assert _camera(model).project(_points()) == pytest.approx(expected, abs=1e-9)
@@ -43,7 +43,7 @@ def test_projection_agrees_with_pycolmap(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_projection_agrees_with_opencv_half_a_pixel_off(model):
-    """OpenCV's upper-left pixel has its centre at (0, 0), COLMAP's at (0.5, 0.5)."""
+    """Projection equals OpenCV's shifted by 0.5 px, the difference of the pixel origins."""
     camera = _camera(model)
     zero = np.zeros(3)
     matrix = OPENCV_FROM_COLMAP @ camera.matrix
@@ -56,7 +56,7 @@ def test_projection_agrees_with_opencv_half_a_pixel_off(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_unprojection_undoes_projection(model):
-    """Projected rays return to their pixels within 1e-6 px, all over the image."""
+    """Unprojecting and projecting returns the pixels within 1e-6 px over the whole image."""
     camera = _camera(model)
     x, y = np.meshgrid(np.linspace(0.5, 1279.5, 21), np.linspace(0.5, 719.5, 13))
     pixels = np.column_stack([x.ravel(), y.ravel()])
@@ -65,14 +65,14 @@ def test_unprojection_undoes_projection(model):
 
 
 def test_points_behind_the_camera_have_no_pixel():
-    """They are NaN, not mirrored pixels."""
+    """Points behind the camera project to NaN, not to mirrored pixels."""
     pixels = _camera("OPENCV").project(np.array([[0.0, 0, 1], [0, 0, -1], [1, 1, 0]]))
     assert np.isfinite(pixels[0]).all()
     assert np.isnan(pixels[1:]).all()
 
 
 def test_the_field_of_view_is_that_of_the_undistorted_image():
-    """72 degrees over 1280 pixels is a focal length of 880.88 pixels, centred, with any distortion."""
+    """72 degrees over 1280 px gives a focal length of 880.88 px with any distortion."""
     for distortion in ((), (-0.05,), (-0.05, 0.015), (-0.05, 0.015, 0.001, 0.001)):
         camera = Camera.from_horizontal_fov(1280, 720, 72.0, distortion)
         assert camera.focal_px == pytest.approx((880.884, 880.884), abs=1e-3)
@@ -81,7 +81,7 @@ def test_the_field_of_view_is_that_of_the_undistorted_image():
 
 
 def test_a_camera_of_a_scaled_image_sees_the_same_rays():
-    """At half the size, pixel coordinates are halved and distortion terms are unchanged."""
+    """At half the image size, projected pixel coordinates are halved."""
     camera = _camera("OPENCV")
     half = camera.scaled(640, 360)
     assert half.project(_points()) == pytest.approx(camera.project(_points()) / 2, abs=1e-9)
@@ -89,7 +89,7 @@ def test_a_camera_of_a_scaled_image_sees_the_same_rays():
 
 
 def test_the_number_of_parameters_is_checked():
-    """An unknown model or a missing parameter is a programming error."""
+    """An unknown model or a missing parameter raises ValueError."""
     with pytest.raises(ValueError, match="FISHEYE"):
         Camera("FISHEYE", 10, 10, np.zeros(4))
     with pytest.raises(ValueError, match="takes 8 parameters, got 7"):

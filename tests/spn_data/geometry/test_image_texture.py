@@ -1,4 +1,4 @@
-"""Texture of images: what a scene shows, and what noise, fog and a cover leave of it."""
+"""Tests of image texture: a scene against noise, fog and a covered lens."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spn_data.geometry.image_texture import MIN_DETAIL_SHARE, detail_share, miss
 
 
 def scene(width: int = 960, height: int = 720) -> np.ndarray:
-    """Random grey steps at several scales, as edges of a real scene."""
+    """Return random grey steps at several scales, similar to the edges of a real scene."""
     rng = np.random.default_rng(1)
     image = np.zeros((height, width), np.float32)
     for cells in (6, 12, 24, 48):
@@ -22,13 +22,13 @@ def scene(width: int = 960, height: int = 720) -> np.ndarray:
 
 @pytest.mark.parametrize("width", [80, 320, 960, 2000])
 def test_a_scene_has_texture_at_every_size(width):
-    """The measure does not depend on the size of the image."""
+    """A scene has texture at any image size."""
     assert detail_share(scene(width, width * 3 // 4)) > 4 * MIN_DETAIL_SHARE
     assert missing_texture(scene(width, width * 3 // 4)) == ""
 
 
 def test_half_of_a_scene_is_enough():
-    """A cover over half the image leaves texture, one over 95 % does not, nor does its edge count."""
+    """A cover over half the image leaves enough texture; one over 95 % does not."""
     image = scene()
     image[:, :480] = 0
     assert missing_texture(image) == ""
@@ -49,6 +49,6 @@ def test_half_of_a_scene_is_enough():
     ],
 )
 def test_what_shows_no_scene_has_a_reason(spoil, told):
-    """Black with the noise of a sensor, white, fog, defocus and a gradient."""
+    """Black with sensor noise, white, fog, defocus and a gradient are each named as the reason."""
     image = np.clip(spoil(scene().astype(np.float32)), 0, 255).astype(np.uint8)
     assert told in missing_texture(image)

@@ -1,4 +1,4 @@
-"""Poses, quaternions and similarities, with pycolmap as the independent oracle."""
+"""Tests of poses, quaternions and similarities, with pycolmap as independent reference."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def _random_quats(n: int, seed: int = 0) -> np.ndarray:
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
-    """(cos 45, 0, 0, sin 45) rotates x into y."""
+    """The quaternion (cos 45, 0, 0, sin 45) rotates x into y."""
     half = np.sqrt(0.5)
     rotation = rotations_from_quats(np.array([half, 0, 0, half]))
     assert rotation @ [1, 0, 0] == pytest.approx([0, 1, 0])
 
 
 def test_rotation_matrices_agree_with_pycolmap():
-    """pycolmap's quaternions are scalar-last; the matrices are the same."""
+    """Rotation matrices equal those of pycolmap, whose quaternions are scalar-last."""
     for quat in _random_quats(20):
         theirs = pycolmap.Rotation3d(np.roll(quat, -1)).matrix()
         assert rotations_from_quats(quat) == pytest.approx(theirs, abs=1e-14)
 
 
 def test_quaternions_survive_the_way_through_matrices_and_vectors():
-    """Round trips are exact, also at half a turn, where the usual formulas divide by zero, and at zero."""
+    """Quaternions survive conversion to matrices and vectors, also at zero and half a turn."""
     special = [
         [0, 1, 0, 0],
         [0, 0, 1, 0],
@@ -58,7 +58,7 @@ def test_quaternions_survive_the_way_through_matrices_and_vectors():
 
 
 def test_a_quaternion_and_its_negative_are_one_rotation():
-    """canonical_quats makes them equal, with w >= 0; length zero is an error."""
+    """canonical_quats maps q and -q to the same unit quaternion with w >= 0, and refuses zero."""
     quats = _random_quats(50)
     assert canonical_quats(-3 * quats) == pytest.approx(quats)
     assert (quats[:, 0] >= 0).all()
@@ -68,7 +68,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
 
 
 def test_small_rotation_errors_are_exact():
-    """Errors of a millionth of a degree are measured, which arccos cannot do; q and -q are equal."""
+    """Rotation errors of 1e-6 degrees are measured accurately, which arccos cannot do."""
     quats = _random_quats(20)
     for angle_deg in (1e-6, 1e-3, 1.0, 90.0, 179.999):
         turn = rotations_from_vectors(np.tile([0, np.deg2rad(angle_deg), 0], (20, 1)))
@@ -81,15 +81,15 @@ def test_small_rotation_errors_are_exact():
     ("angles", "forward", "right"),
     [
         ((0, 0, 0), (0, 1, 0), (1, 0, 0)),  # north, level
-        ((90, 0, 0), (1, 0, 0), (0, -1, 0)),  # east: the right side is south
+        ((90, 0, 0), (1, 0, 0), (0, -1, 0)),  # east: right is south
         ((0, -90, 0), (0, 0, -1), (1, 0, 0)),  # down, image top to the north
         ((90, -90, 0), (0, 0, -1), (0, -1, 0)),  # down, image top to the east
-        ((0, 0, 90), (0, 1, 0), (0, 0, -1)),  # the right side goes down
+        ((0, 0, 90), (0, 1, 0), (0, 0, -1)),  # rolled: right is down
         ((0, 45, 0), (0, np.sqrt(0.5), np.sqrt(0.5)), (1, 0, 0)),
     ],
 )
 def test_heading_pitch_roll_point_where_the_gimbal_says(angles, forward, right):
-    """Rows of cam_from_world are the camera's right, down and forward in East-North-Up."""
+    """Rotations from angles have the expected right and forward axes in East-North-Up."""
     rotation = rotations_from_angles(np.array(angles, dtype=float))
     assert rotation[2] == pytest.approx(forward, abs=1e-12)
     assert rotation[0] == pytest.approx(right, abs=1e-12)
@@ -97,7 +97,7 @@ def test_heading_pitch_roll_point_where_the_gimbal_says(angles, forward, right):
 
 
 def test_angles_survive_the_way_through_rotations():
-    """All three angles are recovered except straight down: there roll is 0 and heading is the image's top."""
+    """All angles are recovered; looking straight up or down, roll is 0 and heading the image's top."""
     rng = np.random.default_rng(1)
     angles = np.column_stack(
         [rng.uniform(0, 360, 100), rng.uniform(-89, 89, 100), rng.uniform(-179, 179, 100)]
@@ -108,7 +108,7 @@ def test_angles_survive_the_way_through_rotations():
 
 
 def test_poses_agree_with_pycolmap_s_projection_center():
-    """Conversion from and to COLMAP's cam_from_world agrees; the centre is -R^T t."""
+    """Conversion from and to COLMAP's cam_from_world agrees with pycolmap; the centre is -R^T t."""
     rng = np.random.default_rng(2)
     quats_xyzw = np.roll(_random_quats(10, 3), -1, axis=1)
     translations = rng.standard_normal((10, 3))
@@ -123,7 +123,7 @@ def test_poses_agree_with_pycolmap_s_projection_center():
 
 
 def test_points_in_camera_axes_agree_with_pycolmap():
-    """With one pose for all points, with one pose per point, and for depths alone."""
+    """Camera coordinates and depths equal pycolmap's, with one pose or one pose per point."""
     rng = np.random.default_rng(5)
     poses = Poses(rng.standard_normal((4, 3)), _random_quats(4, 6))
     points, index = rng.standard_normal((9, 3)), rng.integers(0, 4, 9)
@@ -140,7 +140,7 @@ def test_points_in_camera_axes_agree_with_pycolmap():
 
 
 def test_poses_can_be_picked_and_walked():
-    """Poses have a length and support masks, slices and iteration."""
+    """Poses support masks, slices and iteration."""
     poses = Poses(np.arange(12.0).reshape(4, 3), _random_quats(4))
     assert len(poses[np.array([True, False, True, False])]) == 2
     assert poses[1:3].centers[0].tolist() == [3, 4, 5]
@@ -148,7 +148,7 @@ def test_poses_can_be_picked_and_walked():
 
 
 def test_a_similarity_agrees_with_pycolmap_s_estimate():
-    """Umeyama's fit, on noisy points, is the same transform as pycolmap's."""
+    """Umeyama's fit to noisy points equals pycolmap's estimate."""
     rng = np.random.default_rng(4)
     source = rng.standard_normal((30, 3))
     true = Similarity(
@@ -165,14 +165,14 @@ def test_a_similarity_agrees_with_pycolmap_s_estimate():
 
 
 def test_a_similarity_never_mirrors():
-    """Points fitted to their mirror image give a proper rotation."""
+    """Fitting points to their mirror image gives a proper rotation."""
     source = np.random.default_rng(5).standard_normal((20, 3))
     fit = Similarity.fit(source, source * [1, 1, -1])
     assert np.linalg.det(fit.rotation) == pytest.approx(1)
 
 
 def test_a_plane_is_enough_for_a_similarity_and_a_line_is_not():
-    """Coplanar points suffice; for collinear, coincident or only two points it is undetermined."""
+    """Coplanar points determine a similarity; collinear, coincident or two points do not."""
     rng = np.random.default_rng(6)
     flat = np.column_stack([rng.standard_normal((10, 2)), np.zeros(10)])
     true = Similarity(3.0, rotations_from_vectors(np.array([1.0, 2.0, 0.5])), np.ones(3))
@@ -186,7 +186,7 @@ def test_a_plane_is_enough_for_a_similarity_and_a_line_is_not():
 
 
 def test_weights_of_a_similarity_count_points_as_often():
-    """A weight of two counts a point twice, a weight of zero ignores it."""
+    """A weight of two equals a repeated point, and a weight of zero an omitted one."""
     rng = np.random.default_rng(7)
     source, target = rng.standard_normal((6, 3)), rng.standard_normal((6, 3))
     weighted = Similarity.fit(source, target, np.array([2.0, 1, 1, 1, 1, 0]))
@@ -217,7 +217,7 @@ def test_similarities_compose_and_invert():
 
 
 def test_a_moved_camera_still_sees_its_points_at_the_same_pixels():
-    """Camera coordinates scale with the similarity, so projections do not change."""
+    """A similarity scales camera coordinates, so projections do not change."""
     b_from_a = Similarity(
         3.0, rotations_from_vectors(np.array([0.4, -1.0, 0.3])), np.array([9.0, 2, 3])
     )
@@ -230,7 +230,7 @@ def test_a_moved_camera_still_sees_its_points_at_the_same_pixels():
 
 
 def test_poses_are_put_together_and_at_rows_and_the_rest_is_unknown():
-    """Unknown poses are NaN, never the identity; no parts give no poses."""
+    """Rows without a pose are NaN, never the identity; concatenating nothing gives no poses."""
     some = Poses(np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([[1.0, 0, 0, 0], [0, 1, 0, 0]]))
     both = Poses.concatenate([some[1:], some])
     assert both.centers[:, 0].tolist() == [4, 1, 4]

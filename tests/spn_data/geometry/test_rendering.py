@@ -1,4 +1,4 @@
-"""Rendered images agree with projection: no shift, no empty border, no aliasing."""
+"""Tests that rendered images agree with projection: no shift, empty border or aliasing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SMALL = RenderingOptions()
 
 
 def rays_of(target: Camera, step: float = 1.0) -> np.ndarray:
-    """Return rays (N, 3) of a pinhole's border."""
+    """Return the rays (N, 3) of a pinhole camera's image border."""
     x, y = np.arange(0, target.width + step, step), np.arange(0, target.height + step, step)
     edge = [
         *((a, b) for a in x for b in (0, target.height)),
@@ -52,7 +52,7 @@ def shift_px(found: np.ndarray, wanted: np.ndarray, block: int = 90) -> np.ndarr
 
 @pytest.mark.parametrize("others", [[], [SLANTED]])
 def test_the_canonical_camera_has_no_empty_border_and_is_as_wide_as_can_be(others):
-    """Its border is inside every mapping image; with a focal length 0.1 % shorter it would not be."""
+    """The canonical border is inside every mapping image, but not with a 0.1 % shorter focal length."""
     cameras = [MAPPING, *others]
     target = canonical_camera(cameras, SMALL)
     assert (target.width, target.height) == (480, 270)
@@ -70,7 +70,7 @@ def test_the_canonical_camera_has_no_empty_border_and_is_as_wide_as_can_be(other
 
 
 def test_a_pinhole_keeps_its_whole_view():
-    """A centred pinhole is not cropped: the canonical focal length is its own, scaled down."""
+    """A centred pinhole is not cropped: its focal length is only scaled."""
     camera = Camera.from_horizontal_fov(1280, 720, 72.0)
     target = canonical_camera([camera], RenderingOptions(width_px=320))
     assert (target.width, target.height) == (320, 180)
@@ -78,7 +78,7 @@ def test_a_pinhole_keeps_its_whole_view():
 
 
 def test_the_undistorted_camera_keeps_the_images_size():
-    """A lens's own pinhole has its size, square pixels and a centred principal point."""
+    """The undistorted camera keeps the image size, with a centred principal point."""
     target = undistorted_camera(SLANTED)
     assert (target.width, target.height) == (1280, 720)
     assert target.params[1:].tolist() == [640.0, 360.0]
@@ -86,14 +86,14 @@ def test_the_undistorted_camera_keeps_the_images_size():
 
 
 def test_an_axis_outside_the_image_is_refused():
-    """No view can be centred on the optical axis of a crop that does not contain it."""
+    """A camera whose principal point is outside the image is refused."""
     camera = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, -20.0, 240.0]))
     with pytest.raises(GeometryError, match="principal point is outside"):
         canonical_camera([camera], SMALL)
 
 
 def test_a_lens_model_that_folds_back_is_not_followed_past_the_fold():
-    """Strong barrel distortion maps far rays back into the image; they are invalid and limit the view."""
+    """Rays that strong barrel distortion folds back into the image are invalid and limit the view."""
     camera = Camera("RADIAL", 640, 480, np.array([300.0, 320.0, 240.0, -0.35, 0.0]))
     fold = np.sqrt(1 / (3 * 0.35))
     target = canonical_camera([camera], RenderingOptions(width_px=320))
@@ -113,7 +113,7 @@ def place():
 
 @pytest.mark.parametrize("camera", [MAPPING, SLANTED], ids=["mapping", "slanted"])
 def test_rendering_agrees_with_the_simulators_projection(place, camera):
-    """A simulated image, undistorted and reduced, is aligned with the same view rendered by the pinhole.
+    """An undistorted simulated image is aligned with the same view simulated by the pinhole.
 
     The tolerance is 0.02 px everywhere; the simulator has no undistortion code. An error of half a source
     pixel would shift it by 0.19 px.
@@ -132,7 +132,7 @@ def test_rendering_agrees_with_the_simulators_projection(place, camera):
 
 
 def test_what_is_finer_than_a_pixel_is_averaged_away():
-    """Stripes of 1.25 output pixels keep 30 % of their contrast; nearest-pixel sampling would keep it all."""
+    """Stripes of 1.25 output pixels keep under 30 % contrast; nearest sampling would keep it all."""
     camera = Camera.from_horizontal_fov(1280, 720, 72.0)
     target = canonical_camera([camera], SMALL)
     x, y = np.meshgrid(np.arange(1280) + 0.5, np.arange(720) + 0.5)
@@ -150,7 +150,7 @@ def test_what_is_finer_than_a_pixel_is_averaged_away():
 
 
 def test_a_narrower_camera_leaves_invalid_pixels_black():
-    """The mask is true exactly if the camera projects the pixel's whole area into the image."""
+    """Pixels are valid only if their whole area projects into the narrower camera's image."""
     target = canonical_camera([MAPPING], SMALL)
     renderer = PinholeRenderer(NARROW, target)
     assert 0.1 < renderer.valid.mean() < 0.9
@@ -168,7 +168,7 @@ def test_a_narrower_camera_leaves_invalid_pixels_black():
 
 
 def test_a_users_mask_is_rendered_with_its_image():
-    """Pixels that see anything masked out are not usable."""
+    """Output pixels that see any masked input pixel are unusable."""
     target = canonical_camera([MAPPING], SMALL)
     usable = np.ones((720, 1280), bool)
     usable[:, 900:] = False
@@ -182,7 +182,7 @@ def test_a_users_mask_is_rendered_with_its_image():
 
 @pytest.mark.parametrize("camera", [MAPPING, NARROW], ids=["mapping", "narrow"])
 def test_points_move_with_the_image(camera):
-    """Mapped pixels agree with the pinhole's projection to 1e-6 px; only those in view are kept."""
+    """Mapped pixels equal the pinhole's projection within 1e-6 px; those out of view are dropped."""
     target = canonical_camera([MAPPING], SMALL)
     rng = np.random.default_rng(3)
     points = np.column_stack(
@@ -199,12 +199,12 @@ def test_points_move_with_the_image(camera):
     assert not (seen & ~in_view).any()
     column, row = moved[seen].astype(int).T
     assert renderer.valid[row, column].all()
-    lost = in_view & ~seen  # on a pixel that is only partly in the narrow camera's view
+    lost = in_view & ~seen  # on pixels only partly in the narrow camera's view
     assert lost.sum() == 0 if camera is MAPPING else 0 < lost.mean() < 0.02
 
 
 def test_no_points_move_to_no_points():
-    """Frames without points need no special case."""
+    """Mapping an empty set of pixels gives empty arrays."""
     moved, seen = PinholeRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).map_pixels(
         np.zeros((0, 2))
     )
@@ -213,7 +213,7 @@ def test_no_points_move_to_no_points():
 
 
 def test_an_image_of_another_size_is_our_mistake():
-    """An image of another size than the camera's is an error."""
+    """An image whose size differs from the camera's raises ValueError."""
     with pytest.raises(ValueError, match="960x540, the camera is for 1280x720"):
         PinholeRenderer(MAPPING, canonical_camera([MAPPING], SMALL)).render(
             np.zeros((540, 960, 3), np.uint8)

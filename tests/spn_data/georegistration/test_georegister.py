@@ -1,4 +1,4 @@
-"""Georegistration of simulated flights with exact truth."""
+"""Tests of georegistration on simulated flights with exact ground truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STRAIGHT = replace(STANDARD, mapping_paths=MappingPaths.STRAIGHT)
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One draw of errors: what the program gets, and the truth."""
+    """One draw of errors: the inputs of georegistration and the truth."""
 
     model: Poses
     telemetry: Telemetry
@@ -54,7 +54,7 @@ class Draw:
 
 
 def draw(options: SimulateOptions = STANDARD, *, sigma_m: dict[str, float] | None = None) -> Draw:
-    """Every eighth frame of the mapping flights; the model is the truth, 1 cm and 0.03 degrees off."""
+    """Simulate every eighth mapping frame, with model poses off by 1 cm and 0.03 degrees of noise."""
     rng = np.random.default_rng([options.seed, 5])
     tracks, sequence, times, centers, rotations, bursts = {}, [], [], [], [], []
     for name, path in simulate_paths(replace(options, seed=STANDARD.seed)).items():
@@ -109,7 +109,7 @@ def standard_fit(standard: Draw) -> GeoFit:
 
 
 def test_gnss_bias_limits_the_position_and_the_gimbal_the_tilt(standard, standard_fit):
-    """Position is off by the mean GNSS bias (decimetres, not zero), tilt by less than a tenth of a degree."""
+    """Position is off by the mean GNSS bias (decimetres), tilt by less than 0.1 degrees."""
     errors = standard.errors(standard_fit)
     assert 0.05 < errors.position_m < 2.0
     assert errors.tilt_deg < 0.1
@@ -120,7 +120,7 @@ def test_gnss_bias_limits_the_position_and_the_gimbal_the_tilt(standard, standar
 
 
 def test_noise_levels_are_found_from_the_residuals(standard_fit):
-    """The drifting bias of 0.7/1.1 m and the white noise of 0.08 m are estimated separately, not assumed."""
+    """The drifting bias (0.7/1.1 m) and white noise (0.08 m) are estimated from the residuals."""
     bias, white = standard_fit.noise_m["horizontal"]
     assert 0.45 < bias < 1.1
     assert 0.05 < white < 0.13
@@ -130,7 +130,7 @@ def test_noise_levels_are_found_from_the_residuals(standard_fit):
 
 
 def test_frames_in_bursts_are_outliers_and_no_others(standard, standard_fit):
-    """Multipath of 12 m is flagged at all of its frames; false alarms stay below 2 %."""
+    """All frames with 12 m of multipath are outliers, with less than 2 % false alarms."""
     assert standard.is_burst.sum() >= 3
     assert standard_fit.outlier[standard.is_burst].all()
     assert standard_fit.outlier[~standard.is_burst].mean() < 0.02
@@ -138,7 +138,7 @@ def test_frames_in_bursts_are_outliers_and_no_others(standard, standard_fit):
 
 
 def test_the_gauge_of_the_model_does_not_matter(standard, standard_fit):
-    """Any similarity of the model gives the same world poses to 1e-9."""
+    """Any gauge of the model gives the same world poses within 1e-9."""
     turn = rotations_from_vectors(np.array([2.0, 0.3, -1.0]))
     other_from_model = Similarity(23.0, turn, np.array([500.0, -80.0, 9.0]))
     moved = replace(standard, model=other_from_model.apply_to_poses(standard.model))
@@ -153,16 +153,16 @@ def test_the_gauge_of_the_model_does_not_matter(standard, standard_fit):
     ("lat", "lon"), [(-33.4, -70.6), (64.1, -21.9), (-17.5, 179.9999), (0.0, 0.0)]
 )
 def test_any_place_on_earth_gives_the_same_fit(standard, standard_fit, lat, lon):
-    """South, west, the antimeridian and the equator: the same flight has the same errors."""
+    """The errors are the same in the south, in the west, at the antimeridian and on the equator."""
     there = draw(replace(STANDARD, origin=GeoOrigin(lat, lon, 163.2)))
     errors, expected = there.errors(there.fit()), standard.errors(standard_fit)
-    # Rounding of latitude and longitude to 6 decimals falls differently in each place.
+    # Rounding latitude and longitude to 6 decimals has a different effect in each place.
     assert errors.position_m == pytest.approx(expected.position_m, abs=0.1)
     assert errors.heading_deg == pytest.approx(expected.heading_deg, abs=0.15)
 
 
 def test_a_take_off_twelve_metres_lower_becomes_the_flight_s_offset(standard):
-    """The second flight's heights start 12 m lower: its offset is found, shape and zero are unchanged."""
+    """A second take-off 12 m lower is estimated as that flight's vertical offset."""
     second = np.array(standard.sequence) == "flight2"
     heights = standard.telemetry.rel_alt_m + np.where(second, 12.0, 0.0)
     fit = replace(standard, telemetry=replace(standard.telemetry, rel_alt_m=heights)).fit()
@@ -173,13 +173,13 @@ def test_a_take_off_twelve_metres_lower_becomes_the_flight_s_offset(standard):
 
 
 def test_take_offs_that_differ_within_the_errors_pass_as_one(standard, standard_fit):
-    """Two flights from one place: offsets stay within the 0.3 m allowed between equal take-offs."""
+    """Flights from one take-off get vertical offsets below 0.6 m and no note."""
     assert abs(standard_fit.vertical_offsets_m["flight2"]) < 0.6
     assert not any("its heights are offset by" in note for note in standard_fit.notes)
 
 
 def test_a_straight_flight_needs_gimbal_angles():
-    """Without them the roll about the line is refused with the remedy; with them tilt is within 0.7 deg."""
+    """A straight flight is refused without gimbal angles; with them, tilt is within 0.7 degrees."""
     with pytest.raises(GeometryError, match=r"cross leg of at least 20 m, or give gimbal angles"):
         draw(replace(STRAIGHT, gimbal_angles=False)).fit()
     straight = draw(STRAIGHT)
@@ -189,7 +189,7 @@ def test_a_straight_flight_needs_gimbal_angles():
 
 
 def test_without_gimbal_angles_heights_and_level_cameras_give_the_vertical():
-    """A flight around the courtyard still has its tilt within 2 degrees, and says so."""
+    """Without gimbal angles, tilt is within 2 degrees and its uncertainty reflects that."""
     without = draw(replace(STANDARD, gimbal_angles=False))
     fit = without.fit()
     assert 0.02 < without.errors(fit).tilt_deg < 2.0
@@ -199,7 +199,7 @@ def test_without_gimbal_angles_heights_and_level_cameras_give_the_vertical():
 
 
 def test_a_hovering_drone_is_refused(standard):
-    """Fixes that spread no more than their noise determine neither scale nor heading."""
+    """Fixes that spread no more than their noise are refused."""
     hover = replace(standard.telemetry, lat_lon_deg=standard.telemetry.lat_lon_deg.copy())
     rng = np.random.default_rng(1)
     hover.lat_lon_deg[:] = hover.lat_lon_deg[0] + 3e-6 * rng.standard_normal((len(hover), 2))
@@ -209,7 +209,7 @@ def test_a_hovering_drone_is_refused(standard):
 
 
 def test_too_few_fixes_are_refused(standard):
-    """Two frames with a fix, and none, are refused with their count."""
+    """Two fixes, or none, are refused with their count."""
     for count, message in ((2, "2 frames have a fix, 6 are needed"), (0, "none of 169 frames")):
         lat_lon = standard.telemetry.lat_lon_deg.copy()
         lat_lon[count:] = np.nan
@@ -218,7 +218,7 @@ def test_too_few_fixes_are_refused(standard):
 
 
 def test_telemetry_of_another_flight_is_refused(standard):
-    """Fixes whose order in time has nothing to do with the model agree with no similarity."""
+    """Fixes shuffled in time fit no similarity and are refused."""
     back = np.random.default_rng(0).permutation(len(standard.time_s))
     shuffled = replace(standard.telemetry.select(back), time_s=standard.telemetry.time_s)
     with pytest.raises(GeometryError, match="telemetry of another"):
@@ -227,7 +227,7 @@ def test_telemetry_of_another_flight_is_refused(standard):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_two_flights_with_each_other_s_telemetry_are_refused_for_it(seed):
-    """Flights of the same length, so that only angles and positions reveal the swap."""
+    """Swapped telemetry of two flights is refused, even if the flights have equal length."""
     drawn = draw(replace(STANDARD, seed=seed))
     first = np.array(drawn.sequence) == "flight1"
     n = min(first.sum(), (~first).sum())
@@ -239,6 +239,7 @@ def test_two_flights_with_each_other_s_telemetry_are_refused_for_it(seed):
 
 
 def test_a_gimbal_that_was_never_written_does_not_stop_the_fit(standard):
+    """Gimbal angles that are all zero are ignored with a note."""
     frozen = replace(standard.telemetry, gimbal_deg=np.zeros_like(standard.telemetry.gimbal_deg))
     fit = replace(standard, telemetry=frozen).fit()
     assert "gimbal" not in fit.observations
@@ -246,7 +247,7 @@ def test_a_gimbal_that_was_never_written_does_not_stop_the_fit(standard):
 
 
 def test_frames_without_telemetry_change_nothing(standard):
-    """Rows of NaN take no part, and have no residual."""
+    """Frames without telemetry do not affect the fit and have no residual."""
     gone = np.zeros(len(standard.time_s), dtype=bool)
     gone[::3] = True
     columns = ("lat_lon_deg", "rel_alt_m", "abs_alt_m", "gimbal_deg", "sigma_m")
@@ -267,7 +268,7 @@ def test_frames_without_telemetry_change_nothing(standard):
 
 
 def test_a_flight_with_rtk_leads_one_without():
-    """One flight of 3 cm and one of a metre: the result and its uncertainty are those of the better one."""
+    """With one RTK flight of 3 cm, position error and uncertainty are below 5 cm."""
     mixed = draw(STANDARD, sigma_m={"flight1": 0.03, "flight2": 1.0})
     exact = draw(
         replace(STANDARD, gnss=GnssOptions.rtk()), sigma_m={"flight1": 0.03, "flight2": 0.03}
@@ -283,7 +284,7 @@ def test_a_flight_with_rtk_leads_one_without():
 
 
 def test_rtk_that_the_source_does_not_state_shows_in_the_residuals():
-    """With 3 cm noise and an assumed sigma of 1 m, the fit is still accurate to 5 cm."""
+    """RTK accuracy that the source does not state is estimated: the fit is accurate to 5 cm."""
     exact = draw(replace(STANDARD, gnss=GnssOptions.rtk()))
     fit = exact.fit()
     assert exact.errors(fit).position_m < 0.05
@@ -291,7 +292,7 @@ def test_rtk_that_the_source_does_not_state_shows_in_the_residuals():
 
 
 def test_fixes_left_out_in_blocks_fit_worse_than_those_used(standard_fit):
-    """Correlated errors make residuals look too small; held-out blocks of a minute reveal it."""
+    """Held-out blocks of a minute reveal that correlated errors make residuals too small."""
     held_out, summary = standard_fit.held_out_blocks, standard_fit.summary
     assert held_out.folds == 3
     assert held_out.horizontal_rmse_m > 1.1 * summary.horizontal_rmse_m
@@ -299,7 +300,7 @@ def test_fixes_left_out_in_blocks_fit_worse_than_those_used(standard_fit):
 
 
 def test_gimbal_angles_that_move_otherwise_than_the_camera_are_refused_by_name(standard):
-    """The fit succeeds without the gimbal angles of both flights."""
+    """Wrong gimbal angles are refused with the flight's name; without gimbal the fit succeeds."""
     gimbal = standard.telemetry.gimbal_deg.copy()
     second = np.array(standard.sequence) == "flight2"
     gimbal[second, 1:] = np.random.default_rng(2).uniform(-60, 60, (second.sum(), 2))
@@ -310,7 +311,7 @@ def test_gimbal_angles_that_move_otherwise_than_the_camera_are_refused_by_name(s
 
 
 def test_the_zero_of_heights_is_what_was_said_of_it(standard, standard_fit):
-    """Take-off by default; its height where given; absolute heights keep their reference, or have none."""
+    """The vertical zero is the take-off, its given height, or that of absolute heights (unknown)."""
     assert standard_fit.height_reference is HeightReference.TAKEOFF
     assert standard_fit.origin.alt_m == 0.0
     given = standard.fit(
@@ -324,12 +325,12 @@ def test_the_zero_of_heights_is_what_was_said_of_it(standard, standard_fit):
     assert unknown.height_reference is HeightReference.UNKNOWN
     assert any("vertical zero is unknown" in note for note in unknown.notes)
     up_m = unknown.world_from_model.apply(standard.model.centers)[:, 2] + unknown.origin.alt_m
-    # abs_alt is 163.2 m less the geoid's 48.3 m above the courtyard's ground.
+    # abs_alt is offset from the courtyard's ground by 163.2 m minus the geoid height of 48.3 m.
     assert np.mean(up_m - standard.true.centers[:, 2]) == pytest.approx(163.2 - 48.3, abs=3.0)
 
 
 def test_without_heights_everything_but_the_height_is_known(standard):
-    """Fixes without heights and gimbal angles: mean camera height 0, its uncertainty infinite."""
+    """Without heights, the mean camera height is 0 with infinite vertical uncertainty."""
     unknown = np.full(len(standard.time_s), np.nan)
     flat = replace(standard.telemetry, rel_alt_m=unknown, abs_alt_m=unknown)
     fit = replace(standard, telemetry=flat).fit()
@@ -344,7 +345,7 @@ def test_without_heights_everything_but_the_height_is_known(standard):
 
 
 def test_an_area_that_is_extended_keeps_its_origin(standard, standard_fit):
-    """A given origin stays, and the world poses move by exactly the difference of origins."""
+    """A given origin is kept, and world poses shift by the difference of the origins."""
     origin = GeoOrigin(STANDARD.origin.lat_deg + 0.001, STANDARD.origin.lon_deg, 0.0)
     origin = replace(origin, height_reference=HeightReference.TAKEOFF)
     fit = standard.fit(GeoregisterOptions(origin=origin))
@@ -359,7 +360,7 @@ def test_an_area_that_is_extended_keeps_its_origin(standard, standard_fit):
 
 
 def test_json_holds_the_whole_fit(standard_fit):
-    """Written as JSON and read again, every number is the same; damage and newer versions are refused."""
+    """A fit survives the JSON round trip; damaged and newer versions are refused."""
     text = json.dumps(standard_fit.to_json(), allow_nan=False)
     again = GeoFit.from_json(json.loads(text))
     assert again.to_json() == standard_fit.to_json()
@@ -375,7 +376,7 @@ def test_json_holds_the_whole_fit(standard_fit):
 
 @pytest.mark.slow
 def test_the_stated_uncertainty_contains_the_truth():
-    """In 15 draws, 70 to 100 % of the errors are within two sigma (nominally 95 %)."""
+    """In 15 draws, at least 70 % of the errors are within two sigma (nominally 95 %)."""
     inside = []
     for seed in range(200, 215):
         one = draw(replace(STANDARD, seed=seed))

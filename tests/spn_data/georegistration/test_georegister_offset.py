@@ -1,4 +1,4 @@
-"""The offset between telemetry and video, on simulated flights."""
+"""Tests of the time offset between telemetry and video, on simulated flights."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _frames(path: FlightPath) -> tuple[Poses, np.ndarray]:
 
 @pytest.mark.parametrize("offset_s", [0.4, -2.3])
 def test_an_offset_is_found_within_a_tenth_of_a_second(path, offset_s):
-    """In six draws of GNSS and gimbal errors, each within 0.1 s and all but one within 3 sigma."""
+    """In six draws, the offset is within 0.1 s, and in all but one within 3 sigma."""
     model, time_s = _frames(path)
     errors, sigmas = [], []
     for seed in range(6):
@@ -55,7 +55,7 @@ def test_an_offset_is_found_within_a_tenth_of_a_second(path, offset_s):
 
 
 def test_the_offset_brings_telemetry_to_the_video_s_time(path):
-    """`Telemetry.shifted` by the offset puts the heading where the camera's is."""
+    """Telemetry shifted by the offset has the camera's heading at video time."""
     model, time_s = _frames(path)
     track = _track(path, 1, 1.5)
     found = estimate_time_offset(model, time_s, track)
@@ -63,12 +63,12 @@ def test_the_offset_brings_telemetry_to_the_video_s_time(path):
     true = path.motion.at(time_s)[1][:, 0]
     difference = (heading - true + 180) % 360 - 180
     known = np.isfinite(difference)
-    # What is left is the compass's constant error.
+    # Only the constant error of the compass remains.
     assert np.std(difference[known]) < 0.5
 
 
 def _even_flight(speed_m_s: float) -> tuple[Poses, np.ndarray, Telemetry]:
-    """East at a constant speed, looking north, with a drifting GNSS bias and white noise."""
+    """Simulate a flight east at constant speed, looking north, with GNSS drift and white noise."""
     rng = np.random.default_rng(4)
     time_s = np.arange(0, 60, 0.1)
     centers = np.column_stack([speed_m_s * time_s, 0 * time_s, 0 * time_s + 5])
@@ -93,7 +93,7 @@ def _even_flight(speed_m_s: float) -> tuple[Poses, np.ndarray, Telemetry]:
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 2.0])
 def test_a_hover_and_an_even_line_leave_the_offset_undetermined(speed_m_s):
-    """If a time shift changes nothing, no offset is returned and the reason is stated."""
+    """If a time shift has no effect, no offset is returned and the reason is given."""
     found = estimate_time_offset(*_even_flight(speed_m_s))
     assert found.offset_s is None
     assert found.applied_s == 0.0
@@ -101,14 +101,14 @@ def test_a_hover_and_an_even_line_leave_the_offset_undetermined(speed_m_s):
 
 
 def test_a_straight_line_without_gimbal_angles_leaves_it_undetermined():
-    """No rotation about the line, and no turn: undetermined rather than an error."""
+    """A straight flight without gimbal angles has no offset, but raises no error."""
     model, time_s, track = _even_flight(2.0)
     track = replace(track, gimbal_deg=np.full((len(track), 3), np.nan))
     assert estimate_time_offset(model, time_s, track).offset_s is None
 
 
 def test_too_little_telemetry_leaves_it_undetermined(path):
-    """No fix at all, or only five frames, leave the offset undetermined with a reason."""
+    """Without fixes, or with only five frames, no offset is returned."""
     model, time_s = _frames(path)
     track = _track(path, 1, 0.0)
     empty = replace(track, lat_lon_deg=np.full((len(track), 2), np.nan))
@@ -118,6 +118,6 @@ def test_too_little_telemetry_leaves_it_undetermined(path):
 
 
 def test_an_offset_is_described_with_its_sigma():
-    """One sentence, in seconds, with the sign of what is added to the telemetry's times."""
+    """The description gives the signed offset and its sigma in seconds."""
     sentence = TimeOffset(0.4, 0.02).describe("flight1")
     assert sentence == "flight1: time offset of the telemetry +0.40 s (sigma 0.02 s)."

@@ -1,4 +1,4 @@
-"""Residuals of georegistration and their derivatives."""
+"""Tests of the residuals of georegistration and their Jacobian."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROTATION = rotations_from_vectors(np.array([0.3, 1.2, -0.5]))
 
 
 def _problem(noise: float) -> tuple[Problem, FitState]:
-    """Nine cameras of two flights, one straight down and one on its side, and the state that fits them."""
+    """Return nine cameras of two flights (one nadir, one on its side) and the state that fits them."""
     rng = np.random.default_rng(0)
     n = 9
     flight = np.arange(n) % 2
@@ -58,18 +58,18 @@ def _problem(noise: float) -> tuple[Problem, FitState]:
 
 
 def test_the_true_state_leaves_no_residual():
-    """Fixes, gimbal angles and heading of the model itself: zero, also straight down and on the side."""
+    """The true state has zero residuals, also for a nadir camera and one on its side."""
     problem, state = _problem(0.0)
     residual = problem.residuals(state)
     for kind in Kind:
         if kind is not Kind.LEVEL:
             assert np.abs(residual[kind]).max() < 1e-9
-    # The camera on its side looks 5 degrees up: its right is 85 below the horizon (a sine, in degrees).
+    # The camera on its side looks 5 degrees up, so its right axis points 85 degrees below the horizon.
     assert residual[Kind.LEVEL][1] == pytest.approx(np.rad2deg(np.cos(np.deg2rad(5.0))))
 
 
 def test_the_jacobian_is_the_residuals_derivative():
-    """Every kind of observation against every parameter, by central differences."""
+    """The Jacobian equals central differences for all observations and parameters."""
     problem, state = _problem(1e-4)
     linear = problem.linearise(state, np.full(2, 1e3), np.ones(2))
     assert linear.jacobian.shape == (7 * 9, SHARED + 10)
@@ -82,12 +82,12 @@ def test_the_jacobian_is_the_residuals_derivative():
             problem.residuals(state.updated(-step)),
         )
         slope = ((after - before) / (2 * h))[problem.kind, problem.frame]
-        # To first order in the gimbal's disagreement, which the shake makes 1e-4.
+        # The Jacobian is exact to first order in the gimbal residuals, which are 1e-4 here.
         assert -slope == pytest.approx(linear.jacobian[:, k], abs=0.02), k
 
 
 def test_observations_that_are_missing_take_no_row():
-    """A frame without a height keeps its east and north; one left out keeps nothing but its place."""
+    """A missing height removes only that row, and an excluded frame all its rows."""
     problem, _ = _problem(0.0)
     enu = problem.fixes.enu_m.copy()
     enu[2, 2] = np.nan

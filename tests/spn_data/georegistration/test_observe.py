@@ -1,4 +1,4 @@
-"""Heights of fixes in the local frame of an origin."""
+"""Tests of the heights and accuracies of fixes in the local frame of an origin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def up_m(options: GeoregisterOptions) -> list[float]:
 
 
 def test_a_take_off_above_a_kept_origin_lifts_the_fixes() -> None:
-    """A take-off at 112 m above an origin kept at 100 m adds 12 m to heights above take-off."""
+    """A take-off at 112 m, with the origin kept at 100 m, adds 12 m to heights above take-off."""
     options = GeoregisterOptions(
         origin=ORIGIN,
         heights=Heights.RELATIVE,
@@ -38,13 +38,13 @@ def test_a_take_off_above_a_kept_origin_lifts_the_fixes() -> None:
 
 
 def test_absolute_heights_count_from_a_kept_origin() -> None:
-    """Fixes at 122 m and 132 m lie 22 m and 32 m above an origin kept at 100 m."""
+    """Fixes at 122 m and 132 m are 22 m and 32 m above an origin kept at 100 m."""
     options = GeoregisterOptions(origin=ORIGIN, heights=Heights.ABSOLUTE)
     assert up_m(options) == pytest.approx([22.0, 32.0], abs=1e-6)
 
 
 def test_a_default_sigma_grows_between_distant_fixes() -> None:
-    """Frames between fixes 5 s apart are less certain than those at a fix, if the source states nothing."""
+    """The default sigma is larger between fixes 5 s apart than at a fix."""
     time_s = np.arange(0.0, 21.0, 5.0)
     flight = Telemetry.from_columns(time_s, lat_lon_deg=np.full((5, 2), 45.0), kind="gpx")
     rows = align_telemetry({"a": flight}, ["a"] * 2, np.array([5.0, 7.5]))
