@@ -87,7 +87,7 @@ def test_times_at_one_instant_share_their_error_and_break_nothing():
 
 
 def test_noise_levels_are_estimated_two_sidedly():
-    """Bias and white noise are estimated within 35 % from 300 s of errors and a wrong start."""
+    """Bias and white noise are estimated to about a third from 300 s of errors and a wrong start."""
     rng = np.random.default_rng(2)
     time_s = np.arange(0, 300, 0.8)
     m = len(time_s)
