@@ -333,7 +333,10 @@ def test_a_video_that_has_moved_is_found_where_it_is_said_to_be(
 def test_a_relative_video_is_found_from_any_folder_and_with_the_area_moved_along(
     bare: Path, flight2: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """area.toml stores the video's path relative to the area, so it resolves from any working directory."""
+    """area.toml stores the video's path relative to the area, so any working directory works.
+
+    It still resolves after the area and the video have been moved together.
+    """
     both = tmp_path / "together"
     shutil.copytree(bare, both / "area")
     shutil.copytree(flight2, both / "second day")
@@ -398,7 +401,7 @@ def test_a_mapping_flight_does_not_take_an_evaluation_sequence_s_name(
 
 
 def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
-    """`split` refers to `register --all-frames`, which names the leftover folder and then runs."""
+    """`split` reports the leftover of a removed sequence, and `register --all-frames` says what to remove."""
     shutil.rmtree(area / EVALUATION / "medium")
     refused = run("split", "--area", area)
     assert "4-tracked/medium is stale" in refused.stderr

@@ -270,7 +270,7 @@ def test_a_second_pose_that_is_the_same_is_no_rival() -> None:
 
 
 def test_a_lens_that_is_not_known_is_found() -> None:
-    """An unknown lens is estimated from a narrow lens without distortion; a fixed one stays bit for bit."""
+    """An unknown lens is estimated from a narrow-angle start without distortion; a fixed one is kept."""
     made = flight()
     start = replace(LENS, params=np.array([900.0, 160, 120, 0, 0]))
     sequence = made.sequence(made.matched())
@@ -283,7 +283,7 @@ def test_a_lens_that_is_not_known_is_found() -> None:
 
 
 def test_what_no_map_point_explains_becomes_a_point_of_the_sequence_where_it_is() -> None:
-    """With two thirds of the facade unmapped, tracks there are triangulated and improve the frames."""
+    """Tracks on the unmapped two thirds of the facade become own points at their true positions."""
     made = flight()
     putative = [matches[matches[:, 1] % 3 == 0] for matches in made.matched()]
     _, solution, _ = solved(made, putative)

@@ -226,7 +226,7 @@ def test_photos_far_apart_in_time_keep_a_frame_between(evaluation):
 def test_a_hover_next_to_a_block_is_left_out_up_to_the_next_chosen_frame(evaluation):
     """A hover at the edge of a block is left out up to the next chosen frame.
 
-    Its tracked frames, 20 s long, show the same view as the block because nothing moved.
+    The hover lasts 20 s, and its tracked frames show the same view as the end of the block.
     """
     moving = flight("one", line(30))
     after = flight("one", line(30) + np.array([30.0, 0.0, 0.0]), start_s=35.0)
