@@ -1,4 +1,4 @@
-"""Baselines, on poses and images whose answer is known."""
+"""Tests of baselines, on poses and images with known answers."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class Pictures:
 
 
 def textures(n, seed=0, size=(90, 160)):
-    """Different textures with corners and blobs, (n, H, W, 3) uint8."""
+    """Return different textures with corners and blobs, shape (n, H, W, 3), uint8."""
     rng = np.random.default_rng(seed)
     small = rng.integers(0, 256, (n, size[0] // 6, size[1] // 6, 3), dtype=np.uint8)
     return np.stack([cv2.resize(s, size[::-1], interpolation=cv2.INTER_CUBIC) for s in small])
 
 
 def seen_again(images, shift=5, seed=1):
-    """The same textures, shifted, darker and with noise."""
+    """Return the same textures, shifted, darkened and with noise."""
     rng = np.random.default_rng(seed)
     moved = np.roll(images, shift, axis=2).astype(float)
     return np.clip(0.8 * moved + rng.normal(scale=4, size=images.shape), 0, 255).astype(np.uint8)
@@ -69,7 +69,7 @@ def some_poses(n, seed=0):
 
 
 def test_mean_of_turns_about_one_axis_is_the_middle_turn():
-    """Turns of 10, 20 and 30 deg about up have their mean at 20 deg, whatever the quaternions' signs."""
+    """The mean of rotations by 10, 20 and 30 deg about up is 20 deg, whatever the quaternions' signs."""
     vectors = np.zeros((3, 3))
     vectors[:, 2] = np.deg2rad([10, 20, 30])
     quats = quats_from_rotations(rotations_from_vectors(vectors))
@@ -82,7 +82,7 @@ def test_mean_of_turns_about_one_axis_is_the_middle_turn():
 
 
 def test_mean_minimises_squared_chords():
-    """No small turn of the mean is nearer to all rotations (Markley's criterion)."""
+    """No small rotation of the mean reduces the sum of squared chordal distances (Markley)."""
     poses = some_poses(30, seed=4)
     _, quat = mean_pose(poses)
 
@@ -95,10 +95,10 @@ def test_mean_minimises_squared_chords():
 
 
 def test_figures_of_shop_facade(shared_data):
-    """The public pose lists give the mean pose 8.60 m, 33.75 deg and the oracle 0.75 m, 8.5 deg (medians).
+    """The public pose lists give medians of 8.60 m, 33.75 deg (mean pose) and 0.75 m, 8.5 deg (oracle).
 
-    The mean of quaternions aligned in sign to the first, which depends on the order, gives 34.0 deg. The
-    literature's PoseNet has 1.46 m, 8.08 deg there: no better in position than the oracle.
+    The mean of quaternions aligned in sign to the first, which depends on the order, gives 34.0 deg. PoseNet
+    in the literature has 1.46 m, 8.08 deg there: no better in position than the oracle.
     """
     folder = shared_data / "cambridge" / "ShopFacade"
     training = read_cambridge(folder / "dataset_train.txt").poses
@@ -117,7 +117,7 @@ def test_figures_of_shop_facade(shared_data):
 
 
 def test_oracle_is_the_best_of_all_training_poses():
-    """No training pose has a smaller sum of distance and angle / 10, by trying all."""
+    """By brute force, no training pose has a smaller sum of distance and angle / 10."""
     training, true = some_poses(40, seed=1), some_poses(15, seed=2)
     found = nearest_pose_estimates(training, true).poses
     error_m, error_deg = pose_errors(found, true)
@@ -127,7 +127,7 @@ def test_oracle_is_the_best_of_all_training_poses():
 
 
 def test_nothing_to_learn_from_is_an_error():
-    """Without training poses there is neither a mean nor a nearest one."""
+    """Mean pose and oracle raise an error if there are no training poses."""
     none, true = some_poses(0), some_poses(3)
     with pytest.raises(ValueError, match="cannot average zero poses"):
         mean_pose_estimates(none, 3)
@@ -136,7 +136,7 @@ def test_nothing_to_learn_from_is_an_error():
 
 
 def test_vlad_finds_the_same_place():
-    """Each texture seen again is answered with the pose of its own training image."""
+    """VLAD retrieves the pose of the matching training image for each modified texture."""
     images = textures(12)
     training = some_poses(12)
     order = np.random.default_rng(3).permutation(12)
@@ -149,7 +149,7 @@ def test_vlad_finds_the_same_place():
 
 
 def test_vocabulary_is_of_the_training_images_alone():
-    """What images are described later does not change how an image is described; nor does a second run."""
+    """Descriptors do not depend on images described before, and are the same in a second run."""
     images = textures(6)
     describe = vlad(Pictures(images), VladOptions(words=8))
     before = describe(Pictures(images))
@@ -161,7 +161,7 @@ def test_vocabulary_is_of_the_training_images_alone():
 
 
 def test_masked_pixels_do_not_describe():
-    """Images that differ only where their masks say that nothing is shown are described alike."""
+    """Images that differ only in masked pixels have the same descriptor."""
     images = textures(2, size=(90, 360))
     other = images.copy()
     other[:, :, 240:] = textures(2, seed=5, size=(90, 120))
@@ -175,7 +175,7 @@ def test_masked_pixels_do_not_describe():
 
 
 def test_an_image_that_shows_nothing_gets_no_pose():
-    """A black image has no features: the answer is NaN, not the first training image."""
+    """A black image, which has no features, gets NaN instead of the first training pose."""
     images = textures(5)
     describe = vlad(Pictures(images), VladOptions(words=8))
     black = np.zeros_like(images[:1])
@@ -185,7 +185,7 @@ def test_an_image_that_shows_nothing_gets_no_pose():
 
 
 def test_pool_is_the_power_mean():
-    """Power 1 is the mean, a high power nears the maximum, 3 is the cube root of the mean cube."""
+    """Power 1 gives the mean, a high power nearly the maximum, and 3 the cube root of the mean cube."""
     maps = np.array([[[[1.0, 2], [3, 2]], [[0, 0], [0, 4]]]])
     for power, wanted in (
         (1.0, [2, 1]),
@@ -198,7 +198,7 @@ def test_pool_is_the_power_mean():
 
 
 def test_gem_does_not_depend_on_batches():
-    """The same descriptions in batches of 2 and of 8, in the images' order."""
+    """Descriptors are the same in batches of 2 and of 8, in the order of the images."""
     images = Pictures(textures(5))
 
     def maps(batch):
@@ -212,7 +212,7 @@ def test_gem_does_not_depend_on_batches():
 
 
 def test_all_baselines_of_several_groups():
-    """Each group gets the mean, the oracle and each way of looking up; training frames are no group."""
+    """Each group gets mean pose, oracle and each retrieval method; training frames are rejected."""
     images, poses = textures(6), some_poses(6)
     training = Pictures(images, poses=poses)
     groups = [Pictures(seen_again(images[rows]), poses=poses[rows]) for rows in ([4, 1], [2])]
@@ -229,7 +229,7 @@ def test_all_baselines_of_several_groups():
 
 
 def test_feature_maps_are_those_of_squeezenet():
-    """fire9 of the shipped weights, against the layers written out as plain convolutions with ReLUs."""
+    """Feature maps equal fire9 of the shipped weights, computed with plain convolutions and ReLUs."""
     torch = pytest.importorskip("torch")
     from spn_model.evaluation.feature_maps import squeezenet_maps
     from spn_model.pretrained.tensors import read_tensors
@@ -263,7 +263,7 @@ def test_feature_maps_are_those_of_squeezenet():
 
 
 def test_the_better_retrieval_has_the_smaller_error():
-    """Judged by the median of metres plus degrees / 10; one that has no pose for most frames is worse."""
+    """Retrieval is ranked by the median of metres plus degrees / 10; missing poses make it worse."""
     true = some_poses(3)
     frames = evaluation_frames("a", np.array(["0", "1", "2"]), np.full(3, ""), true, true)
     near = Estimates("near", Poses(true.centers + np.array([0.1, 0, 0]), true.quats_wxyz))
@@ -277,7 +277,7 @@ def test_the_better_retrieval_has_the_smaller_error():
 
 
 def test_the_papers_table_is_the_papers():
-    """Three networks on both sequences, SqueezePoseNet as in its abstract."""
+    """The table has three networks on both sequences, with SqueezePoseNet as in the abstract."""
     table = {(p.network, p.sequence): (p.position_m, p.rotation_deg) for p in PAPER_TABLE_1}
     assert len(table) == len(PAPER_TABLE_1) == 6
     assert table["SqueezePoseNet", "medium"] == (5.19, 29.28)

@@ -1,4 +1,4 @@
-"""Virtual cameras at the place of real ones: labels exact, pixels where they belong."""
+"""Tests of virtual cameras at real camera positions: exact labels and pixel positions."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def camera(matrix: np.ndarray, width: int, height: int) -> Camera:
 
 
 def spot(width: int, height: int, at: np.ndarray, sigma: float = 2.0) -> np.ndarray:
-    """A smooth bright spot, its middle at a COLMAP pixel."""
+    """Return an image of a smooth bright spot centred on a COLMAP pixel."""
     y, x = np.mgrid[:height, :width] + 0.5
     values = 250 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * sigma**2))
     return np.repeat(np.rint(values).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def middle(image: np.ndarray) -> np.ndarray:
-    """Centroid of the light, in COLMAP's pixels."""
+    """Return the centroid of the intensity in COLMAP pixels."""
     light = image[..., 0].astype(np.float64)
     y, x = np.mgrid[: light.shape[0], : light.shape[1]] + 0.5
     return np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
@@ -45,7 +45,7 @@ def middle(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("zoom", [0.45, 1.0, 1.35])
 @pytest.mark.parametrize("target", [None, (240, 136)])
 def test_a_warped_pixel_is_the_projection_by_the_turned_pose(zoom, target):
-    """Points of the scene land where the virtual camera projects them, to 1e-6 px, and come back."""
+    """Warped pixels equal projections by the virtual camera to 1e-6 px, and the warp is invertible."""
     rng = np.random.default_rng(0)
     pose = Poses.from_rotations([[3.0, -2.0, 5.0]], rotations_from_vectors([[0.4, -1.2, 0.3]]))
     in_camera = rng.uniform([-4, -2, 6], [4, 2, 30], (50, 3))
@@ -63,7 +63,7 @@ def test_a_warped_pixel_is_the_projection_by_the_turned_pose(zoom, target):
 @pytest.mark.parametrize("zoom", [0.45, 0.65, 1.0, 1.35])
 @pytest.mark.parametrize("target", [None, (440, 260)])
 def test_the_image_moves_with_its_pixels(zoom, target):
-    """A bright spot is drawn within 0.05 px of where its pixel is warped to."""
+    """A bright spot is drawn within 0.05 px of its warped pixel."""
     for seed in range(4):
         virtual = warp(seed, zoom, target)
         at = virtual.source_pixels(np.array([[201.0, 118.0]]))[0]
@@ -73,7 +73,7 @@ def test_the_image_moves_with_its_pixels(zoom, target):
 
 
 def test_a_small_virtual_image_passes_over_no_pixel():
-    """Lines one pixel wide and four apart blur together at 0.45, instead of coming and going."""
+    """Reducing an image to 0.45 blends lines one pixel wide and four apart instead of aliasing."""
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     image[:, ::4] = 240
     still = WarpOptions(tilt_deg=0.0, roll_deg=0.0)
@@ -81,11 +81,11 @@ def test_a_small_virtual_image_passes_over_no_pixel():
     small = random_warp(rng, MATRIX, SIZE, still, zoom=0.45, target_size=(120, 68))
     columns = small.image(image)[:, :, 0].astype(float).mean(axis=0)
     assert columns.mean() == pytest.approx(60, abs=3)
-    assert columns.std() < 50  # 76 where pixels are passed over
+    assert columns.std() < 50  # 76 if pixels are skipped
 
 
 def test_what_the_real_camera_did_not_see_is_filled():
-    """Outside the source image there is the given colour and nothing else."""
+    """Pixels outside the source image have exactly the fill colour."""
     white = np.full((SIZE[1], SIZE[0], 3), 255, np.uint8)
     drawn = warp(2, 0.45).image(white, fill=(1, 2, 3))
     assert drawn[0, 0].tolist() == [1, 2, 3]
@@ -93,7 +93,7 @@ def test_what_the_real_camera_did_not_see_is_filled():
 
 
 def test_points_behind_the_virtual_camera_have_no_pixel():
-    """A pixel that a strong turn puts behind the image plane is NaN, not mirrored."""
+    """Pixels that a strong rotation puts behind the image plane are NaN, not mirrored."""
     options = WarpOptions(tilt_deg=0.0, roll_deg=0.0)
     still = random_warp(np.random.default_rng(0), MATRIX, SIZE, options, zoom=1.0)
     turned = type(still)(rotations_from_vectors([[0.0, 1.2, 0.0]])[0], MATRIX, still.matrix, *SIZE)
@@ -103,7 +103,7 @@ def test_points_behind_the_virtual_camera_have_no_pixel():
 
 
 def test_turns_and_zooms_fill_their_ranges():
-    """Drawn cameras stay within the options, and reach most of them."""
+    """Random zooms and tilts stay within the options and cover most of their range."""
     rng = np.random.default_rng(0)
     warps = [random_warp(rng, MATRIX, SIZE, WarpOptions()) for _ in range(300)]
     zoom = np.array([w.matrix[0, 0] / MATRIX[0, 0] for w in warps])
@@ -114,7 +114,7 @@ def test_turns_and_zooms_fill_their_ranges():
 
 
 def test_a_look_without_changes_is_the_image():
-    """All strengths at zero give the same bytes, in a new array."""
+    """With all strengths at zero, augmentation returns an equal copy."""
     image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     still = PhotometricOptions(
         exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=0
@@ -125,7 +125,7 @@ def test_a_look_without_changes_is_the_image():
 
 
 def test_looks_are_those_of_their_seed():
-    """The same generator gives the same bytes, another gives others; the image stays as it was."""
+    """Equal seeds give equal images, other seeds differ, and the input is unchanged."""
     image = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
     before = image.copy()
     first, again, other = (
@@ -138,7 +138,7 @@ def test_looks_are_those_of_their_seed():
 
 
 def test_blur_moves_nothing():
-    """Motion blur spreads a spot and leaves its middle within 0.02 px."""
+    """Motion blur spreads a spot but moves its centroid by less than 0.02 px."""
     only = PhotometricOptions(exposure=0, tint=0, gamma=0, blur_share=1, noise=0, occlusion_share=0)
     image = spot(121, 91, np.array([60.3, 45.8]), sigma=3.0)
     for seed in range(8):
@@ -148,7 +148,7 @@ def test_blur_moves_nothing():
 
 
 def test_an_occlusion_is_one_box_of_one_colour():
-    """Inside a rectangle all pixels are alike, outside all are as before."""
+    """An occlusion is one rectangle of uniform colour; all other pixels are unchanged."""
     only = PhotometricOptions(exposure=0, tint=0, gamma=0, blur_share=0, noise=0, occlusion_share=1)
     image = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
     changed = augment_photometrically(image, np.random.default_rng(3), only)

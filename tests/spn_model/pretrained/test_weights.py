@@ -1,4 +1,4 @@
-"""Published weights: the shipped file, files of others, hostile files, and the download."""
+"""Tests of pretrained weights: the shipped file, other formats, hostile files, and downloads."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ FEATURES = by_name("squeezenet1_1-features")
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch) -> Path:
-    """An empty cache folder; that of the user is never touched."""
+    """Return an empty cache folder, so that the user's is never used."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return cache_folder()
 
 
 @pytest.fixture(scope="module")
 def original(shared_data) -> Path:
-    """The whole SqueezeNet 1.1 in float32 that the shipped file was made from."""
+    """Return the path of the complete float32 SqueezeNet 1.1 behind the shipped file."""
     path = shared_data.parent / "weights" / "squeezenet1_1-imagenet.safetensors"
     if not path.is_file():
         pytest.skip(f"the original weights are not at {path}")
@@ -62,7 +62,7 @@ def tensors() -> dict[str, torch.Tensor]:
 
 
 def quiet(step: str, done: int, total: int) -> None:
-    """Progress that nobody sees."""
+    """Ignore progress."""
 
 
 def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
@@ -75,7 +75,7 @@ def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
 
 
 def test_a_fresh_clone_has_what_the_default_network_starts_from():
-    """The default network's weights are in the package, intact, and fit its trunk with nothing left over."""
+    """The default network's weights are in the package, intact, and match its trunk exactly."""
     network = build("squeezeposenet")
     path = find(network.weights_name)
     assert path.parent == SHIPPED
@@ -87,7 +87,7 @@ def test_a_fresh_clone_has_what_the_default_network_starts_from():
 
 
 def test_the_shipped_file_is_the_one_that_its_hash_belongs_to():
-    """Size and the whole SHA-256; 722,496 parameters in float16 and a header."""
+    """Size and SHA-256 match the catalogue: 722,496 parameters in float16 and a header."""
     content = FEATURES.path.read_bytes()
     assert hashlib.sha256(content).hexdigest() == FEATURES.sha256
     assert len(content) == FEATURES.size_bytes
@@ -95,7 +95,7 @@ def test_the_shipped_file_is_the_one_that_its_hash_belongs_to():
 
 
 def test_its_licence_lies_beside_it_and_goes_with_the_package():
-    """MIT, with its copyright line, named in pyproject.toml."""
+    """The MIT licence with its copyright line is included and named in pyproject.toml."""
     licence = SHIPPED / "LICENSE.squeezenet1_1-features.txt"
     assert "Copyright (c) 2019 Primoz Godec" in licence.read_text()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -103,7 +103,7 @@ def test_its_licence_lies_beside_it_and_goes_with_the_package():
 
 
 def test_the_shipped_file_is_made_by_the_tool(original):
-    """tools/shipped_weights.py gives the same bytes."""
+    """tools/shipped_weights.py reproduces the shipped file byte for byte."""
     done = subprocess.run(
         [
             sys.executable,
@@ -123,7 +123,7 @@ def test_the_shipped_file_is_made_by_the_tool(original):
 
 
 def test_rounding_changes_weights_by_less_than_a_two_thousandth(original, tensors):
-    """float16 has 11 bits; weights below its normal range stay within its smallest step."""
+    """Conversion to float16 (11 bits) changes weights by at most 2^-11 relative, or the smallest step."""
     exact = read_tensors(original)
     for name, tensor in tensors.items():
         error = (tensor.float() - exact[name]).abs()
@@ -132,7 +132,7 @@ def test_rounding_changes_weights_by_less_than_a_two_thousandth(original, tensor
 
 
 def test_the_original_fits_a_network_that_keeps_conv10(original):
-    """With conv10 every tensor of the published network has its place; without, conv10 is left over."""
+    """The published network loads completely with conv10; without it, only conv10 is left over."""
     whole = read_tensors(original)
     assert load_pretrained(build("squeezeposenet", {"conv10": True}), whole, original) == ()
     left = load_pretrained(build("squeezeposenet"), whole, original)
@@ -140,7 +140,7 @@ def test_the_original_fits_a_network_that_keeps_conv10(original):
 
 
 def test_version_1_0_takes_weights_of_1_0_only(original):
-    """Names and shapes are those of the other release of SqueezeNet; the two are not confused."""
+    """SqueezeNet 1.0 weights load into version 1.0 and are rejected by version 1.1."""
     path = original.with_name("squeezenet1_0-imagenet-pruned.safetensors")
     network = build("squeezeposenet", {"version": "1.0"})
     left = load_pretrained(network, read_tensors(path), path)
@@ -153,7 +153,7 @@ def test_version_1_0_takes_weights_of_1_0_only(original):
 
 
 def test_published_files_carry_their_hash_in_their_name():
-    """torchvision's files, over https, with the first 8 digits of their SHA-256."""
+    """torchvision files have https addresses and the first 8 digits of their SHA-256 in the name."""
     published = [weights for weights in CATALOGUE if weights.url is not None]
     assert [w.sha256 for w in published] == ["b8a52dc0", "b66bff10", "397923af", "1378be20"]
     for weights in published:
@@ -171,12 +171,12 @@ def test_published_files_carry_their_hash_in_their_name():
     ],
 )
 def test_every_network_names_weights_of_the_catalogue(name, options):
-    """What a network starts from by default can be listed and fetched."""
+    """The default weights of each network are in the catalogue."""
     by_name(build(name, options).weights_name)
 
 
 def test_fetched_files_are_kept_in_the_users_cache(tmp_path, monkeypatch):
-    """XDG_CACHE_HOME where it is an absolute path, else ~/.cache."""
+    """The cache is in XDG_CACHE_HOME if that is an absolute path, otherwise in ~/.cache."""
     assert cache_folder() == tmp_path / "cache" / "squeezeposenet-toolkit" / "weights"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -187,7 +187,7 @@ def test_fetched_files_are_kept_in_the_users_cache(tmp_path, monkeypatch):
 
 
 def test_loading_changes_the_pretrained_trunk_alone(tensors):
-    """Inserted normalisations, fc11 and heads stay as they were."""
+    """Loading weights changes only the trunk, not inserted normalisation layers, fc11 or the heads."""
     network = build("squeezeposenet")
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     load_pretrained(network, tensors, FEATURES.path)
@@ -199,7 +199,7 @@ def test_loading_changes_the_pretrained_trunk_alone(tensors):
 
 @pytest.mark.parametrize("zipped", [True, False])
 def test_files_of_torch_are_read_in_both_formats(tensors, tmp_path, zipped):
-    """What torch.save writes today, and the older format of torchvision's early files."""
+    """Both torch.save formats are read: zip, and the older one of early torchvision files."""
     path = tmp_path / "mine.pth"
     torch.save(tensors, path, _use_new_zipfile_serialization=zipped)
     read = read_tensors(path)
@@ -208,7 +208,7 @@ def test_files_of_torch_are_read_in_both_formats(tensors, tmp_path, zipped):
 
 
 def test_parameters_inside_a_training_programs_checkpoint_are_found(tensors, tmp_path):
-    """Under `state_dict`, with names that begin with `module.`, as the weights of Places365 are."""
+    """Parameters under `state_dict` with a `module.` prefix, as in Places365 weights, are loaded."""
     path = tmp_path / "places.pth.tar"
     wrapped = {f"module.{name}": tensor for name, tensor in tensors.items()}
     torch.save({"epoch": 90, "state_dict": wrapped}, path)
@@ -216,7 +216,7 @@ def test_parameters_inside_a_training_programs_checkpoint_are_found(tensors, tmp
 
 
 def test_googlenets_own_statistics_are_loaded_and_its_auxiliary_heads_are_not():
-    """torchvision's file holds running statistics that count, and auxiliary heads that never were trained."""
+    """GoogLeNet's running statistics are loaded, but not its auxiliary heads, which were never trained."""
     source, network = build("posenet", seed=1), build("posenet", seed=2)
     for buffer in source.buffers():
         if buffer.is_floating_point():
@@ -235,7 +235,7 @@ def test_googlenets_own_statistics_are_loaded_and_its_auxiliary_heads_are_not():
 
 
 def changed(tensors: dict[str, torch.Tensor], name: str, tensor: torch.Tensor | None):
-    """The shipped tensors with one exchanged, or left out."""
+    """Return the shipped tensors with one replaced or removed."""
     others = {n: t for n, t in tensors.items() if n != name}
     return others if tensor is None else {**others, name: tensor}
 
@@ -265,7 +265,7 @@ def changed(tensors: dict[str, torch.Tensor], name: str, tensor: torch.Tensor | 
 def test_tensors_that_do_not_fit_are_refused_before_anything_changes(
     tensors, name, tensor, message
 ):
-    """The line names file, tensor, what was found and what is needed; the network is as it was."""
+    """An incompatible tensor raises a one-line error and leaves the network unchanged."""
     network = build("squeezeposenet")
     before = {n: t.clone() for n, t in network.state_dict().items()}
     with pytest.raises(InputError, match=re.escape(message)) as error:
@@ -278,7 +278,7 @@ def test_tensors_that_do_not_fit_are_refused_before_anything_changes(
 
 
 class Payload:
-    """Pickled, it makes a file wherever it is unpickled by a reader that trusts it."""
+    """Object whose pickle creates a file when unpickled by an unsafe reader."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -290,7 +290,7 @@ class Payload:
 @pytest.mark.parametrize("zipped", [True, False])
 @pytest.mark.parametrize("suffix", [".pth", ".pt", ".safetensors"])
 def test_code_inside_a_file_is_never_run(tensors, tmp_path, zipped, suffix):
-    """A pickle with a payload is refused under every name, and its payload stays asleep."""
+    """A pickle with a payload is rejected under every file name without running it."""
     touched, path = tmp_path / "touched", tmp_path / f"evil{suffix}"
     content = {**tensors, "features.0.bias": Payload(touched)}
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
@@ -307,7 +307,7 @@ def test_code_inside_a_file_is_never_run(tensors, tmp_path, zipped, suffix):
 
 @pytest.mark.parametrize("share", [0.0, 0.0001, 0.01, 0.5, 0.9999])
 def test_a_safetensors_file_that_is_cut_short_is_refused(tmp_path, share):
-    """Wherever a copy broke off."""
+    """A safetensors file truncated at any length is rejected."""
     content = FEATURES.path.read_bytes()
     path = tmp_path / "cut.safetensors"
     path.write_bytes(content[: int(share * len(content))])
@@ -318,7 +318,7 @@ def test_a_safetensors_file_that_is_cut_short_is_refused(tmp_path, share):
 @pytest.mark.parametrize("share", [0.0, 0.0001, 0.01, 0.5, 0.9999])
 @pytest.mark.parametrize("zipped", [True, False])
 def test_a_file_of_torch_that_is_cut_short_is_refused(tensors, tmp_path, share, zipped):
-    """Wherever a copy broke off, in both formats."""
+    """A torch file truncated at any length is rejected, in both formats."""
     whole, path = tmp_path / "whole.pth", tmp_path / "cut.pth"
     torch.save(tensors, whole, _use_new_zipfile_serialization=zipped)
     path.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
@@ -339,7 +339,7 @@ def test_a_file_of_torch_that_is_cut_short_is_refused(tensors, tmp_path, share, 
     ],
 )
 def test_a_safetensors_header_that_lies_is_refused(tmp_path, header):
-    """Sizes beyond the file, negative and overflowing ones, unknown types."""
+    """Headers with oversized, negative or overflowing sizes, or unknown types, are rejected."""
     path = tmp_path / "lies.safetensors"
     path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(4))
     with pytest.raises(InputError, match="is not a safetensors file, or truncated"):
@@ -347,7 +347,7 @@ def test_a_safetensors_header_that_lies_is_refused(tmp_path, header):
 
 
 def test_a_header_that_claims_the_whole_memory_is_refused(tmp_path):
-    """A length of 2^63 costs no memory."""
+    """A header length of 2^63 is rejected without allocating memory."""
     path = tmp_path / "huge.safetensors"
     path.write_bytes(struct.pack("<Q", 2**63) + b"{}")
     with pytest.raises(InputError, match="is not a safetensors file, or truncated"):
@@ -355,7 +355,7 @@ def test_a_header_that_claims_the_whole_memory_is_refused(tmp_path):
 
 
 def test_a_compressed_file_of_torch_is_refused(tmp_path):
-    """64 MB of zeros in 64 KB: torch never compresses, so nothing is unpacked."""
+    """A compressed torch file (64 MB of zeros in 64 KB) is rejected, as torch never compresses."""
     whole, path = tmp_path / "whole.pth", tmp_path / "bomb.pth"
     torch.save({"features.0.weight": torch.zeros(2**24)}, whole)
     with zipfile.ZipFile(whole) as source, zipfile.ZipFile(path, "w") as target:
@@ -370,7 +370,7 @@ def test_a_compressed_file_of_torch_is_refused(tmp_path):
     "content", [{}, [1, 2], torch.ones(3), {"a": 1}, {1: torch.ones(3)}, {"state_dict": {}}]
 )
 def test_a_file_without_named_tensors_is_refused(tmp_path, content):
-    """Lists, single tensors, numbers: torch.save stores anything."""
+    """Lists, single tensors, numbers and empty dictionaries are rejected."""
     path = tmp_path / "other.pth"
     torch.save(content, path)
     with pytest.raises(InputError, match="contains no parameters by name"):
@@ -378,7 +378,7 @@ def test_a_file_without_named_tensors_is_refused(tmp_path, content):
 
 
 def test_what_is_no_file_or_far_too_large_is_refused(tmp_path):
-    """A folder, a missing name, and a file of 3 GB, which is sparse here and never read."""
+    """A folder and a (sparse) file of 3 GB are rejected."""
     with pytest.raises(InputError, match="is not a file of weights"):
         read_tensors(tmp_path)
     large = tmp_path / "large.pth"
@@ -392,14 +392,14 @@ def test_what_is_no_file_or_far_too_large_is_refused(tmp_path):
 
 
 def test_weights_that_were_not_fetched_are_told_with_the_remedy():
-    """Nothing is downloaded behind the user's back."""
+    """Missing weights are not downloaded silently; the error names the fetch command."""
     with pytest.raises(InputError, match="weights vgg16 are not on this machine") as error:
         find("vgg16")
     assert "'spn-model weights fetch vgg16' downloads 553 MB, or give a file" in one_line(error)
 
 
 def test_a_name_that_is_neither_file_nor_weights_is_told(tmp_path):
-    """The line has the names that there are."""
+    """The error for an unknown name lists the available ones."""
     with pytest.raises(
         InputError,
         match="neither a file of weights nor one of the names squeezenet1_1-features, squeezenet",
@@ -408,7 +408,7 @@ def test_a_name_that_is_neither_file_nor_weights_is_told(tmp_path):
 
 
 def test_a_published_name_on_other_content_is_refused(tmp_path, cache):
-    """By the hash in the name, in the cache and anywhere else."""
+    """A file whose content does not match the hash in its name is rejected, in the cache and elsewhere."""
     cache.mkdir(parents=True)
     for folder in (tmp_path, cache):
         (folder / "googlenet-1378be20.pth").write_bytes(b"half a download")
@@ -419,7 +419,7 @@ def test_a_published_name_on_other_content_is_refused(tmp_path, cache):
 
 
 def test_a_file_of_the_users_own_is_taken_as_it_is(tmp_path):
-    """A date in its name is no hash."""
+    """A date in the name of a user's file is not taken for a hash."""
     path = tmp_path / "trained-20261122.pth"
     path.write_bytes(b"")
     assert find(path) == find(str(path)) == path
@@ -429,7 +429,7 @@ def test_a_file_of_the_users_own_is_taken_as_it_is(tmp_path):
 
 
 class Server(http.server.ThreadingHTTPServer):
-    """Serves one content under every path, counts the requests, and redirects where it is told to."""
+    """HTTP server with one content for every path, which counts requests and can redirect."""
 
     daemon_threads = False  # closing waits for them
     content = b""
@@ -439,7 +439,7 @@ class Server(http.server.ThreadingHTTPServer):
     requests = 0
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that hangs up early is part of the tests."""
+        """Ignore clients that disconnect early, which is part of the tests."""
 
     def url(self, name: str) -> str:
         return f"http://127.0.0.1:{self.server_address[1]}/models/{name}"
@@ -458,7 +458,7 @@ class Answer(http.server.BaseHTTPRequestHandler):
         self.wfile.write(self.server.content)
 
     def log_message(self, *args: object) -> None:
-        """Says nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture
@@ -472,7 +472,7 @@ def server() -> Iterator[Server]:
 
 
 def served(server: Server, content: bytes, size_bytes: int | None = None):
-    """Weights whose file the server has, under a name with the content's hash."""
+    """Return weights whose file is on the server, named by the hash of its content."""
     server.content = content
     digest = hashlib.sha256(content).hexdigest()[:8]
     file = f"small-{digest}.pth"
@@ -483,7 +483,7 @@ def served(server: Server, content: bytes, size_bytes: int | None = None):
 
 
 def test_a_download_lands_in_the_cache_and_is_made_once(server, cache):
-    """Checked, whole, with progress; a second fetch asks no server; a damaged file is replaced."""
+    """A download is verified, cached and not repeated; a damaged file is replaced."""
     weights = served(server, b"w" * 3_000_000)
     steps = []
     path = fetch(weights, lambda *step: steps.append(step))
@@ -512,7 +512,7 @@ def test_a_download_lands_in_the_cache_and_is_made_once(server, cache):
     ],
 )
 def test_a_download_that_fails_leaves_nothing(server, cache, spoil, message):
-    """Wrong content, too much of it, no such file, a broken connection: one line, and an empty cache."""
+    """Wrong or oversized content, HTTP errors and lost connections give one line and an empty cache."""
     weights = served(server, b"small")
     for name, value in spoil.items():
         setattr(server, name, value)
@@ -523,7 +523,7 @@ def test_a_download_that_fails_leaves_nothing(server, cache, spoil, message):
 
 
 def test_a_redirection_to_an_insecure_address_is_not_followed():
-    """From https to http or a file, nothing is read; from https to https, the request goes on."""
+    """Redirects from https to http or ftp are refused; those to https are followed."""
     import urllib.error
     import urllib.request
 
@@ -538,7 +538,7 @@ def test_a_redirection_to_an_insecure_address_is_not_followed():
 
 
 def test_without_a_network_the_line_says_what_to_do(cache):
-    """Where to put the file that was fetched elsewhere."""
+    """The error for a failed download says where to put a file fetched elsewhere."""
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
     weights = replace(by_name("googlenet"), url=f"http://127.0.0.1:{port}/small.pth")
@@ -549,7 +549,7 @@ def test_without_a_network_the_line_says_what_to_do(cache):
 
 
 def test_shipped_weights_need_no_fetching():
-    """Their fetch is their place in the package."""
+    """Fetching shipped weights returns their path in the package."""
     assert fetch(FEATURES, quiet) == FEATURES.path
 
 
@@ -561,7 +561,7 @@ def invoke(*words: str):
 
 
 def test_the_list_shows_what_is_here_and_what_is_not(cache):
-    """Name, contents, presence, origin, size and hash of each; a damaged file is pointed out."""
+    """The list shows name, contents, presence, origin, size and hash, and marks damaged files."""
     shown = invoke()
     assert shown.exit_code == 0
     rows = {line.split()[0]: line for line in shown.output.splitlines() if line.strip()}
@@ -580,7 +580,7 @@ def test_the_list_shows_what_is_here_and_what_is_not(cache):
 
 
 def test_fetching_what_is_shipped_tells_where_it_lies():
-    """Exit 0, with the path and the licence."""
+    """Fetching shipped weights exits with 0 and prints path and licence."""
     shown = invoke("fetch", FEATURES.name)
     assert shown.exit_code == 0
     assert str(FEATURES.path) in shown.output.replace("\n", "")
@@ -588,7 +588,7 @@ def test_fetching_what_is_shipped_tells_where_it_lies():
 
 
 def test_fetching_an_unknown_name_is_one_line_and_exit_1():
-    """With the names that there are."""
+    """An unknown name gives exit code 1 and a one-line error with the available names."""
     shown = invoke("fetch", "resnet")
     assert shown.exit_code == 1
     names = ", ".join(weights.name for weights in CATALOGUE)
@@ -596,7 +596,7 @@ def test_fetching_an_unknown_name_is_one_line_and_exit_1():
 
 
 def test_listing_and_help_load_no_torch():
-    """They answer at once."""
+    """Listing and help do not import torch."""
     code = (
         "import sys\n"
         "from spn_cli.model import main\n"
@@ -612,7 +612,7 @@ def test_listing_and_help_load_no_torch():
 
 
 def test_saved_trunks_are_read_back(tmp_path):
-    """A trunk written as safetensors by anyone starts another network."""
+    """A trunk saved as safetensors can initialise another network."""
     source, network = build("squeezeposenet", seed=1), build("squeezeposenet", seed=2)
     path = tmp_path / "own.safetensors"
     wanted = read_tensors(FEATURES.path).keys()

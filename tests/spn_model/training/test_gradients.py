@@ -1,4 +1,4 @@
-"""A batch in parts: the same gradient whichever thread is ready first, and whoever computes it."""
+"""Tests of gradients of a batch in parts: the result does not depend on threads or their order."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def in_parts(tiny_kind: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def model_and_parts(tmp_path_factory: pytest.TempPathFactory):
-    """A scene-coordinate network, and two parts of a batch of different size."""
+    """Return a scene-coordinate model and two parts of a batch with different sizes."""
     with Dataset(write_box(tmp_path_factory.mktemp("hall") / "hall.h5", train=6)) as dataset:
         data = TrainingSet(dataset.groups["train"])
     model = SceneCoordinatesModel.make({}, seed=1)
@@ -53,7 +53,7 @@ def gradient(model, parts, threads: int) -> tuple[float, list[torch.Tensor]]:
 
 
 def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(model_and_parts):
-    """As backward computes it for each by itself; the loss too."""
+    """Gradient and loss are the means of those computed for each part separately."""
     model, parts = model_and_parts
     loss, found = gradient(model, parts, 1)
     parameters = [p for group in model.parameter_groups() for p in group["params"]]
@@ -70,7 +70,7 @@ def test_the_gradient_of_a_batch_is_the_mean_of_its_parts(model_and_parts):
 
 
 def test_threads_compute_the_gradient_of_one(model_and_parts, one_thread):
-    """Bit for bit, time after time, though the parts differ in size and in time."""
+    """Two threads repeatedly give the bit-identical gradient of one, despite parts of different size."""
     model, parts = model_and_parts
     _, alone = gradient(model, parts, 1)
     for _ in range(5):
@@ -80,7 +80,7 @@ def test_threads_compute_the_gradient_of_one(model_and_parts, one_thread):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_training_in_parts_goes_on_to_the_same_end(field, in_parts, tmp_path, threads):
-    """Stopped or not, with one thread or two."""
+    """A resumed training in parts matches an uninterrupted one, with one or two threads."""
     train(RECIPE, files(tmp_path / "whole"), Data(field), ONE_THREAD, Follower())
     options = replace(ONE_THREAD, threads=threads)
     with pytest.raises(TrainingStopped):
@@ -91,18 +91,18 @@ def test_a_training_in_parts_goes_on_to_the_same_end(field, in_parts, tmp_path, 
 
 
 def test_parts_draw_the_images_of_a_whole_batch(field, in_parts, tmp_path):
-    """Without augmentation the network is that of whole batches but for rounding."""
+    """Without augmentation, training in parts matches training with whole batches up to rounding."""
     train(RECIPE, files(tmp_path / "parts"), Data(field), ONE_THREAD, Follower())
     recipe = replace(RECIPE, stages=(replace(STAGE, parts=1),))
     train(recipe, files(tmp_path / "whole"), Data(field), ONE_THREAD, Follower())
     parts, whole = (weights(tmp_path / name / "last.safetensors") for name in ("parts", "whole"))
     for name in whole:
-        if name != "variance":  # of a few validation frames: a ratio of small errors
+        if name != "variance":  # from a few validation frames: a ratio of small errors
             torch.testing.assert_close(parts[name], whole[name], rtol=1e-4, atol=1e-5)
 
 
 def test_a_network_with_statistics_of_the_batch_has_no_parts(field, tmp_path):
-    """A pose regressor normalises by the whole batch: parts are refused before anything is trained."""
+    """A pose regressor, which normalises over the whole batch, rejects parts before training."""
     recipe = replace(RECIPE, kind="regression", options={})
     with pytest.raises(InputError, match="cannot split a batch: parts needs to be 1"):
         train(recipe, files(tmp_path), Data(field), ONE_THREAD, Follower())

@@ -1,4 +1,4 @@
-"""What a training runs on: devices that are not there are refused, threads are divided."""
+"""Tests of the choice of device, precision and threads for training."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from spn_model.training.machine import choose, cores, limited_threads
 
 @pytest.mark.parametrize("device", ["tpu", "cuda:x", "mps", "meta", ""])
 def test_what_is_no_device_is_refused(device):
-    """By name, with those that there are."""
+    """An unknown device is rejected with a list of valid ones."""
     with pytest.raises(InputError, match=f"unknown device '{device}'; choose auto, cpu, cuda"):
         choose(device, 1, "auto")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a graphics card")
 def test_a_graphics_card_that_is_not_there_is_refused():
-    """cuda is no wish: nothing else is taken in its place; auto is."""
+    """An unavailable `cuda` is rejected instead of replaced; `auto` falls back to the CPU."""
     with pytest.raises(InputError, match="not found, or torch was built without CUDA"):
         choose("cuda", 1, "auto")
     assert choose("auto", 1, "auto").device.type == "cpu"
@@ -28,7 +28,7 @@ def test_a_graphics_card_that_is_not_there_is_refused():
     ("threads", "computing", "making"), [(1, 1, 1), (2, 1, 1), (4, 3, 1), (8, 6, 2), (64, 56, 8)]
 )
 def test_makers_of_batches_have_their_own_threads(threads, computing, making):
-    """On a processor no thread is shared, but where there is only one; without makers all compute."""
+    """Threads are divided between training and batch workers, unless there is only one."""
     machine = choose("cpu", threads, "float32", makes_batches=True)
     assert (machine.threads, machine.workers) == (computing, making)
     assert choose("cpu", threads, "float32").threads == threads
@@ -36,14 +36,14 @@ def test_makers_of_batches_have_their_own_threads(threads, computing, making):
 
 
 def test_precision_is_taken_as_it_is_given():
-    """bfloat16 where it is asked for, even where it is slow; auto is what the processor can."""
+    """bfloat16 is used if requested, even where it is slow."""
     assert choose("cpu", 1, "bfloat16").bfloat16
     assert not choose("cpu", 1, "float32").bfloat16
     assert choose("cpu", 1, "bfloat16").plain()["precision"] == "bfloat16"
 
 
 def test_libraries_are_left_as_they_were():
-    """Inside, torch computes with the machine's threads; after it as before, whatever went wrong."""
+    """The number of torch threads is limited inside the context and restored after an error."""
     before = torch.get_num_threads()
 
     def fail() -> None:

@@ -1,4 +1,4 @@
-"""Muon: what it leaves of a matrix, how far it moves, and that a stopped training goes on with it."""
+"""Tests of the Muon optimizer: orthogonalization, step size, and resuming."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RECIPE = Recipe(
 @pytest.mark.parametrize("shape", [(8, 40), (40, 8), (16, 16), (1, 9)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_what_is_left_of_a_matrix_is_nearly_orthogonal(one_thread, shape, dtype):
-    """Singular values between 0.5 and 1.3, along the same singular vectors, whatever its size."""
+    """Singular values become 0.5 to 1.3 along the same singular vectors, whatever the matrix size."""
     rows, columns = shape
     left = torch.linalg.qr(torch.randn(rows, rows))[0][:, : min(shape)]
     right = torch.linalg.qr(torch.randn(columns, columns))[0][:, : min(shape)]
@@ -43,7 +43,7 @@ def test_nothing_is_left_of_nothing():
 
 @pytest.mark.parametrize("size", [1e-8, 1.0, 1e6])
 def test_the_entries_of_a_step_have_the_rate_as_their_size(one_thread, size):
-    """For a convolution, in either order of memory, and a gradient of any size."""
+    """The RMS of a step is the learning rate, for any memory format and gradient size."""
     for order in (torch.contiguous_format, torch.channels_last):
         weight = torch.nn.Parameter(torch.zeros(8, 4, 3, 3).to(memory_format=order))
         weight.grad = torch.randn(8, 4, 3, 3).mul(size).to(memory_format=order)
@@ -64,7 +64,7 @@ def test_both_orders_of_memory_end_alike(one_thread):
 
 
 def test_vectors_move_as_adamw_moves_them(one_thread):
-    """Ten steps, with decay; the rate changes on the way."""
+    """Vectors get the updates of AdamW over ten steps, with decay and a changing learning rate."""
     first = torch.randn(7)
     own, other = (torch.nn.Parameter(first.clone()) for _ in range(2))
     optimizers = (
@@ -89,7 +89,7 @@ def test_a_parameter_without_a_gradient_stays():
 
 @pytest.mark.usefixtures("tiny_kind")
 def test_a_training_goes_on_with_its_momentum(field, tmp_path):
-    """It learns; stopped after 40 of 100 steps it ends bit for bit where it would have."""
+    """Training converges, and resuming after 40 of 100 steps gives bit-identical weights."""
     follower = Follower()
     train(RECIPE, files(tmp_path / "whole"), Data(field), ONE_THREAD, follower)
     with pytest.raises(TrainingStopped):
@@ -98,7 +98,7 @@ def test_a_training_goes_on_with_its_momentum(field, tmp_path):
     whole, again = (weights(tmp_path / of / "last.safetensors") for of in ("whole", "again"))
     assert all(torch.equal(whole[name], again[name]) for name in whole)
     judged = [row["median_m"] for row in follower.rows if row["event"] == "validation"]
-    assert judged[-1] < 10  # of 20 before
+    assert judged[-1] < 10  # from about 20 before training
     adam = replace(RECIPE, optimizer="adamw")
     train(adam, files(tmp_path / "adam"), Data(field), ONE_THREAD, Follower())
     other = weights(tmp_path / "adam" / "last.safetensors")

@@ -1,4 +1,4 @@
-"""benchmarks/training_speed.py gives all its loops the same work."""
+"""Tests that benchmarks/training_speed.py gives all its loops the same work."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def benchmark(tiny_kind: None, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_every_loop_takes_the_same_steps(benchmark, tmp_path, monkeypatch):
-    """Of 4 steps with 5 images; the loop's batches are those of the bare loop, and all learn."""
+    """Each loop runs the same 4 steps with identical batches of 5 images."""
     (tmp_path / "5-split").mkdir()
     write_field(tmp_path / "5-split" / "dataset.h5", 7, 2)
     recipe = tmp_path / "tiny.toml"
