@@ -36,7 +36,7 @@ def test_makers_of_batches_have_their_own_threads(threads, computing, making):
 
 
 def test_precision_is_taken_as_it_is_given():
-    """bfloat16 is used if requested, even where it is slow."""
+    """bfloat16 is used if requested, even if it is slow on this processor."""
     assert choose("cpu", 1, "bfloat16").bfloat16
     assert not choose("cpu", 1, "float32").bfloat16
     assert choose("cpu", 1, "bfloat16").plain()["precision"] == "bfloat16"

@@ -38,6 +38,7 @@ def test_what_is_left_of_a_matrix_is_nearly_orthogonal(one_thread, shape, dtype)
 
 
 def test_nothing_is_left_of_nothing():
+    """A zero matrix stays zero."""
     assert torch.equal(orthogonalized(torch.zeros(3, 5), torch.bfloat16), torch.zeros(3, 5))
 
 
@@ -53,6 +54,7 @@ def test_the_entries_of_a_step_have_the_rate_as_their_size(one_thread, size):
 
 
 def test_both_orders_of_memory_end_alike(one_thread):
+    """Both memory formats give bit-identical weights after a step."""
     gradient = torch.randn(8, 4, 3, 3)
     ends = []
     for order in (torch.contiguous_format, torch.channels_last):
@@ -82,6 +84,7 @@ def test_vectors_move_as_adamw_moves_them(one_thread):
 
 
 def test_a_parameter_without_a_gradient_stays():
+    """A parameter without a gradient does not change, not even by weight decay."""
     weight = torch.nn.Parameter(torch.ones(3, 3))
     Muon([{"params": [weight]}], 0.1, 0.5).step()
     assert torch.equal(weight.detach(), torch.ones(3, 3))
