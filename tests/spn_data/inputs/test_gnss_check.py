@@ -99,6 +99,7 @@ def test_an_offset_beyond_what_gnss_can_err_is_a_contradiction() -> None:
 
 
 def test_a_clock_that_is_behind_is_no_scatter() -> None:
+    """A clock 0.6 s behind is estimated as a time offset and does not count as scatter."""
     geo = geo_fit(3)
     found = check(labelled(), track(geo, (0.0, 0.0, 0.0), late_s=0.6), geo)
     assert found.time_offset_s == pytest.approx(0.6, abs=0.1)
@@ -132,6 +133,7 @@ def test_heights_above_take_off_count_from_the_origin() -> None:
 
 
 def test_too_few_labels_or_fixes_are_no_check() -> None:
+    """With only a few labels, or without fixes, no comparison is made."""
     geo = geo_fit(3)
     telemetry = track(geo, (0.0, 0.0, 0.0))
     assert check_gnss(labelled(failed=N - 4), telemetry, geo) is None

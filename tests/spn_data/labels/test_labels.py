@@ -88,6 +88,7 @@ def test_poses_csv_gives_back_every_bit(tmp_path: Path) -> None:
 def test_what_is_no_list_of_poses_is_refused_with_its_line(
     tmp_path: Path, old: str, new: str, message: str
 ) -> None:
+    """A malformed poses.csv is refused with the line at fault."""
     path = tmp_path / "poses.csv"
     write_labels(path, labels())
     text = path.read_text()
@@ -98,6 +99,7 @@ def test_what_is_no_list_of_poses_is_refused_with_its_line(
 
 
 def test_a_file_of_bytes_or_none_at_all_is_an_input_error(tmp_path: Path) -> None:
+    """A missing file and a binary one each raise an InputError."""
     with pytest.raises(InputError, match="can't be read"):
         read_labels(tmp_path / "missing.csv")
     (tmp_path / "poses.csv").write_bytes(b"\xff\xfe\x00")
@@ -126,6 +128,7 @@ def test_labels_move_with_their_world() -> None:
 
 
 def test_labels_are_selected_and_put_together() -> None:
+    """Labels are concatenated and selected; duplicate names and columns of other lengths are refused."""
     one, other = labels(3), labels(2, "high")
     both = Labels.concatenate([one, other])
     assert both.names.tolist() == [*one.names.tolist(), *other.names.tolist()]
@@ -144,6 +147,7 @@ def seen() -> LabelObservations:
 
 
 def test_seen_points_are_selected_by_frame_and_come_back_from_their_file(tmp_path: Path) -> None:
+    """Observations are selected by frame, and reading them from a file gives the same arrays."""
     some = seen().select(np.array([2, 1, 0]))
     assert some.frame_idx.tolist() == [0, 0, 0, 2, 2]
     assert some.of_frame(0)[0].tolist() == [3, 9, 7]
@@ -156,6 +160,7 @@ def test_seen_points_are_selected_by_frame_and_come_back_from_their_file(tmp_pat
 
 
 def test_a_damaged_file_of_observations_is_refused(tmp_path: Path) -> None:
+    """Truncated, empty, foreign and inconsistent observation files are refused."""
     path = tmp_path / "o.npz"
     write_label_observations(path, seen())
     whole = path.read_bytes()
@@ -196,6 +201,7 @@ def test_the_hash_of_a_map_knows_every_byte_and_name(tmp_path: Path) -> None:
 
 
 def test_points_are_found_by_their_id_and_strangers_are_not() -> None:
+    """Map points are looked up by id, and an unknown id raises KeyError."""
     points = MapPoints(
         np.array([2, 5, 9]), np.zeros((3, 3)), np.zeros((3, 3), np.uint8), np.ones(3, int)
     )
@@ -222,6 +228,7 @@ def database(finished_area: Path, tmp_path: Path) -> Path:
 
 
 def test_descriptors_of_a_map_are_read_and_nothing_is_written(database: Path) -> None:
+    """Descriptors of a map image are read without changing the database."""
     before = database.read_bytes()
     with MapFeatures.open(database) as features:
         found = features.descriptors("flight1/000000.jpg")
@@ -235,6 +242,7 @@ def test_descriptors_of_a_map_are_read_and_nothing_is_written(database: Path) ->
 
 
 def test_a_damaged_database_of_a_map_is_told_in_one_line(database: Path) -> None:
+    """Damaged descriptors and a damaged database each give a one-line error."""
     with sqlite3.connect(database) as connection:
         connection.execute("UPDATE descriptors SET data = substr(data, 1, 1000)")
     connection.close()

@@ -62,6 +62,7 @@ def compared_all(
 
 @pytest.mark.parametrize("move", MOVES)
 def test_it_finds_what_comparing_all_and_masking_finds(move) -> None:
+    """Guided matching gives the matches of an exhaustive comparison masked by epipolar lines."""
     a, b, descriptors, fundamental = views(move)
     rng = np.random.default_rng(4)
     noisy = (descriptors + rng.integers(-20, 20, descriptors.shape)).clip(0, 255).astype(np.uint8)
@@ -109,6 +110,7 @@ def test_what_is_alike_everywhere_gives_few_matches() -> None:
 
 @pytest.mark.parametrize("move", MOVES)
 def test_no_match_is_off_its_line(move) -> None:
+    """No match is farther from its epipolar line than the limit."""
     a, b, descriptors, fundamental = views(move)
     others = np.random.default_rng(6).permutation(b)
     found = match_guided(a, descriptors, others, descriptors, fundamental, OPTIONS)
@@ -118,6 +120,7 @@ def test_no_match_is_off_its_line(move) -> None:
 
 
 def test_without_features_there_are_no_matches() -> None:
+    """An image without features gives no matches."""
     a, b, descriptors, fundamental = views(MOVES[0], 20)
     none = np.empty((0, 2)), np.empty((0, 128), np.uint8)
     assert match_guided(*none, b, descriptors, fundamental, OPTIONS).shape == (0, 2)

@@ -44,6 +44,7 @@ def test_a_reduced_image_gives_keypoints_in_full_size_pixels(texture: np.ndarray
 
 
 def test_no_feature_lies_where_the_mask_is_black(texture: np.ndarray) -> None:
+    """No keypoint is detected in the masked half of an image."""
     mask = np.ones(texture.shape, bool)
     mask[:, :400] = False
     features = extract(texture, mask, FeatureOptions())
@@ -52,6 +53,7 @@ def test_no_feature_lies_where_the_mask_is_black(texture: np.ndarray) -> None:
 
 
 def test_descriptors_have_colmaps_length_and_the_strongest_are_kept(texture: np.ndarray) -> None:
+    """Descriptors have COLMAP's norm of 512, and the number of features is limited."""
     features = extract(texture, None, FeatureOptions(max_features=200))
     assert len(features) == 200
     lengths = np.linalg.norm(features.descriptors.astype(float), axis=1)
@@ -59,6 +61,7 @@ def test_descriptors_have_colmaps_length_and_the_strongest_are_kept(texture: np.
 
 
 def test_an_empty_image_has_no_features() -> None:
+    """A uniform image has no features."""
     assert len(extract(np.full((100, 100), 128, np.uint8), None, FeatureOptions())) == 0
 
 
@@ -104,6 +107,7 @@ def test_a_comparison_that_grows_ends_in_the_matches_of_all_at_once() -> None:
 
 
 def test_no_feature_is_matched_twice() -> None:
+    """Each feature is part of at most one match."""
     same = np.tile(np.arange(128, dtype=np.uint8), (5, 1))
     other = np.random.default_rng(1).integers(0, 255, (50, 128)).astype(np.uint8)
     matches = match_descriptors(same, np.concatenate([same[:1], other]), MatchOptions())
@@ -129,6 +133,7 @@ def scene_pair(
 
 
 def test_verification_keeps_the_true_matches_and_drops_the_others() -> None:
+    """Geometric verification keeps the true matches and removes nearly all false ones."""
     a, b, camera = scene_pair(np.random.default_rng(0), outliers=90)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
@@ -138,6 +143,7 @@ def test_verification_keeps_the_true_matches_and_drops_the_others() -> None:
 
 
 def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -> None:
+    """Chance matches fail verification, and the pair has no inliers."""
     a, b, camera = scene_pair(np.random.default_rng(1), outliers=30, n=30)
     images = {k: ImageForMatching(f, camera, True) for k, f in ((1, a), (2, b))}
     (pair,) = match_pairs(images, [(1, 2)], MatchOptions())
@@ -146,6 +152,7 @@ def test_verification_of_chance_matches_fails_and_says_so_with_an_empty_pair() -
 
 
 def test_no_samples_are_drawn_to_find_fewer_inliers_than_verify_a_pair() -> None:
+    """RANSAC's minimum inlier ratio follows from the inliers that a verified pair needs."""
     options = MatchOptions()
     few = verification_options(options, 25).ransac
     many = verification_options(options, 1000).ransac
@@ -173,6 +180,7 @@ def test_of_images_that_overlap_the_features_on_wrong_lines_are_not_even_matched
 
 
 def test_the_same_pair_is_verified_the_same_way_anywhere() -> None:
+    """Verifying a pair twice gives identical inliers and fundamental matrices."""
     a, b, camera = scene_pair(np.random.default_rng(2), outliers=150)
     images = {k: ImageForMatching(f, camera, False) for k, f in ((1, a), (2, b))}
     (first,), (second,) = (match_pairs(images, [(1, 2)], MatchOptions()) for _ in range(2))

@@ -16,6 +16,7 @@ from spn_data.matching.pairs import (
 
 
 def test_frames_pair_with_the_next_ones_of_their_own_sequence_only() -> None:
+    """Frames are paired with the following frames of their own sequence only."""
     sequences = np.array(["a", "a", "a", "b", "b"])
     assert sequence_pairs(sequences, PairOptions(overlap=1, far_steps=0)) == {
         (0, 1),
@@ -25,6 +26,7 @@ def test_frames_pair_with_the_next_ones_of_their_own_sequence_only() -> None:
 
 
 def test_further_steps_double() -> None:
+    """The distances to further frames of a sequence double."""
     pairs = sequence_pairs(np.array(["a"] * 10), PairOptions(overlap=1, far_steps=3))
     assert {j for i, j in pairs if i == 0} == {1, 2, 4, 8}
 
@@ -32,6 +34,7 @@ def test_further_steps_double() -> None:
 def test_neighbours_in_space_are_found_across_sequences_and_unknown_positions_pair_with_none() -> (
     None
 ):
+    """Nearby frames of different sequences are paired; frames without a position are not."""
     positions = np.array([[0.0, 0, 0], [100, 0, 0], [1, 0, 0], [np.nan, 0, 0]])
     options = PairOptions(spatial_neighbors=3, spatial_max_m=60.0)
     assert spatial_pairs(np.array(["a", "b", "c", "d"]), positions, options) == {(0, 2)}
@@ -49,6 +52,7 @@ def test_of_one_flight_neighbouring_lines_are_paired_and_what_lies_straight_on_i
 
 
 def test_pairs_are_sorted_unique_and_ordered() -> None:
+    """Pairs are sorted and unique, with the smaller index first."""
     rng = np.random.default_rng(0)
     pairs = choose_pairs(
         np.array(["a"] * 12 + ["b"] * 12), rng.normal(size=(24, 3)), None, PairOptions()
@@ -72,12 +76,14 @@ def test_a_place_seen_again_is_found_by_appearance() -> None:
 
 
 def test_an_image_without_features_does_not_stop_the_others() -> None:
+    """Images without features give an empty appearance vector instead of an error."""
     none = np.zeros((0, 128), np.uint8)
     vocabulary = visual_vocabulary([none, none], PairOptions())
     assert vlad_descriptor(none, vocabulary).shape == (0,)
 
 
 def test_few_distinct_features_make_a_vocabulary_without_a_warning() -> None:
+    """Three distinct descriptors give a finite, normalised appearance vector without a warning."""
     few = np.random.default_rng(0).integers(0, 255, (3, 128)).astype(np.uint8)
     vocabulary = visual_vocabulary([np.repeat(few, 40, axis=0)], PairOptions())
     appearance = vlad_descriptor(few, vocabulary)

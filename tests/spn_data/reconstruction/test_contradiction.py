@@ -40,6 +40,7 @@ def turned(scene: Scene, rows: np.ndarray) -> Scene:
 
 
 def test_a_right_model_is_not_contradicted(synthetic: tuple[Path, Scene]) -> None:
+    """No pair contradicts the correct model."""
     path, scene = synthetic
     with MapDatabase.open(path) as database:
         assert len(database.verified_pairs()) > 100

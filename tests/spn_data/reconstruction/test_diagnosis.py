@@ -71,6 +71,7 @@ def registrations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FrameRe
 def test_registered_frames_have_observations_and_an_error_but_no_reason(
     registrations: dict[str, FrameRegistration],
 ) -> None:
+    """Registered frames have observations and a reprojection error, but no reason for failure."""
     registered = [row for row in registrations.values() if row.registered]
     assert len(registered) == 20
     assert all(row.reason == "" and row.observations > 50 for row in registered)
@@ -89,6 +90,7 @@ def test_registered_frames_have_observations_and_an_error_but_no_reason(
 def test_a_missing_frame_says_why(
     registrations: dict[str, FrameRegistration], name: str, reason: str
 ) -> None:
+    """Each frame that was not registered has the expected reason."""
     row = registrations[name]
     assert not row.registered
     assert np.isnan(row.error_px)
@@ -96,6 +98,8 @@ def test_a_missing_frame_says_why(
 
 
 def test_missing_passages_are_runs_of_one_sequence_with_their_times_and_commonest_reason() -> None:
+    """Missing frames are grouped into runs per sequence, with times and the commonest reason."""
+
     def row(name: str, reason: str) -> FrameRegistration:
         return FrameRegistration(name, not reason, reason, 500, 3, 0, float("nan"))
 

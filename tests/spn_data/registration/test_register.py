@@ -166,6 +166,7 @@ def test_the_points_that_frames_see_are_where_their_poses_put_them(registered: P
 
 
 def test_the_same_again_is_left_alone(area: Path, flight2: Path) -> None:
+    """Registering the same sequence again changes no file."""
     before = {p: p.stat().st_mtime_ns for p in (area / EVALUATION).rglob("*")}
     again = register(area, flight2 / "flight2.mp4", "--name", "medium", *FAST, "--all-frames")
     assert f"{EVALUATION}/medium: unchanged since" in again.stdout
@@ -192,6 +193,7 @@ def test_another_place_fails_entirely_and_says_so(bare: Path, other_place: Path)
 def test_real_photos_of_another_place_fail_entirely(
     bare: Path, shared_data: Path, tmp_path: Path
 ) -> None:
+    """Real photos of another place all fail, each with a reason."""
     photos = tmp_path / "beach"
     photos.mkdir()
     for file in sorted((shared_data / "photos-dji-xmp").glob("*.JPG"))[:5]:
@@ -207,6 +209,7 @@ def test_real_photos_of_another_place_fail_entirely(
 def test_other_options_need_overwrite_and_the_first_ones_give_the_first_result(
     area: Path, flight2: Path
 ) -> None:
+    """Other options need --overwrite, and the original options reproduce the original poses."""
     first = poses_file(area).read_bytes()
     options = (flight2 / "flight2.mp4", "--name", "medium", "--threads", "1")
     refused = run("register", *options, "--rate", "2", "--area", area)
@@ -256,6 +259,7 @@ def test_what_is_part_of_the_map_is_refused(bare: Path, flight1: Path, flight2: 
 
 @pytest.mark.parametrize("name", ["../medium", "two words", ".hidden", "", "a/b", "x" * 81])
 def test_a_name_that_cannot_be_a_folder_is_refused(bare: Path, flight2: Path, name: str) -> None:
+    """A sequence name that is not a valid folder name is refused before anything is written."""
     result = run("register", flight2, "--name", name, "--area", bare)
     assert result.exit_code == 1
     assert "is not a valid sequence name" in result.stderr
@@ -265,6 +269,7 @@ def test_a_name_that_cannot_be_a_folder_is_refused(bare: Path, flight2: Path, na
 def test_several_sequences_are_registered_one_at_a_time(
     bare: Path, flight2: Path, other_place: Path, tmp_path: Path
 ) -> None:
+    """A folder with two sequences is refused, and the error names both."""
     folder = tmp_path / "day"
     folder.mkdir()
     shutil.copy(flight2 / "flight2.mp4", folder)
@@ -282,12 +287,14 @@ def test_several_sequences_are_registered_one_at_a_time(
     ],
 )
 def test_half_a_command_is_a_usage_error(bare: Path, arguments: list[str], message: str) -> None:
+    """Incomplete option combinations are usage errors with exit code 2."""
     result = run("register", *arguments, "--area", bare)
     assert result.exit_code == 2
     assert message in result.stderr
 
 
 def test_an_area_without_a_map_is_told_what_comes_first(flight2: Path, tmp_path: Path) -> None:
+    """Without a map, the error says to run `spn-data reconstruct` first."""
     result = run("register", flight2, "--area", tmp_path)
     assert result.exit_code == 1
     assert "is missing; run spn-data reconstruct first" in result.stderr
@@ -350,6 +357,7 @@ def test_a_relative_video_is_found_from_any_folder_and_with_the_area_moved_along
 def test_a_remembered_folder_without_videos_does_not_hide_the_one_named(
     bare: Path, flight1: Path, tmp_path: Path
 ) -> None:
+    """A recorded folder that is now empty does not take precedence over --video."""
     emptied = tmp_path / "emptied"
     emptied.mkdir()
     facts = bare / "area.toml"
@@ -376,6 +384,7 @@ def test_frames_between_follow_a_lens_that_was_kept(
 
 
 def test_groups_of_the_split_are_no_names_of_sequences(bare: Path, flight2: Path) -> None:
+    """The names of split groups are refused as sequence names."""
     for name in ("train", "validation", "test"):
         result = run("register", flight2, "--name", name, "--area", bare)
         assert result.exit_code == 1
@@ -394,6 +403,7 @@ def test_an_evaluation_flight_stays_out_of_the_map(registered: Path, flight2: Pa
 def test_a_mapping_flight_does_not_take_an_evaluation_sequence_s_name(
     registered: Path, other_place: Path, tmp_path: Path
 ) -> None:
+    """A new mapping flight named like an evaluation sequence gets a numbered name."""
     video = tmp_path / "Medium.mp4"
     shutil.copy(other_place, video)
     found = plan([video], FramesOptions(), extended=Area(registered), tested=Area(registered))
@@ -411,12 +421,14 @@ def test_what_is_left_of_a_removed_sequence_is_named(area: Path) -> None:
 
 
 def test_frames_between_need_a_map(tmp_path: Path) -> None:
+    """--all-frames without a map gives an error that names the missing stage."""
     result = run("register", "--all-frames", "--area", tmp_path)
     assert result.exit_code == 1
     assert "2-model is missing; run spn-data reconstruct first" in result.stderr
 
 
 def test_an_unknown_sequence_is_named(bare: Path) -> None:
+    """An unknown sequence name is repeated in the error."""
     result = run("register", "--all-frames", "--name", "nothing", "--area", bare)
     assert result.exit_code == 1
     assert "there is no sequence 'nothing'" in result.stderr

@@ -133,6 +133,7 @@ def test_derivatives_are_those_of_finite_differences(camera: Camera) -> None:
 
 
 def test_a_point_behind_the_camera_counts_as_far_and_pulls_at_nothing() -> None:
+    """A point behind the camera gets a residual of 1000 px and zero derivatives."""
     state, observations = problem(frames=2, own=0)
     places = observations.map_xyz.copy()
     places[0] = state.poses.centers[0] - 5 * state.poses.rotations[0][2]
@@ -223,6 +224,7 @@ def test_gross_errors_hardly_move_the_result() -> None:
 
 
 def test_a_lens_that_is_held_stays_as_it_is() -> None:
+    """A fixed lens is unchanged by the adjustment."""
     true, observations = problem(noise_px=0.5)
     found = adjust(disturbed(true), observations, scale_px=1.0, lens=())
     assert np.array_equal(found.camera.params, disturbed(true).camera.params)

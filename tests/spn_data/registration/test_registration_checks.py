@@ -68,6 +68,7 @@ def judged(found: Evidence, posed: np.ndarray | None = None) -> PoseVerdict:
 
 
 def test_frames_of_which_all_is_well_are_accepted() -> None:
+    """Frames with sound evidence are accepted without a reason."""
     verdict = judged(evidence())
     assert verdict.accepted.all()
     assert verdict.reason == ("", "", "")
@@ -110,6 +111,7 @@ def test_what_a_neighbour_can_make_good_fails_without_one(
 
 @pytest.mark.parametrize(("values", "reason"), NEED_SUPPORT)
 def test_a_neighbour_that_stands_makes_it_good(values: dict[str, int], reason: str) -> None:
+    """A weak frame is accepted if an accepted neighbour confirms its pose."""
     assert judged(with_frame(evidence(), 1, **values)).accepted.all()
 
 
@@ -140,6 +142,7 @@ def test_where_no_majority_holds_all_fail() -> None:
 
 
 def test_a_neighbour_with_few_matches_or_no_pose_of_its_own_does_not_testify() -> None:
+    """Neighbours with few matches, a refused pose or no pose do not vote."""
     few = replace(evidence(2, {(0, 1): 0.0}), matches=np.array([29]))
     assert judged(few).accepted.all()
     refused = with_frame(evidence(2, {(0, 1): 0.0}), 0, inliers=3)
@@ -149,6 +152,7 @@ def test_a_neighbour_with_few_matches_or_no_pose_of_its_own_does_not_testify() -
 
 
 def test_a_frame_without_a_pose_says_why() -> None:
+    """A frame without a pose has the reason for it."""
     found = with_frame(evidence(), 1, putative=0)
     verdict = judged(found, np.array([False, False, True]))
     assert verdict.reason[0] == "no pose agrees with its 400 matches with the map"
@@ -367,6 +371,7 @@ def test_what_failed_pulls_at_nothing_that_stands() -> None:
 
 
 def test_where_nothing_stands_there_is_no_covariance() -> None:
+    """If no frame is accepted, there is no covariance and each frame has a reason."""
     made = flight(3)
     found = accepted(made, [np.zeros((0, 2), np.int64)] * 3)
     assert not found.solution.posed.any()

@@ -45,6 +45,7 @@ def test_a_track_that_meets_a_frame_twice_is_left_out() -> None:
 
 @pytest.mark.parametrize("matched", [{}, pairs((0, 1, []))])
 def test_no_matches_make_no_tracks(matched: dict[tuple[int, int], np.ndarray]) -> None:
+    """Without matches there are no tracks."""
     found = find_tracks(matched, [4, 4])
     assert found.count == 0
     assert len(found.frame) == len(found.feature) == 0
@@ -86,6 +87,7 @@ POINT = np.array([11.0, 0.5, 3.0])
 
 
 def test_exact_rays_meet_in_their_point() -> None:
+    """Exact measurements triangulate to the exact point."""
     made = flight(6)
     found = seen_at(made, project(made, POINT, [1, 2, 4]), [1, 2, 4])
     assert np.abs(found - POINT).max() < 1e-9
@@ -121,6 +123,7 @@ def test_noise_moves_a_point_as_far_as_its_angle_says() -> None:
 def test_what_does_not_determine_a_point_gives_none(
     frames: list[int], off: list[float], limit: float
 ) -> None:
+    """A single frame, nearly parallel rays and a wrong measurement each give no point."""
     made = flight(6)
     pixels = project(made, POINT, frames)
     pixels[-1] += off

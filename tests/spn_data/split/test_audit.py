@@ -84,6 +84,7 @@ EVALUATION_SOURCES = {"medium": {"medium/medium.mp4": "bbbb"}}
 
 
 def test_evaluation_frames_apart_from_the_map_pass(mapping, evaluation):
+    """Evaluation frames that are not in the map pass."""
     names = mapping.names[~mapping.tracked].tolist()
     found = audit.check_not_in_map(names, SOURCES, evaluation, EVALUATION_SOURCES)
     assert found.verdict is AuditVerdict.PASS
@@ -91,6 +92,7 @@ def test_evaluation_frames_apart_from_the_map_pass(mapping, evaluation):
 
 
 def test_an_evaluation_frame_among_the_maps_images_is_found(mapping, evaluation):
+    """An evaluation frame among the images of the map is named."""
     names = [*mapping.names.tolist(), "medium/f00007.jpg"]
     found = audit.check_not_in_map(names, SOURCES, evaluation, EVALUATION_SOURCES)
     assert_fails(found, "medium/f00007.jpg")
@@ -104,6 +106,7 @@ def test_an_evaluation_video_that_was_mapped_is_found_under_any_name(mapping, ev
 
 
 def test_an_evaluation_sequence_of_unknown_source_is_found(mapping, evaluation):
+    """An evaluation sequence whose source was not recorded fails."""
     found = audit.check_not_in_map(mapping.names.tolist(), SOURCES, evaluation, {})
     assert_fails(found, "medium", "not recorded")
 
@@ -136,6 +139,7 @@ def test_a_map_hash_that_changed_is_found():
 
 
 def test_a_sound_split_passes_every_check_of_blocks(mapping, split):
+    """A valid split passes the checks of blocks and gaps."""
     for check in (audit.check_blocks, audit.check_gap):
         assert check(mapping, split).verdict is AuditVerdict.PASS
 
@@ -152,6 +156,7 @@ def test_a_training_frame_within_a_block_is_found(mapping, split, tracked):
 
 
 def test_a_held_out_frame_outside_all_blocks_is_found(mapping, split):
+    """A validation frame outside all blocks is named."""
     outside = mapping.names[split.groups_of(mapping.names) == TRAIN][0]
     assert_fails(audit.check_blocks(mapping, regrouped(split, outside, VALIDATION)), outside)
 
@@ -271,6 +276,7 @@ def test_labels_that_are_not_finite_are_found(parts):
 
 
 def test_a_frame_that_the_split_lacks_or_holds_twice_is_found(parts, split):
+    """A frame that is missing from the split or listed twice is named."""
     assert audit_files.check_completeness(parts, split).verdict is AuditVerdict.PASS
     name = split.names[0]
     missing = replace(split, names=split.names[1:], group=split.group[1:], reason=split.reason[1:])
@@ -302,6 +308,7 @@ def test_a_frame_in_a_group_that_is_not_its_own_is_found(parts, split):
 
 
 def test_a_frame_left_out_without_a_reason_is_found(parts, split):
+    """A frame left out without a reason is named."""
     bare = regrouped(split, "one/f00000.jpg", LEFT_OUT)
     assert_fails(audit_files.check_completeness(parts, bare), "one/f00000.jpg", "without a reason")
 
@@ -368,6 +375,7 @@ def test_a_measurement_of_a_held_out_frame_in_the_model_is_found(mapping, split)
 
 
 def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
+    """A test block in a mapping flight gives a notice that results are optimistic."""
     assert audit.check_test_independence(split).verdict is AuditVerdict.PASS
     chosen, tracked = mapping.select(~mapping.tracked), mapping.select(mapping.tracked)
     alone = make_split(chosen, tracked, {}, SplitOptions())
@@ -377,5 +385,6 @@ def test_a_test_of_a_mapping_flight_is_noticed(mapping, split):
 
 
 def test_a_stale_split_fails():
+    """A split older than a redone stage fails."""
     assert audit.check_up_to_date(None).verdict is AuditVerdict.PASS
     assert audit.has_failed([audit.check_up_to_date("3-geo was redone since")])

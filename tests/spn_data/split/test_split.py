@@ -266,6 +266,7 @@ def test_too_few_frames_are_an_error_that_names_the_way_out():
 
 
 def test_nothing_registered_is_an_error(evaluation):
+    """If no mapping frame has a pose, there is an error."""
     lost = failed(flight("a", line(30)), slice(None), "too few matches")
     with pytest.raises(GeometryError, match="no mapping frame has a pose"):
         make_split(lost, nothing(), evaluation, SplitOptions())
@@ -284,6 +285,7 @@ def test_left_out_dense_frames_are_in_no_group(area, evaluation):
 
 @pytest.mark.parametrize("name", ["train", "validation", "test"])
 def test_a_sequence_may_not_be_called_like_a_group(area, evaluation, name):
+    """A sequence with the name of a group is refused."""
     with pytest.raises(StageError, match="may not be called"):
         make_split(area[0], nothing(), {name: evaluation["medium"]}, SplitOptions())
 
@@ -352,6 +354,7 @@ def test_a_band_of_heights_is_held_out(evaluation):
 
 @pytest.mark.parametrize("policy", [Policy.SPACE, Policy.HEIGHT])
 def test_space_and_height_need_metres(area, evaluation, policy):
+    """Splits by space or height are refused if the area is not in metres."""
     with pytest.raises(GeometryError, match="needs metres"):
         make_split(*area, evaluation, SplitOptions(validation=policy), metric=False)
 
@@ -404,6 +407,7 @@ def test_the_file_says_what_validation_cannot_be_free_of(area, tmp_path: Path):
     ],
 )
 def test_a_file_that_is_no_split_is_refused(area, evaluation, tmp_path: Path, before, after):
+    """A malformed split.json is refused, and the error names the file."""
     path = tmp_path / "split.json"
     write_split(path, make_split(area[0], nothing(), evaluation, SplitOptions()))
     assert before in path.read_text()
@@ -416,5 +420,6 @@ def test_a_file_that_is_no_split_is_refused(area, evaluation, tmp_path: Path, be
     "wrong", [{"validation_share": 0.0}, {"test_share": 1.0}, {"gap_s": -1.0}, {"cell_m": 0.0}]
 )
 def test_options_that_mean_nothing_are_refused(wrong):
+    """Options outside their valid range are refused."""
     with pytest.raises(ValueError, match=r"must be between|at least"):
         SplitOptions(**wrong)

@@ -37,6 +37,7 @@ def full_track(n: int = 5, start_s: float = 0.0) -> Telemetry:
 
 
 def test_a_track_comes_back_exactly(tmp_path: Path) -> None:
+    """A track read back from its file equals the one written."""
     track = full_track()
     write_track(tmp_path / "track.csv", track)
     again = read_track(tmp_path / "track.csv")
@@ -50,6 +51,7 @@ def test_a_track_comes_back_exactly(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["", "# {}\n", "not a track\nx\n", "cut"])
 def test_a_damaged_track_is_a_format_error(tmp_path: Path, damage: str) -> None:
+    """A truncated or foreign track file raises FormatError."""
     path = tmp_path / "track.csv"
     write_track(path, full_track())
     text = path.read_text()
@@ -59,6 +61,7 @@ def test_a_damaged_track_is_a_format_error(tmp_path: Path, damage: str) -> None:
 
 
 def test_parts_of_one_recording_are_joined_and_overlap_is_dropped() -> None:
+    """Parts of a recording are joined in time order, and overlapping records are dropped."""
     joined = Telemetry.concatenate([full_track(5), full_track(4, start_s=1.0)])
     assert np.all(np.diff(joined.time_s) > 0)
     assert joined.time_s[0] == 0.0

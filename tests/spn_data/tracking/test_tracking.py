@@ -176,6 +176,7 @@ def test_a_frame_of_something_else_fails_and_those_around_it_do_not(world: World
     ],
 )
 def test_each_check_names_its_reason(world: World, options: TrackingOptions, reason: str) -> None:
+    """Each check refuses the frames with its own reason."""
     segment = world.segment(15, 20)
     for frame in track_segment(segment, options):
         assert reason in frame.reason

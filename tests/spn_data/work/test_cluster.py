@@ -125,6 +125,7 @@ def test_every_result_arrives_once_though_a_worker_is_killed(started: Cluster) -
 
 
 def test_the_error_of_a_call_is_raised_here(started: Cluster) -> None:
+    """An error raised in a worker is raised in the calling process."""
     started.add_worker()
     batch = ("a.jpg", ("a.jpg", b"no image", None, FeatureOptions()))
     with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded as an image"):
@@ -143,6 +144,7 @@ def test_a_worker_with_other_code_is_refused(started: Cluster, tmp_path: Path) -
 
 
 def test_a_worker_without_this_program_is_refused(started: Cluster, tmp_path: Path) -> None:
+    """A worker that cannot import this program is refused."""
     empty = tmp_path / "nothing" / "spn_data"
     empty.mkdir(parents=True)
     (empty / "__init__.py").touch()
@@ -152,6 +154,7 @@ def test_a_worker_without_this_program_is_refused(started: Cluster, tmp_path: Pa
 
 
 def test_a_call_is_refused_by_a_worker_that_joined_later_with_another_version() -> None:
+    """A worker with another package version refuses the call, whenever it joined."""
     expected = {**fingerprint(), "numpy": "1.0"}
     with pytest.raises(InputError, match=r"has numpy .*, this program 1\.0"):
         cluster.call(expected, str.format, ("a",))
@@ -159,6 +162,7 @@ def test_a_call_is_refused_by_a_worker_that_joined_later_with_another_version() 
 
 
 def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unreachable scheduler or an invalid address gives a one-line error."""
     monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
     with pytest.raises(InputError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         run_on_cluster("tcp://127.0.0.1:9", triple, [("a", (1,))], print)
@@ -167,12 +171,14 @@ def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_workers_are_one_line(started: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scheduler without workers gives a one-line error."""
     monkeypatch.setattr(cluster, "_WAIT_FOR_WORKERS_S", 0.5)
     with pytest.raises(InputError, match="has no workers"):
         run_on_cluster(started.address, triple, [("a", (1,))], print)
 
 
 def test_without_dask_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without Dask, the error gives the command that installs it."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'squeezeposenet-toolkit\[cluster\]'"):
         run_on_cluster("tcp://127.0.0.1:9", triple, [("a", (1,))], print)

@@ -58,12 +58,14 @@ def held_mb_before(allocating_mb: int) -> float:
 
 
 def test_every_result_arrives_once() -> None:
+    """Each batch gives exactly one result."""
     results: list[int] = []
     run_batches(square, ((str(x), (x,)) for x in range(20)), workers=2, on_result=results.append)
     assert sorted(results) == [x * x for x in range(20)]
 
 
 def test_a_killed_worker_costs_only_the_batches_in_flight(tmp_path: Path) -> None:
+    """After a worker is killed, its batches are repeated and every result arrives once."""
     results: list[int] = []
     batches = ((str(x), (str(tmp_path / "died"), x)) for x in range(8))
     run_batches(die_once, batches, workers=2, on_result=results.append)
@@ -72,6 +74,7 @@ def test_a_killed_worker_costs_only_the_batches_in_flight(tmp_path: Path) -> Non
 
 
 def test_a_batch_that_crashes_twice_is_named_and_the_others_are_kept() -> None:
+    """A batch that crashes twice is named in the error, and results of other batches are kept."""
     results: list[int] = []
     with pytest.raises(WorkerDiedError, match="photo 2: a native library crashed on it twice"):
         run_batches(
@@ -81,17 +84,20 @@ def test_a_batch_that_crashes_twice_is_named_and_the_others_are_kept() -> None:
 
 
 def test_an_exception_of_the_function_comes_back() -> None:
+    """An exception raised in a worker is raised in the parent process."""
     with pytest.raises(ValueError, match="no 1"):
         run_batches(fail, [("1", (1,))], workers=1, on_result=print)
 
 
 def test_workers_compute_on_one_thread() -> None:
+    """Numerical libraries use one thread in each worker."""
     results: list[str] = []
     run_batches(blas_threads, [("a", ())], workers=1, on_result=results.append)
     assert results == ["1"]
 
 
 def test_workers_stay_from_one_run_to_the_next_and_end_with_their_team() -> None:
+    """Worker processes are reused by the next run and end with their pool."""
     first: list[int] = []
     second: list[int] = []
     with WorkerPool(2) as team:
@@ -103,6 +109,7 @@ def test_workers_stay_from_one_run_to_the_next_and_end_with_their_team() -> None
 
 
 def test_a_team_works_on_after_an_exception() -> None:
+    """A pool still works after an exception in a batch."""
     results: list[int] = []
     with WorkerPool(2) as team:
         with pytest.raises(ValueError, match="no 1"):
@@ -112,6 +119,7 @@ def test_a_team_works_on_after_an_exception() -> None:
 
 
 def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
+    """The CPU time of workers is counted once, whether they are running or have ended."""
     before = cpu_seconds()
     with WorkerPool(1) as team:
         team.run(work_for, [("a", (1.0,))], print)
@@ -123,6 +131,7 @@ def test_cpu_time_of_workers_counts_once_before_and_after_they_end() -> None:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do as they like")
 def test_a_worker_keeps_its_memory_from_call_to_call_and_gives_it_back_when_it_idles() -> None:
+    """A worker keeps freed memory between calls and returns it to the system when idle."""
     held: list[float] = []
     with WorkerPool(1) as team:
         team.run(held_mb_before, [("a", (200,)), ("b", (200,))], held.append)
@@ -133,6 +142,7 @@ def test_a_worker_keeps_its_memory_from_call_to_call_and_gives_it_back_when_it_i
 
 
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    """Workers end if their parent process is killed."""
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, sys, time\n"
