@@ -29,9 +29,9 @@ def test_a_long_header_cell_takes_no_time(cell):
 def test_the_last_brackets_of_a_cell_hold_its_unit():
     """The last brackets of a header cell hold its unit; others belong to the name and blanks are ignored."""
     columns = parse_header([" OSD.height above takeoff [ ft ] ", "lat( deg )", "lon (x) (deg)"])
-    assert {name: column.unit for name, column in columns.items()} == {
-        "rel_alt": "ft",
-        "latitude": "deg",
+    assert {name: [c.unit for c in found] for name, found in columns.items()} == {
+        "rel_alt": ["ft"],
+        "latitude": ["deg"],
     }
 
 

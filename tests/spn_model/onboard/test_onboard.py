@@ -223,7 +223,11 @@ def test_json_lines_hold_the_same(bundle, sources, camera_file):
     [
         ("none.jpg", None, "none.jpg: does not exist"),
         ("bad.jpg", b"no image", "bad.jpg: cannot be read as an image"),
-        ("bad.mp4", b"no video", "bad.mp4: cannot be decoded as a video"),
+        (
+            "bad.mp4",
+            b"no video",
+            "bad.mp4: cannot be decoded as a video; playlists, URLs and streams are not read",
+        ),
     ],
 )
 def test_a_source_that_is_none_is_told_in_one_line(
