@@ -44,6 +44,19 @@ def photos_in_order(paths: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(named)
 
 
+def one_file_per_photo(photos: Sequence[Path], ignored: list[tuple[Path, str]]) -> list[Path]:
+    """Leave out the DNG or HEIC of which there is a JPEG of the same name in the same folder."""
+    jpegs = {(p.parent, p.stem.lower()): p for p in photos if p.suffix.lower() in (".jpg", ".jpeg")}
+    kept = []
+    for path in photos:
+        twin = jpegs.get((path.parent, path.stem.lower()))
+        if twin is not None and path.suffix.lower() in (".dng", ".heic", ".heif"):
+            ignored.append((path, f"the same photo as {twin.name}, which is used"))
+        else:
+            kept.append(path)
+    return kept
+
+
 def _by_time(named: Sequence[Path], times: Sequence[float | None]) -> tuple[Path, ...]:
     """Sort photos stably by their times; None is the time of the photo before."""
     last = -math.inf

@@ -14,12 +14,11 @@ import numpy as np
 from PIL import Image
 
 from spn_data.errors import InputError
+from spn_data.media.photo_file import DAMAGE, develop, is_raw, open_photo, raw_size
 from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
-MAX_PHOTO_PIXELS = 500_000_000
 _MIN_RANGE_16 = 64 * 256  # of 16-bit values: a quarter of the grey levels
 _MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
-_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")  # JPEG includes MPO
 _ORIENTATION = 0x0112
 _DIAGONAL_35MM = 43.267
 _TURNS = {
@@ -91,7 +90,6 @@ def read_headers(paths: Sequence[Path]) -> PhotoHeaders:
     for path in paths:
         try:
             photo = read_photo(path)
-            _check_size(photo.width, photo.height, path)
         except InputError as error:
             metadata.append(None)
             problem.append(_message_without_path(error, path))
@@ -107,9 +105,9 @@ def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
     Parameters
     ----------
     path : Path
-        A JPEG, PNG, TIFF, BMP or WebP.
+        A JPEG, PNG, TIFF, BMP, WebP, HEIC or DNG.
     upright : bool
-        False to leave the pixels as they are stored (not possible for a TIFF).
+        False to leave the pixels as they are stored (not possible for a TIFF or HEIC).
 
     Returns
     -------
@@ -122,6 +120,8 @@ def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
         If the photo is damaged, too large or of a pixel format without a known range, or uses so few of
         its 16 bits that hardly any grey levels would be left.
     """
+    if is_raw(path):
+        return np.ascontiguousarray(develop(path, upright=upright)[:, :, ::-1])
     with _open_image(path) as image:
         _check_deep_colour(image, path)
         rgb = _to_8_bits(_upright(image) if upright else image, path).convert("RGB")
@@ -130,15 +130,23 @@ def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
 
 def decode_photo_gray(path: Path, *, max_width: int) -> np.ndarray:
     """Decode an upright grey image (h, w) uint8 at most `max_width` wide; JPEGs are decoded reduced."""
-    with _open_image(path) as image:
-        _check_deep_colour(image, path)
-        image.draft("L", (max_width, max_width * image.height // max(image.width, 1)))
-        gray = np.asarray(_to_8_bits(_upright(image), path).convert("L"))
+    if is_raw(path):
+        half_size = min(raw_size(path)) >= 2 * max_width
+        gray = cv2.cvtColor(develop(path, half_size=half_size), cv2.COLOR_RGB2GRAY)
+    else:
+        gray = _decode_gray(path, max_width)
     scale = max_width / gray.shape[1]
     if scale < 1:
         size = (max_width, max(1, round(gray.shape[0] * scale)))
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(gray)
+
+
+def _decode_gray(path: Path, max_width: int) -> np.ndarray:
+    with _open_image(path) as image:
+        _check_deep_colour(image, path)
+        image.draft("L", (max_width, max_width * image.height // max(image.width, 1)))
+        return np.asarray(_to_8_bits(_upright(image), path).convert("L"))
 
 
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
@@ -183,30 +191,20 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
     """Open a photo after checking its size; damage becomes an InputError."""
     try:
         with warnings.catch_warnings():
-            # `read_headers` and the limit below report large photos, `read_photo` reports damaged EXIF.
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=_FORMATS) as image:
-                _check_size(image.width, image.height, path)
+            warnings.simplefilter("ignore")  # `read_photo` reports damaged EXIF
+            with open_photo(path) as image:
                 yield image
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        reason = (
-            str(error) if isinstance(error, Image.DecompressionBombError) else _damage_reason(error)
-        )
-        raise InputError(f"cannot be read as an image: {reason}", path=path) from error
-
-
-def _check_size(width: int, height: int, path: Path) -> None:
-    """Refuse a photo whose header claims an absurd size."""
-    if width * height > MAX_PHOTO_PIXELS:
+    except DAMAGE as error:
         raise InputError(
-            f"{width}x{height} pixels exceed the limit of {MAX_PHOTO_PIXELS / 1e6:.0f} megapixels",
-            path=path,
-        )
+            f"cannot be read as an image: {_damage_reason(error)}", path=path
+        ) from error
 
 
 def _upright(image: Image.Image) -> Image.Image:
     """Apply the EXIF orientation, unless the EXIF is damaged, which `read_photo` reports."""
     image.load()  # Pillow turns a TIFF upright on loading and then reports no orientation
+    if image.format == "HEIF":  # libheif has turned it
+        return image
     try:
         orientation = image.getexif().get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):

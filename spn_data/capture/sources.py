@@ -13,8 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from spn_data.capture.photo_order import photos_in_order
+from spn_data.capture.photo_order import one_file_per_photo, photos_in_order
 from spn_data.errors import InputError
+from spn_data.media import photo_file
 
 if TYPE_CHECKING:
     from spn_data.capture.video import VideoInfo
@@ -23,9 +24,10 @@ _logger = logging.getLogger(__name__)
 
 _MPEG_SUFFIXES = (".mp4", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts")
 VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".wmv", ".flv"])
-PHOTO_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"])
+PHOTO_SUFFIXES = frozenset(photo_file.PHOTO_SUFFIXES)
+EVENTS_SUFFIX = ".mrk"  # DJI: exposures of the photos in the same folder
 SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
-TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv"}
+TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
 # Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
@@ -140,10 +142,12 @@ def discover(
         # Telemetry of a photo folder has the folder's name, or is the only file of its kind in it.
         here = [t for t in by_kind["telemetry"] if t.parent == place]
         used = {t for s in sources for t in s.telemetry}
+        events = tuple(t for t in here if t.suffix.lower() == EVENTS_SUFFIX)
+        used.update(events)
         free = [t for t in here if t not in used and t.suffix.lower() not in SUBTITLE_SUFFIXES]
         named = tuple(t for t in free if t.stem.lower() == place.resolve().name.lower())
         telemetry = named or (tuple(free) if len(free) == 1 else ())
-        sources.append(Source(name, SourceKind.PHOTOS, photos, telemetry))
+        sources.append(Source(name, SourceKind.PHOTOS, photos, (*events, *telemetry)))
     used = {t for s in sources for t in s.telemetry}
     for path in by_kind["telemetry"]:
         if path not in used and folder.is_dir():
@@ -239,20 +243,30 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
             kinds["video"].append(path)
         elif suffix in PHOTO_SUFFIXES:
             kinds["photo"].append(path)
+        elif suffix in photo_file.RAW_SUFFIXES:
+            ignored.append((path, photo_file.RAW_REMEDY))
         elif suffix in TELEMETRY_SUFFIXES:
             kinds["telemetry"].append(path)
         else:
             ignored.append((path, "not a video, photo or telemetry file"))
+    kinds["photo"] = one_file_per_photo(kinds["photo"], ignored)
+    photo_file.check_readers(kinds["photo"])
     return kinds
 
 
 def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
     if not folder.is_dir():
+        if folder.suffix.lower() in photo_file.RAW_SUFFIXES:
+            return f"is a {photo_file.RAW_REMEDY}"
         return f"is not a video or photo: unsupported suffix {folder.suffix or '(none)'}"
     links = sum(why.startswith("broken link") for _, why in ignored)
+    raw = sum(why == photo_file.RAW_REMEDY for _, why in ignored)
     found = f"; {len(ignored)} other files" if ignored else "; the folder is empty"
     return (
-        "contains no video or photo" + found + (f", {links} of them broken links" if links else "")
+        "contains no video or photo"
+        + found
+        + (f", {links} of them broken links" if links else "")
+        + (f", {raw} of them RAW photos: convert them to DNG or JPEG" if raw else "")
     )
 
 

@@ -20,13 +20,15 @@ from spn_data.dataset.cambridge import (
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
+from spn_data.media.photo_file import PHOTO_SUFFIXES
 
 LISTS = {
     Role.TRAIN: TRAIN_LIST,
     Role.VALIDATION: VALIDATION_LIST,
     Role.TEST: TEST_LIST,
 }
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".PNG", ".JPG", ".JPEG", ".BMP", ".WEBP")
+# A DNG is another image than its JPEG: its lens is not corrected.
+_SUFFIXES = [each for s in PHOTO_SUFFIXES if s != ".dng" for each in (s, s.upper())]
 # Networks compute in float32: a coordinate has 24 bits.
 _COARSE_SHARE = 1e-4  # of the frames' median distance from their middle, at least of one unit
 _FAR_TIMES = 5.0

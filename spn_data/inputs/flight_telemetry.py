@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from spn_data.capture.candidates import Candidates
-from spn_data.capture.sources import SUBTITLE_SUFFIXES, Source, SourceKind
+from spn_data.capture.sources import EVENTS_SUFFIX, SUBTITLE_SUFFIXES, Source, SourceKind
 from spn_data.capture.video import VideoInfo, probe
 from spn_data.errors import InputError
 from spn_data.inputs.telemetry_clocks import ImageClock, check_overlap, on_image_clock
+from spn_data.telemetry.mrk import read_mrk, with_exposures
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
@@ -166,9 +167,18 @@ def _photo_telemetry(
     source: Source, candidates: Candidates, accept: bool, offset_s: float | None
 ) -> Telemetry | None:
     own = candidates.photo_telemetry
+    events = [path for path in source.telemetry if path.suffix.lower() == EVENTS_SUFFIX]
+    if own is not None and events and accept:
+        note = f"{', '.join(path.name for path in events)} is not used (--any-telemetry)"
+        own = replace(own, notes=(*own.notes, note))
+    elif own is not None and events:
+        names = [path.name for path in source.parts]
+        own = with_exposures(own, names, [read_mrk(path) for path in events])
     if own is not None and own.has_fix.any():
         return own
     for path in source.telemetry:
+        if path in events:
+            continue
         log = read_telemetry(path)
         if own is None or not _are_dated(own) or not np.isfinite(log.utc_s).any():
             if accept:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,26 +10,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.media.photo_file import DAMAGE, is_raw, open_photo, raw_size
 from spn_data.telemetry.accuracy import NAN_SIGMA, Sigma, sigma_from_dop
-from spn_data.telemetry.photo_tags import NAN, exif_tags, number, positive, text, xmp_properties
+from spn_data.telemetry.drone_xmp import DroneXmp, describe_rtk, read_drone_xmp
+from spn_data.telemetry.photo_tags import (
+    NAN,
+    exif_tags,
+    number,
+    positive,
+    tags_of_raw,
+    text,
+    xmp_properties,
+)
 from spn_data.telemetry.photo_time import exposure_times, natural_order
 from spn_data.telemetry.placeholders import without_placeholders
 from spn_data.telemetry.track import Telemetry
-
-MAX_PHOTO_BYTES = 1_000_000_000
 
 _MAKE, _MODEL, _ORIENTATION = 271, 272, 274
 _FOCAL_MM, _FOCAL_35MM, _LENS_MODEL = 37386, 41989, 42036
 _GPS_LAT, _GPS_LON, _GPS_ALT_REF, _GPS_ALT = 2, 4, 5, 6
 _GPS_MEASURE_MODE, _GPS_DOP, _GPS_H_ERROR = 10, 11, 31
-
-# Files choose their own prefixes; the URI identifies the namespace.
-_DJI = "{http://www.dji.com/drone-dji/1.0/}"
-_PIX4D = "{http://pix4d.com/camera/1.0}"
+_XMP = 700
+_SAME_HEIGHT_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class PhotoMetadata:
 
 
 def read_photo(path: Path | str) -> PhotoMetadata:
-    """Read the metadata of a JPEG, PNG, TIFF, BMP or WebP.
+    """Read the metadata of a JPEG, PNG, TIFF, BMP, WebP, HEIC or DNG.
 
     Parameters
     ----------
@@ -121,44 +125,27 @@ def read_photo(path: Path | str) -> PhotoMetadata:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            if path.stat().st_size > MAX_PHOTO_BYTES:
-                raise InputError(
-                    f"is larger than {MAX_PHOTO_BYTES / 1e9:.0f} GB, the limit for a photo",
-                    path=path,
-                )
-            with Image.open(path, formats=("JPEG", "PNG", "TIFF", "BMP", "WEBP")) as image:
-                width, height = image.size
-                main, exif, gps = exif_tags(image, notes)
-                if image.format == "TIFF" and number(main.get(_ORIENTATION)) in (5, 6, 7, 8):
-                    width, height = height, width  # Pillow reports the upright size of a TIFF
-                xmp = xmp_properties(image, notes)
-        except (
-            OSError,
-            SyntaxError,
-            ValueError,
-            struct.error,
-            Image.DecompressionBombError,
-        ) as error:
+            width, height, main, exif, gps, data = _read_file(path, notes)
+        except DAMAGE as error:
             reason = (
                 getattr(error, "strerror", None)
-                or "it is not a JPEG, PNG, TIFF, BMP or WebP, or it is damaged"
+                or "it is not a JPEG, PNG, TIFF, BMP, WebP or HEIC, or it is damaged"
             )
             raise InputError(f"cannot be read as a photo: {reason}", path=path) from error
-    damage = [
-        str(warning.message).splitlines()[0][:200]
-        for warning in caught
-        if not issubclass(warning.category, Image.DecompressionBombWarning)
-    ]
-    if damage:
-        notes.append(f"damaged EXIF: {damage[0]}")
+    if caught:
+        notes.append(f"damaged EXIF: {str(caught[0].message).splitlines()[0][:200]}")
+    drone = read_drone_xmp(xmp_properties(data, notes))
     orientation = number(main.get(_ORIENTATION))
-    local_s, utc_s = exposure_times(
-        main, exif, gps, utc_at_exposure=xmp.get(_DJI + "UTCAtExposure", "")
-    )
-    lat, lon = _position(gps, xmp, notes)
-    altitude, reference = _altitude(gps, xmp)
-    gimbal = [number(xmp.get(_DJI + f"Gimbal{axis}Degree")) for axis in ("Yaw", "Pitch", "Roll")]
-    rtk = number(xmp.get(_DJI + "RtkFlag"))
+    local_s, utc_s = exposure_times(main, exif, gps, utc_at_exposure=drone.utc_at_exposure)
+    lat, lon = _position(gps, drone, notes)
+    altitude, reference = _altitude(gps, drone)
+    if drone.invalid_fix and math.isfinite(lat):
+        notes.append("GpsStatus is Invalid, so its position is left out")
+        lat = lon = altitude = NAN
+    if drone.unused_angles:
+        notes.append(
+            "Camera:Pitch is left out, as makers measure it from the horizon or from below"
+        )
     return PhotoMetadata(
         path=path,
         width=width,
@@ -176,13 +163,31 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         position_without_letters=math.isnan(lat) and _lacks_letters(gps),
         altitude_m=altitude,
         altitude_reference=reference,
-        altitude_type=text(xmp.get(_DJI + "AltitudeType")),
-        relative_altitude_m=number(xmp.get(_DJI + "RelativeAltitude")),
-        gimbal_deg=(gimbal[0] % 360.0, gimbal[1], gimbal[2]),
-        rtk_flag=None if math.isnan(rtk) else int(rtk),
-        sigma_m=_sigma(gps, xmp, rtk),
+        altitude_type=drone.altitude_type,
+        relative_altitude_m=drone.relative_altitude_m,
+        gimbal_deg=drone.gimbal_deg,
+        rtk_flag=drone.rtk_flag,
+        sigma_m=_sigma(gps, drone),
         notes=tuple(notes),
     )
+
+
+def _read_file(
+    path: Path, notes: list[str]
+) -> tuple[int, int, dict[int, Any], dict[int, Any], dict[int, Any], Any]:
+    """Return stored width and height, main, EXIF and GPS tags, and XMP; HEIC, DNG are upright already."""
+    if is_raw(path):
+        width, height = raw_size(path)
+        main, exif, gps = exif_tags(lambda: tags_of_raw(path), notes)
+        return width, height, main | {_ORIENTATION: 1}, exif, gps, main.get(_XMP)
+    with open_photo(path) as image:
+        width, height = image.size
+        main, exif, gps = exif_tags(image.getexif, notes)
+        if image.format == "HEIF":
+            main = main | {_ORIENTATION: 1}
+        elif image.format == "TIFF" and number(main.get(_ORIENTATION)) in (5, 6, 7, 8):
+            width, height = height, width  # Pillow reports the upright size of a TIFF
+        return width, height, main, exif, gps, image.info.get("xmp")
 
 
 def telemetry_from_photos(
@@ -256,6 +261,9 @@ def telemetry_from_photos(
     if list(names) != ordered:
         first = next(n for n, m in zip(names, ordered, strict=True) if n != m)
         notes.append(f"photos are in the order of their times, not of their names, from {first} on")
+    rtk = describe_rtk([photo.rtk_flag for photo in photos])
+    if rtk:
+        notes.append(f"RTK: {rtk}")
     kinds = sorted({p.altitude_type for p in photos if p.altitude_type})
     if kinds and reference is HeightReference.UNKNOWN:
         notes.append(
@@ -278,14 +286,11 @@ def telemetry_from_photos(
     return without_placeholders(track)
 
 
-def _position(
-    gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
-) -> tuple[float, float]:
+def _position(gps: Mapping[int, Any], drone: DroneXmp, notes: list[str]) -> tuple[float, float]:
     """Return (latitude, longitude) from EXIF, which post-processing rewrites, or from XMP; NaN if unknown."""
     lat, lon = _degrees(gps, _GPS_LAT, "N", "S"), _degrees(gps, _GPS_LON, "E", "W")
     if math.isnan(lat + lon):
-        lat = number(xmp.get(_DJI + "GpsLatitude"))
-        lon = number(xmp.get(_DJI + "GpsLongitude", xmp.get(_DJI + "GpsLongtitude")))
+        lat, lon = drone.lat_deg, drone.lon_deg
     # DJI writes 0, 0 if there is no fix.
     if math.isnan(lat + lon) or (lat == 0 and lon == 0):
         return NAN, NAN
@@ -316,29 +321,30 @@ def _degrees(gps: Mapping[int, Any], tag: int, plus: str, minus: str) -> float:
     return -size if letter == minus else size
 
 
-def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float, HeightReference]:
+def _altitude(gps: Mapping[int, Any], drone: DroneXmp) -> tuple[float, HeightReference]:
     """Return the signed altitude and its reference.
 
     EXIF 2 calls references 0 and 1 sea level, EXIF 3 the ellipsoid, and drones write either of these or a
-    pressure height: unknown. References 2 and 3 were added in EXIF 3 and mean sea level.
+    pressure height: unknown, unless DJI says that it is of RTK, which is above the ellipsoid. References 2
+    and 3 were added in EXIF 3 and mean sea level.
     """
     altitude = number(gps.get(_GPS_ALT))
-    if math.isnan(altitude):
-        return number(xmp.get(_DJI + "AbsoluteAltitude")), HeightReference.UNKNOWN
     code = gps.get(_GPS_ALT_REF, b"\0")
     code = code[0] if isinstance(code, bytes) and code else code
-    reference = HeightReference.AMSL if code in (2, 3) else HeightReference.UNKNOWN
-    return (-altitude if code in (1, 3) else altitude), reference
+    altitude = -altitude if code in (1, 3) else altitude
+    # A program that rewrote the EXIF altitude may have changed its reference.
+    same = math.isnan(altitude) or abs(altitude - drone.altitude_m) <= _SAME_HEIGHT_M
+    if drone.altitude_type == "RtkAlt" and math.isfinite(drone.altitude_m) and same:
+        return drone.altitude_m, HeightReference.ELLIPSOID
+    if math.isnan(altitude):
+        return drone.altitude_m, HeightReference.UNKNOWN
+    return altitude, HeightReference.AMSL if code in (2, 3) else HeightReference.UNKNOWN
 
 
-def _sigma(gps: Mapping[int, Any], xmp: Mapping[str, str], rtk_flag: float) -> Sigma:
+def _sigma(gps: Mapping[int, Any], drone: DroneXmp) -> Sigma:
     """Return standard deviations east, north, up in metres from the most direct statement available."""
-    rtk = tuple(positive(xmp.get(_DJI + f"RtkStd{axis}")) for axis in ("Lon", "Lat", "Hgt"))
-    if not any(math.isnan(value) for value in rtk) and rtk_flag != 0:
-        return rtk[0], rtk[1], rtk[2]
-    horizontal = positive(xmp.get(_PIX4D + "GPSXYAccuracy"))
-    if not math.isnan(horizontal):
-        return horizontal, horizontal, positive(xmp.get(_PIX4D + "GPSZAccuracy"))
+    if not math.isnan(drone.sigma_m[0]):
+        return drone.sigma_m
     horizontal = positive(gps.get(_GPS_H_ERROR))
     if not math.isnan(horizontal):
         return horizontal, horizontal, NAN

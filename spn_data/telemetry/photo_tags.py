@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
@@ -14,14 +16,15 @@ from PIL import Image
 MAX_XMP_BYTES = 2_000_000
 NAN = float("nan")
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 
 
 def exif_tags(
-    image: Image.Image, notes: list[str]
+    read: Callable[[], Image.Exif], notes: list[str]
 ) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
     """Return the main, EXIF and GPS tags; empty if they are damaged beyond reading."""
     try:
-        main = image.getexif()
+        main = read()
         # Pillow decodes tags lazily: do it here, where damage is caught.
         return dict(main), dict(main.get_ifd(_EXIF_IFD)), dict(main.get_ifd(_GPS_IFD))
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error) as error:
@@ -29,9 +32,24 @@ def exif_tags(
         return {}, {}, {}
 
 
-def xmp_properties(image: Image.Image, notes: list[str]) -> dict[str, str]:
-    """Return XMP elements and attributes by "{namespace}name"; the first of a name counts."""
-    data = image.info.get("xmp")
+def tags_of_raw(path: Path) -> Image.Exif:
+    """Read the tags of a DNG, which is a TIFF for cameras."""
+    tags = Image.Exif()
+    with path.open("rb") as file:
+        tags.load_from_fp(file)
+        # Decode what is read lazily while the file is open.
+        for directory in (_EXIF_IFD, _GPS_IFD):
+            tags.get_ifd(directory)
+        for tag in list(tags):
+            tags[tag] = tags[tag]
+    return tags
+
+
+def xmp_properties(data: Any, notes: list[str]) -> dict[str, str]:
+    """Return XMP elements and attributes by "{namespace}name"; the first of a name counts.
+
+    Fields of a structure are named "{namespace}structure/{namespace}field".
+    """
     if isinstance(data, str):
         data = data.encode()
     if not isinstance(data, bytes):
@@ -49,7 +67,18 @@ def xmp_properties(image: Image.Image, notes: list[str]) -> dict[str, str]:
         for name, value in (*element.attrib.items(), (element.tag, element.text or "")):
             if name.startswith("{") and value.strip():
                 properties.setdefault(name, value.strip())
+        for field in _fields(element):
+            for name, value in (*field.attrib.items(), *((f.tag, f.text or "") for f in field)):
+                if name.startswith("{") and value.strip():
+                    properties.setdefault(f"{element.tag}/{name}", value.strip())
     return properties
+
+
+def _fields(element: Any) -> list[Any]:
+    """Return the nodes that hold the fields of a structure: itself, or the Description in it."""
+    if element.tag.startswith(_RDF):
+        return []
+    return [element, *element.findall(_RDF + "Description")]
 
 
 def number(value: Any) -> float:

@@ -138,9 +138,93 @@ def test_xmp_position_serves_where_exif_has_none(tmp_path):
     xmp = "d:GpsLatitude='-33.5' d:GpsLongtitude='+70.5' d:AbsoluteAltitude='+88.5' d:AltitudeType='RtkAlt'"
     photo = read_photo(jpeg(tmp_path / "a.jpg", gps={}, xmp=xmp))
     assert (photo.lat_deg, photo.lon_deg, photo.altitude_m) == (-33.5, 70.5, 88.5)
-    assert photo.altitude_reference is HeightReference.UNKNOWN
-    assert any("RtkAlt" in note for note in telemetry_from_photos([photo]).notes)
+    assert photo.altitude_reference is HeightReference.ELLIPSOID
     assert read_photo(jpeg(tmp_path / "b.jpg", xmp=xmp)).lat_deg == pytest.approx(-33.51, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "absolute", "reference", "height_m"),
+    [
+        ("RtkAlt", "+123.40", HeightReference.ELLIPSOID, 123.4),
+        ("RtkAlt", "+80.00", HeightReference.UNKNOWN, 123.4),  # a program rewrote the EXIF altitude
+        ("GpsFusionAlt", "+123.40", HeightReference.UNKNOWN, 123.4),
+    ],
+)
+def test_rtk_heights_are_above_the_ellipsoid(tmp_path, kind, absolute, reference, height_m):
+    """Only an altitude of DJI's type RtkAlt that EXIF repeats is above the ellipsoid; others are unknown."""
+    xmp = f"d:AbsoluteAltitude='{absolute}' d:AltitudeType='{kind}'"
+    found = read_photo(jpeg(tmp_path / "a.jpg", xmp=xmp))
+    assert (found.altitude_m, found.altitude_reference) == (height_m, reference)
+    said = any(f"of type {kind} (DJI)" in note for note in telemetry_from_photos([found]).notes)
+    assert said == (reference is HeightReference.UNKNOWN)
+
+
+def test_a_fix_that_is_called_invalid_is_none(tmp_path):
+    """A position that DJI marks as Invalid is left out with a note; RTK states are counted."""
+    invalid = read_photo(jpeg(tmp_path / "a.jpg", xmp="d:GpsStatus='Invalid' d:RtkFlag='0'"))
+    assert math.isnan(invalid.lat_deg)
+    assert invalid.notes == ("GpsStatus is Invalid, so its position is left out",)
+    fixed = read_photo(jpeg(tmp_path / "b.jpg", xmp="d:GpsStatus='RTK' d:RtkFlag='50'"))
+    notes = telemetry_from_photos([fixed, fixed, invalid]).notes
+    assert "RTK: 2 fixed, 1 single or none" in notes
+
+
+OTHER_MAKERS = """<x:xmpmeta xmlns:x='adobe:ns:meta/'><r:RDF
+ xmlns:r='http://www.w3.org/1999/02/22-rdf-syntax-ns#'><r:Description
+ xmlns:p='http://www.parrot.com/drone-parrot/1.0/' xmlns:c='http://pix4d.com/camera/1.0/'
+ xmlns:s='https://www.skydio.com/drone-skydio/1.0/'>{}</r:Description></r:RDF></x:xmpmeta>"""
+
+
+@pytest.mark.parametrize(
+    ("body", "gimbal", "sigma"),
+    [
+        (
+            "<p:CameraYawDegree>-176.5</p:CameraYawDegree><p:CameraPitchDegree>-78.25</p:CameraPitchDegree>"
+            "<p:CameraRollDegree>-0.5</p:CameraRollDegree><c:Pitch>11</c:Pitch>"
+            "<c:GPSXYAccuracy>5/2</c:GPSXYAccuracy><c:GPSZAccuracy>4.5</c:GPSZAccuracy>",
+            (183.5, -78.25, -0.5),
+            (2.5, 2.5, 4.5),
+        ),
+        (
+            "<s:VehicleOrientationNED r:parseType='Resource'><s:Yaw>1</s:Yaw></s:VehicleOrientationNED>"
+            "<s:CameraOrientationNED r:parseType='Resource'><s:Roll>0.25</s:Roll><s:Pitch>-84</s:Pitch>"
+            "<s:Yaw>146.5</s:Yaw></s:CameraOrientationNED>",
+            (146.5, -84, 0.25),
+            (NAN, NAN, NAN),
+        ),
+        (
+            "<s:CameraOrientationNED><r:Description s:Roll='0.25' s:Pitch='-84' s:Yaw='146.5'/>"
+            "</s:CameraOrientationNED>",
+            (146.5, -84, 0.25),
+            (NAN, NAN, NAN),
+        ),
+    ],
+)
+def test_xmp_of_other_makers(tmp_path, body, gimbal, sigma):
+    """Parrot's and Skydio's camera angles and accuracies are read, structures in both XML forms."""
+    found = read_photo(jpeg(tmp_path / "a.jpg", xmp=OTHER_MAKERS.format(body).encode()))
+    assert found.gimbal_deg == gimbal
+    np.testing.assert_array_equal(found.sigma_m, sigma)
+    assert found.notes == ()
+
+
+def test_angles_of_an_unknown_convention_are_left_out(tmp_path):
+    """Camera:Pitch alone gives no angles, with a note, because makers count it from different directions."""
+    body = "<c:Yaw>10</c:Yaw><c:Pitch>1</c:Pitch><c:Roll>2</c:Roll>"
+    found = read_photo(jpeg(tmp_path / "a.jpg", xmp=OTHER_MAKERS.format(body).encode()))
+    assert np.isnan(found.gimbal_deg).all()
+    assert "Camera:Pitch is left out" in found.notes[0]
+
+
+def test_skydio_states_its_position(tmp_path):
+    """Skydio's own latitude, longitude and altitude serve where EXIF has none."""
+    body = (
+        "<s:Latitude>48.5</s:Latitude><s:Longitude>-11.5</s:Longitude>"
+        "<s:AbsoluteAltitude>512.5</s:AbsoluteAltitude>"
+    )
+    found = read_photo(jpeg(tmp_path / "a.jpg", gps={}, xmp=OTHER_MAKERS.format(body).encode()))
+    assert (found.lat_deg, found.lon_deg, found.altitude_m) == (48.5, -11.5, 512.5)
+    assert found.altitude_reference is HeightReference.UNKNOWN
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
