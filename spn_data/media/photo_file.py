@@ -133,6 +133,7 @@ def develop(path: Path, *, upright: bool = True, half_size: bool = False) -> np.
             return np.asarray(
                 raw.postprocess(
                     no_auto_bright=True,
+                    adjust_maximum_thr=0.0,  # LibRaw else takes the brightest pixel for white
                     use_camera_wb=True,
                     output_color=rawpy.ColorSpace.sRGB,
                     output_bps=8,

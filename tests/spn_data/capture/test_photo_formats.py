@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,8 @@ def write_heic(path: Path, orientation: int = 1) -> Path:
     exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 30.0, 36.0), 3: "W", 4: (20.0, 15.0, 36.0)})
     image = Image.fromarray(quarter()).convert("RGB")
     image.save(path, "HEIF", quality=90, exif=exif.tobytes(), xmp=XMP)
-    assert (b"irot" in path.read_bytes()) == (orientation >= 3)
+    turned = any(box in path.read_bytes() for box in (b"irot", b"imir"))
+    assert turned == (orientation > 1)
     return path
 
 
@@ -170,20 +172,19 @@ def test_damaged_heic_and_dng_are_refused_in_one_line(tmp_path: Path, suffix: st
     whole = write(tmp_path / f"a{suffix}").read_bytes()
     path = tmp_path / f"b{suffix}"
     rng = np.random.default_rng(1)
-    refused = 0
+    errors = []
     for trial in range(40):
         data = bytearray(whole[: int(rng.integers(len(whole)))] if trial % 2 else whole)
-        places = rng.integers(0, 400, 6) - (len(data) // 2 * 0)
-        for place in places if trial % 2 == 0 else ():
-            data[-int(place) - 1 if suffix == ".dng" else int(place)] = int(rng.integers(256))
+        for place in rng.integers(0, 400, 6).tolist() if trial % 2 == 0 else ():
+            data[-place - 1 if suffix == ".dng" else place] = int(rng.integers(256))
         path.write_bytes(bytes(data))
         try:
             read_photo(path)
             decode_photo(path)
         except InputError as error:
-            refused += 1
-            assert "\n" not in str(error)
-    assert refused > 10
+            errors.append(str(error))
+    assert len(errors) > 10
+    assert not any("\n" in error for error in errors)
 
 
 def test_a_dng_that_claims_a_billion_pixels_is_refused(tmp_path: Path) -> None:
@@ -198,10 +199,14 @@ def test_a_dng_that_claims_a_billion_pixels_is_refused(tmp_path: Path) -> None:
 def test_large_mapping_photos_are_read(tmp_path: Path) -> None:
     """Headers of 151 and 280 megapixels, of real cameras, are accepted; Pillow's limit is unchanged."""
     before = Image.MAX_IMAGE_PIXELS
-    for k, size in enumerate([(14_204, 10_652), (20_150, 13_895)]):
-        path = tmp_path / f"{k}.png"
-        Image.new("1", size).save(path, compress_level=1)
-        assert (read_photo(path).width, read_photo(path).height) == size
+    Image.new("1", (64, 64)).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    for size in [(14_204, 10_652), (20_150, 13_895)]:
+        header = b"IHDR" + struct.pack(">II", *size) + data[24:29]
+        (tmp_path / "b.png").write_bytes(
+            data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+        )
+        assert (read_photo(tmp_path / "b.png").width, read_photo(tmp_path / "b.png").height) == size
     assert before == Image.MAX_IMAGE_PIXELS
 
 
