@@ -60,6 +60,26 @@ def photos(dataset: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("suffix", ["bmp", "webp", "heic"])
+def test_other_photo_formats_get_the_same_poses(network, photos, tmp_path, suffix):
+    """BMP, lossless WebP and HEIC of the same images get the poses of the PNG."""
+    if suffix == "heic":
+        heif = pytest.importorskip("pillow_heif", reason="needs the extra heic")
+        heif.register_heif_opener()
+    folder = tmp_path / "other"
+    folder.mkdir()
+    for path in sorted(photos.glob("*.png"))[:3]:
+        with Image.open(path) as image:
+            lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+            options = {"bmp": {}, "webp": {"lossless": True}, "heic": lossless}[suffix]
+            image.save(folder / f"{path.stem}.{suffix}", **options)
+    predicted(network, photos, tmp_path / "png")
+    predicted(network, folder, tmp_path / "out")
+    want, found = poses_of(rows_of(tmp_path / "png")[:3]), poses_of(rows_of(tmp_path / "out"))
+    np.testing.assert_allclose(found.centers, want.centers, atol=1e-3)
+    np.testing.assert_allclose(found.quats_wxyz, want.quats_wxyz, atol=1e-3)
+
+
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a video of ten frames at 5 per second, four times the size of the network's view."""
