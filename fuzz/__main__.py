@@ -22,18 +22,21 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--target", action="append", default=[])
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--replay", type=Path, help="input.json of a failing input: read it here, unlimited")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="of seeds and failures")
+    parser.add_argument(
+        "--replay", type=Path, help="input.json of a failing input: read it here, unlimited"
+    )
     given = parser.parse_args()
     # In a process of its own: what it computes would leave threads, which forks do not survive.
-    subprocess.run([sys.executable, "-m", "fuzz.seeds", FOLDER / "seeds"], check=True)
+    subprocess.run([sys.executable, "-m", "fuzz.seeds", given.folder / "seeds"], check=True)
     from fuzz.campaign import FINE, Campaign, jobs_of, table, until
 
     if given.replay:
         job = json.loads(given.replay.read_text())
-        verdict, text = Campaign(FOLDER, job["seed"]).serve(job["target"], job["number"])
+        verdict, text = Campaign(given.folder, job["seed"]).serve(job["target"], job["number"])
         print(verdict, text, sep="\n")
         return verdict not in FINE
-    campaign = Campaign(FOLDER, given.seed)
+    campaign = Campaign(given.folder, given.seed)
     jobs = until(jobs_of(campaign, given.inputs, given.target), given.seconds)
     found = campaign.run(jobs, given.workers)
     print(table(found))

@@ -106,7 +106,9 @@ class Campaign:
 
     def _keep(self, name: str, number: int, verdict: str, text: str) -> None:
         origin, data = self.make(BY_NAME[name], number)
-        folder = self.folder / "failures" / f"{verdict}-{name.replace(' ', '-')}-{self.seed}-{number}"
+        folder = (
+            self.folder / "failures" / f"{verdict}-{name.replace(' ', '-')}-{self.seed}-{number}"
+        )
         folder.mkdir(parents=True, exist_ok=True)
         (folder / origin.name).write_bytes(data)
         (folder / "why.txt").write_text(text or verdict, encoding="utf-8")
@@ -114,7 +116,9 @@ class Campaign:
         (folder / "input.json").write_text(json.dumps(job, indent=1))
 
 
-def jobs_of(campaign: Campaign, inputs: int, names: Sequence[str] = ()) -> Iterator[tuple[str, int]]:
+def jobs_of(
+    campaign: Campaign, inputs: int, names: Sequence[str] = ()
+) -> Iterator[tuple[str, int]]:
     """Yield targets in turn, those with seeds only, until there are as many inputs as wanted."""
     targets = [t.name for t in TARGETS if campaign.seeds[t.name] and (not names or t.name in names)]
     for k in range(inputs):

@@ -61,7 +61,9 @@ def _other(value: Any, rng: random.Random) -> Any:
     if isinstance(value, bytes):
         return value[: rng.randrange(len(value) + 1)] + rng.choice((b"", b"\xff" * 64))
     if isinstance(value, str):
-        return rng.choice((*TEXTS, "Loop", "If", "Resize", "Reshape", "Tile", "ConstantOfShape", "Expand"))
+        return rng.choice(
+            (*TEXTS, "Loop", "If", "Resize", "Reshape", "Tile", "ConstantOfShape", "Expand")
+        )
     if isinstance(value, float):
         return rng.choice((float("nan"), float("inf"), -1.0, 0.0, 1e38))
     return rng.choice((*(n % 2**31 for n in NUMBERS), -1, -(2**31)))

@@ -15,7 +15,9 @@ from time import monotonic
 CPU_S = 5.0
 MEMORY_BYTES = 10**9
 WALL_S = 120.0  # an input that waits without using the processor
-_ADDRESSES = 4 * 10**9  # address space beyond that at the start; threads reserve some that they never use
+_ADDRESSES = (
+    4 * 10**9
+)  # address space beyond that at the start; threads reserve some that they never use
 
 Task = Callable[[], None]
 
@@ -70,6 +72,7 @@ class Reader:
     def close(self) -> None:
         """End the child."""
         self._ours.close()
+        os.kill(self.pid, signal.SIGKILL)  # its siblings hold the pipe open
         os.waitpid(self.pid, 0)
 
     def _bury(self) -> tuple[str, str]:

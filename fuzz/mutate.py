@@ -13,15 +13,106 @@ from typing import Any
 
 MAX_BYTES = 4_000_000
 TEXTS = (
-    *("NaN", "nan", "inf", "-inf", "-0", "0", "1e400", "-1e308", "1e-400", "1e9", "9" * 400, "0x10", "1_0"),
-    *("-1", "1", "180.1", "-90.5", "4294967296", "9223372036854775808", "true", "null", '""', "[]", "{}"),
-    *("../../etc/passwd", "/etc/passwd", "a\0b", "..", "C:\\x", "http://127.0.0.1/x", "ü" * 300, "\ufeff"),
-    *("\u2028", "١٢٣", "２", "\r", "\n", "\x85", "\ud7ff", "%s%n", "2026-02-30T25:61:61Z", "0000-00-00"),
+    *(
+        "NaN",
+        "nan",
+        "inf",
+        "-inf",
+        "-0",
+        "0",
+        "1e400",
+        "-1e308",
+        "1e-400",
+        "1e9",
+        "9" * 400,
+        "0x10",
+        "1_0",
+    ),
+    *(
+        "-1",
+        "1",
+        "180.1",
+        "-90.5",
+        "4294967296",
+        "9223372036854775808",
+        "true",
+        "null",
+        '""',
+        "[]",
+        "{}",
+    ),
+    *(
+        "../../etc/passwd",
+        "/etc/passwd",
+        "a\0b",
+        "..",
+        "C:\\x",
+        "http://127.0.0.1/x",
+        "ü" * 300,
+        "\ufeff",
+    ),
+    *(
+        "\u2028",
+        "١٢٣",
+        "２",
+        "\r",
+        "\n",
+        "\x85",
+        "\ud7ff",
+        "%s%n",
+        "2026-02-30T25:61:61Z",
+        "0000-00-00",
+    ),
 )
-NUMBERS = (0, 1, 2, 127, 128, 255, 256, 32767, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
+NUMBERS = (
+    0,
+    1,
+    2,
+    127,
+    128,
+    255,
+    256,
+    32767,
+    65535,
+    65536,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**63,
+    2**64 - 1,
+)
 VALUES: tuple[Any, ...] = (
-    *(None, True, False, 0, -1, 1, 1.5, 1e308, -1e308, 1e-320, 2**31, 2**63, 2**64, 10**99, "", "x", [], {}),
-    *([None], {"x": None}, [[[]]], float("nan"), float("inf"), "../../x", "a\0b", "9" * 500, [0] * 1000),
+    *(
+        None,
+        True,
+        False,
+        0,
+        -1,
+        1,
+        1.5,
+        1e308,
+        -1e308,
+        1e-320,
+        2**31,
+        2**63,
+        2**64,
+        10**99,
+        "",
+        "x",
+        [],
+        {},
+    ),
+    *(
+        [None],
+        {"x": None},
+        [[[]]],
+        float("nan"),
+        float("inf"),
+        "../../x",
+        "a\0b",
+        "9" * 500,
+        [0] * 1000,
+    ),
 )
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _CELL = re.compile(rb"[^,;\t\n<>\"=: ]+")
@@ -86,7 +177,9 @@ def _numbers(data: bytes, rng: random.Random) -> bytes:
     """Exchange one number written in digits, such as those of metadata in a picture."""
     found = list(_NUMBER.finditer(data[:100_000]))
     match = rng.choice(found)
-    return data[: match.start()] + rng.choice(TEXTS).encode("utf-8", "replace") + data[match.end() :]
+    return (
+        data[: match.start()] + rng.choice(TEXTS).encode("utf-8", "replace") + data[match.end() :]
+    )
 
 
 def _text(data: bytes, rng: random.Random) -> bytes:
@@ -95,14 +188,21 @@ def _text(data: bytes, rng: random.Random) -> bytes:
     if kind < 4:
         found = list((_NUMBER if kind < 2 else _CELL).finditer(data[:200_000]))
         match = rng.choice(found)
-        return data[: match.start()] + rng.choice(TEXTS).encode("utf-8", "replace") + data[match.end() :]
+        return (
+            data[: match.start()]
+            + rng.choice(TEXTS).encode("utf-8", "replace")
+            + data[match.end() :]
+        )
     lines = data.split(b"\n")
     at = rng.randrange(len(lines))
     if kind == 4:
         lines[at : at + 1] = [] if rng.random() < 0.5 else lines[at : at + 1] * rng.choice((2, 100))
         return b"\n".join(lines)
     if kind == 5:
-        deep = rng.choice((b"[", b"{", b'{"a":', b"<a>", b"(", b",", b" ", b'"', b"a.", b"a=[")) * 20_000
+        deep = (
+            rng.choice((b"[", b"{", b'{"a":', b"<a>", b"(", b",", b" ", b'"', b"a.", b"a=["))
+            * 20_000
+        )
         lines[at] = lines[at] + deep
         return b"\n".join(lines)
     text = data.decode("utf-8", "replace")
@@ -179,8 +279,12 @@ def _array(data: bytes, rng: random.Random) -> bytes:
     """Change the type or shape in the header of an .npy; the length of the header stays."""
     (length,) = struct.unpack_from("<H", data, 8)
     header, body = data[10 : 10 + length].decode("latin-1"), data[10 + length :]
-    descr = rng.choice(("<f8", "<i8", "|O", "<U8", "|S1", "<M8[s]", "|b1", "<c16", "<f2", "|V8", "<u8"))
-    shape = rng.choice(("()", "(0,)", "(99999999999,)", "(1, 1, 1)", "(-1,)", "(3, 0)", "(2,)", "(8, 2)"))
+    descr = rng.choice(
+        ("<f8", "<i8", "|O", "<U8", "|S1", "<M8[s]", "|b1", "<c16", "<f2", "|V8", "<u8")
+    )
+    shape = rng.choice(
+        ("()", "(0,)", "(99999999999,)", "(1, 1, 1)", "(-1,)", "(3, 0)", "(2,)", "(8, 2)")
+    )
     if rng.random() < 0.5:
         header = re.sub(r"'descr': '[^']*'", f"'descr': '{descr}'", header)
     else:

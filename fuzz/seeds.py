@@ -6,9 +6,9 @@ python -m fuzz.seeds FOLDER
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -49,16 +49,6 @@ ScriptType: v4.00+
 Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
 {}
 """
-_RECIPE = """kind = "scene-coordinates"
-weights = "none"
-batch = 8
-[options]
-shrink = 2
-[[stage]]
-name = "all"
-minutes = 1
-rate = 1e-3
-"""
 
 
 def make(folder: Path) -> None:
@@ -68,11 +58,16 @@ def make(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     _flight_and_area(folder)
-    _telemetry(folder / "telemetry", folder / "flight" / "mapping")
-    _pictures(folder / "photos")
-    _videos(folder / "video", folder / "flight" / "mapping")
     _network(folder)
+    make_small(folder, folder / "flight" / "mapping")
     _copy_shared(folder)
+
+
+def make_small(folder: Path, flight: Path) -> None:
+    """Write the seeds that take a second in all: telemetry, photos and videos, also from a simulated flight."""
+    _telemetry(folder / "telemetry", flight)
+    _pictures(folder / "photos")
+    _videos(folder / "video")
     (folder / "complete").touch()
 
 
@@ -100,7 +95,16 @@ def _flight_and_area(folder: Path) -> None:
     with av.open(str(flight / "mapping" / "flight1.mp4")) as container:
         images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
     _write_video(again / "again.mp4", images[3:11])
-    _run(data_command, "register", again / "again.mp4", "--name", "again", "--all-frames", "--area", area)
+    _run(
+        data_command,
+        "register",
+        again / "again.mp4",
+        "--name",
+        "again",
+        "--all-frames",
+        "--area",
+        area,
+    )
     _run(data_command, "register", "--all-frames", "--area", area)
     _run(data_command, "coverage", "--area", area)
     _run(data_command, "split", "--area", area)
@@ -114,11 +118,6 @@ def _flight_and_area(folder: Path) -> None:
         *("--threads", 1),
     )
     _run(model_command, "evaluate", "--run", "default", "--area", area, "--threads", 1)
-    for scratch in ("1-frames/frames", "2-model/database.db"):
-        path = area / scratch
-        if path.is_dir():
-            for image in sorted(path.rglob("*.jpg"))[3:]:
-                image.unlink()
 
 
 def _telemetry(folder: Path, flight: Path) -> None:
@@ -150,19 +149,27 @@ def _telemetry(folder: Path, flight: Path) -> None:
             "gimbal_heading(degrees),gimbal_pitch(degrees)",
             "{ms},2026-05-01 10:00:{k:02d},{lat},8.42,100.1,12,-90",
         ),
-        "px4.csv": ("timestamp,lat,lon,alt,alt_ellipsoid,eph,epv", "{us},{e7},84200000,120500,168000,1.2,2"),
-        "semi.csv": ("time;latitude;longitude;altitude [m]", "2026-05-01T10:00:{k:02d}Z;{lat};8,42;120,5"),
-        "tab.tsv": ("time\tlat\tlon\tele", "10:00:{k:02d}\t{lat}\t8.42\t120"),
+        "px4.csv": (
+            "time_us,lat,lon,alt,alt_ellipsoid,eph,epv",
+            "{us},{e7},84200000,120500,168000,1.2,2",
+        ),
+        "semi.csv": (
+            "time;latitude;longitude;altitude [m]",
+            "2026-05-01T10:00:{k:02d}Z;{lat};8,42;120,5",
+        ),
+        "tab.tsv": ("time\tlat\tlon\tele", "2026-05-01 10:00:{k:02d}\t{lat}\t8.42\t120"),
     }
     for name, (header, row) in dialects.items():
         cells = [
-            row.format(k=k, ms=1000 * k, us=10**6 * k + 10**9, lat=49 + k / 1e5, e7=490000000 + 100 * k)
+            row.format(
+                k=k, ms=1000 * k, us=10**6 * k + 10**9, lat=49 + k / 1e5, e7=490000000 + 100 * k
+            )
             for k in rows
         ]
         (folder / name).write_text("\n".join([header, *cells]) + "\n")
     (folder / "waypoints").mkdir()
     (folder / "waypoints" / "w.csv").write_text(
-        "latitude,longitude,altitude(m),heading(deg),gimbalpitchangle\n49.01,8.42,30,90,-45\n49.011,8.42,31,9,-9\n"
+        "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg\n49.0,8.4,30,90,-45\n49.001,8.4,31,9,-9\n"
     )
 
 
@@ -174,7 +181,15 @@ def _pictures(folder: Path) -> None:
     exif.update({0x010F: "DJI", 0x0110: "FC300S", 0x0112: 6, 0x0132: "2026:05:01 10:00:00"})
     exif.get_ifd(0x8769).update({0x9003: "2026:05:01 10:00:00", 0x920A: 3.6, 0xA405: 20})
     exif.get_ifd(0x8825).update(
-        {1: "N", 2: (49.0, 1.0, 5.5), 3: "E", 4: (8.0, 25.0, 1.5), 5: b"\0", 6: 120.5, 7: (8.0, 0.0, 0.0)}
+        {
+            1: "N",
+            2: (49.0, 1.0, 5.5),
+            3: "E",
+            4: (8.0, 25.0, 1.5),
+            5: b"\0",
+            6: 120.5,
+            7: (8.0, 0.0, 0.0),
+        }
     )
     image.save(folder / "a.jpg", exif=exif, xmp=_XMP)
     image.save(folder / "a.png", exif=exif)
@@ -199,26 +214,37 @@ def _write_video(path: Path, images: list[np.ndarray], codec: str = "libx264") -
         container.mux(stream.encode())
 
 
-def _videos(folder: Path, flight: Path) -> None:
-    """Write one short video in each container; a stream of subtitles comes from ffmpeg where installed."""
+def _videos(folder: Path) -> None:
+    """Write one short video in each container, and two with a stream of subtitles."""
     folder.mkdir()
     images = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(8)]
     for name in ("a.mp4", "a.mkv", "a.ts", "a.avi"):
         _write_video(folder / name, images, "mpeg4" if name == "a.avi" else "libx264")
     subtitled = folder.parent / "subtitled"
     subtitled.mkdir()
-    if shutil.which("ffmpeg"):
-        for name, codec in (("s.mp4", "mov_text"), ("s.mkv", "srt")):
-            command = ["ffmpeg", "-v", "error", "-i", folder / "a.mp4", "-i", flight / "flight1.SRT"]
-            command += ["-c:v", "copy", "-c:s", codec, subtitled / name]
-            subprocess.run([str(part) for part in command], check=False)
+    for name, codec in (("s.mp4", "mov_text"), ("s.mkv", "subrip")):
+        with av.open(str(subtitled / name), "w") as container:
+            stream = container.add_stream("libx264", rate=2)
+            stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv420p"
+            track = container.add_mux_stream(codec)
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode())
+            for k in range(len(images)):
+                text = f"[latitude: {49 + k / 1e5}] [longitude: 8.42] [rel_alt: {k} abs_alt: 160.25]".encode()
+                data = len(text).to_bytes(2, "big") + text if codec == "mov_text" else text
+                packet = av.Packet(data)
+                packet.stream, packet.time_base = track, Fraction(1, 1000)
+                packet.pts = packet.dts = 500 * k
+                packet.duration = 100
+                container.mux(packet)
 
 
 def _network(folder: Path) -> None:
     """Write bundle, checkpoint, training state and parameters of a small network."""
     torch.set_num_threads(1)
-    dataset = write_box(folder / "box" / "dataset.h5", train=4) if (folder / "box").mkdir() is None else None
-    assert dataset is not None
+    (folder / "box").mkdir()
+    dataset = write_box(folder / "box" / "dataset.h5", train=4)
     network = learnt(dataset)
     bundle = folder / "bundle"
     export(network, dataset, bundle, {}, lambda *_: None, BundleOptions(calibration_images=4))

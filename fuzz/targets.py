@@ -24,6 +24,7 @@ from spn_data.coverage.sequence_table import read_strata
 from spn_data.coverage.waypoints import WaypointFrame, read_waypoints
 from spn_data.dataset.cambridge import read_cambridge
 from spn_data.dataset.hdf5_reader import Dataset
+from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.nvm import read_nvm_models
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import read_camera
@@ -83,7 +84,9 @@ class Target:
 
     def files(self, folder: Path) -> list[Path]:
         """Return the seed files in a folder of seeds, sorted."""
-        return sorted(p for pattern in self.seeds.split() for p in folder.glob(pattern) if p.is_file())
+        return sorted(
+            p for pattern in self.seeds.split() for p in folder.glob(pattern) if p.is_file()
+        )
 
 
 def _photo(path: Path) -> None:
@@ -116,15 +119,26 @@ def _database(path: Path) -> None:
 def _dataset(path: Path) -> None:
     with Dataset(path) as data:
         for group in data.groups.values():
-            _ = (group.names, group.sequences, group.strata, group.time_s, group.tracked, group.poses)
+            _ = (
+                group.names,
+                group.sequences,
+                group.strata,
+                group.time_s,
+                group.tracked,
+                group.poses,
+            )
             _ = (group.covariance, group.intrinsics, group.point_ids())
             for row in range(min(2, len(group))):
-                _ = (group.image(row), group.valid(row), group.points(row), group.training_points(row))
+                _ = (group.image(row), group.valid(row), group.points(row))
+                if group.role is Role.TRAIN:
+                    group.training_points(row)
 
 
 def _import(path: Path) -> None:
-    target = path.parents[0] / "out.h5"
-    import_cambridge(path.parent, target, ImportOptions(width_px=64), lambda *_: None, overwrite=True)
+    target = path.parent / "out.h5"
+    import_cambridge(
+        path.parent, target, ImportOptions(width_px=64), lambda *_: None, overwrite=True
+    )
 
 
 def _area(path: Path) -> None:
@@ -186,7 +200,9 @@ def _mask(path: Path) -> None:
     load_mask(path, 64, 48)
 
 
-_JSON_OF_AREA = "area/*/stage.json area/*/*/stage.json area/*/*/registration.json area/3-geo/geo.json"
+_JSON_OF_AREA = (
+    "area/*/stage.json area/*/*/stage.json area/*/*/registration.json area/3-geo/geo.json"
+)
 TARGETS = (
     Target("srt", "telemetry/*.SRT telemetry/*.srt", read_telemetry),
     Target("ass", "telemetry/*.ass", read_telemetry),
@@ -200,7 +216,9 @@ TARGETS = (
     Target("camera.json", "area/4-eval/again/camera.json bundle/camera.json", read_camera),
     Target("recipe", "recipe/*", _recipe),
     Target("waypoints", "telemetry/waypoints/*", _waypoints),
-    Target("area", f"{_JSON_OF_AREA} area/1-frames/* area/coverage/*.json area/area.toml", _area, 9),
+    Target(
+        "area", f"{_JSON_OF_AREA} area/1-frames/* area/coverage/*.json area/area.toml", _area, 9
+    ),
     Target("stage.json", "area/*/stage.json area/*/*/stage.json", read_record),
     Target("registration.json", "area/*/*/registration.json", read_written_world),
     Target("split.json", "area/5-split/split.json", read_split),
@@ -215,9 +233,9 @@ TARGETS = (
     Target("COLMAP database", "area/2-model/database.db", _database),
     Target("Cambridge lists", "area/5-split/cambridge/*.txt", read_cambridge),
     Target("NVM", "area/5-split/cambridge/*.nvm lists/*.nvm", read_nvm_models),
-    Target("import", "lists/*.txt lists/*.nvm lists/seq1/*", _import, 9),
+    Target("import", "lists/*.txt lists/*.nvm", _import, 9),
     Target("dataset.h5", "box/dataset.h5 area/5-split/dataset.h5", _dataset),
-    Target("run", "area/runs/default/*.json area/runs/default/*.csv area/runs/default/figures/*", _run, 9),
+    Target("run", "area/runs/default/*.json area/runs/default/*.csv", _run, 9),
     Target("log.csv", "area/runs/default/log.csv", _log),
     Target("checkpoint", "run/checkpoint.safetensors", load),
     Target("training state", "run/state.safetensors", read_state),
