@@ -6,7 +6,13 @@ from pathlib import Path
 
 
 class SpnError(Exception):
-    """Base class of all errors caused by the user's data or request."""
+    """Base class of all errors caused by the user's data or request.
+
+    The message is one line: what libraries say, and names of files, may have several.
+    """
+
+    def __init__(self, message: str = ""):
+        super().__init__(" ".join(line.strip() for line in message.splitlines()))
 
 
 class InputError(SpnError):

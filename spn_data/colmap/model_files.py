@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 IMAGES, POINTS = "images.bin", "points3D.bin"
+CAMERAS, RIGS, FRAMES = "cameras.bin", "rigs.bin", "frames.bin"
 _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 _TRACK_ELEMENT_BYTES = 8
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POSE_BYTES = 64  # image id, quaternion, translation, camera id
+# Number of parameters by COLMAP's number of the camera model.
+_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+_MAX_SIDE_PX = 1_000_000
+_SENSOR_POSE_BYTES = 56
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +91,51 @@ def count_images(folder: Path) -> int:
 
 
 def check_whole(folder: Path) -> None:
-    """Raise ValueError unless both files hold just the number of records that their headers say.
+    """Raise ValueError unless each file holds just the number of records that its header says.
 
-    COLMAP itself ignores a file that is cut short.
+    COLMAP itself ignores a file that is cut short, and reads records that are not there for as long as a
+    damaged header says.
     """
     _image_blocks((folder / IMAGES).read_bytes())
     _point_offsets((folder / POINTS).read_bytes())
+    _check_records(folder / CAMERAS, _end_of_camera)
+    for name, end_of in ((RIGS, _end_of_rig), (FRAMES, _end_of_frame)):
+        if (folder / name).exists():  # models of COLMAP before 3.12 have neither
+            _check_records(folder / name, end_of)
+
+
+def _check_records(path: Path, end_of: Callable[[bytes, int], int]) -> None:
+    data, offset = path.read_bytes(), 8
+    try:
+        for _ in range(_count(data, path.name)):
+            offset = end_of(data, offset)
+            if offset > len(data):
+                break
+    except (struct.error, OverflowError):
+        offset = -1
+    if offset != len(data):
+        raise ValueError(f"{path.name} is cut short or damaged")
+
+
+def _end_of_camera(data: bytes, offset: int) -> int:
+    _, model, width, height = struct.unpack_from("<IiQQ", data, offset)
+    if not (0 <= model < len(_PARAMETERS) and max(width, height) <= _MAX_SIDE_PX):
+        return len(data) + 1
+    return offset + 24 + 8 * _PARAMETERS[model]
+
+
+def _end_of_rig(data: bytes, offset: int) -> int:
+    _, sensors = struct.unpack_from("<II", data, offset)
+    offset += 8 + (8 if sensors else 0)  # the reference sensor has no pose
+    for _ in range(sensors - 1):
+        _, _, has_pose = struct.unpack_from("<iIB", data, offset)
+        offset += 9 + (_SENSOR_POSE_BYTES if has_pose else 0)
+    return offset
+
+
+def _end_of_frame(data: bytes, offset: int) -> int:
+    (count,) = struct.unpack_from("<I", data, offset + 64)
+    return offset + 68 + 16 * count
 
 
 def _count(data: bytes, name: str) -> int:
@@ -110,7 +155,7 @@ def _image_blocks(data: bytes) -> list[tuple[str, int, int]]:
             start = end_of_name + 9
             blocks.append((data[offset + _POSE_BYTES : end_of_name].decode(), start, count))
             offset = start + _KEYPOINT.itemsize * count
-    except (struct.error, ValueError):
+    except (struct.error, ValueError, OverflowError):
         offset = -1
     if offset != len(data):
         raise ValueError(f"{IMAGES} is cut short or damaged")
@@ -126,7 +171,7 @@ def _point_offsets(data: bytes) -> list[int]:
         for _ in range(_count(data, POINTS)):
             offsets.append(offset)
             offset += head + _TRACK_ELEMENT_BYTES * length_of(data, offset + head - 8)[0]
-    except struct.error:
+    except (struct.error, OverflowError):
         offset = -1
     if offset != len(data):
         raise ValueError(f"{POINTS} is cut short or damaged")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+from tokenize import TokenError
 from zipfile import BadZipFile
 
 import numpy as np
@@ -23,7 +24,10 @@ from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000
 # Exceptions that NumPy raises for a damaged archive.
-_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
+_DAMAGED = (
+    *(OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error),
+    *(SyntaxError, TokenError),  # NumPy parses a header as Python
+)
 _UPPER = np.triu_indices(6)
 
 

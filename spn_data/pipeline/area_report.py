@@ -263,7 +263,10 @@ def _coverage(area: Area, folder: str) -> CoverageFacts | None:
         return None
     try:
         counts = {
-            str(name): {**summary["strata"], "failed": summary["failed"]}
+            str(name): {
+                str(stratum): int(count)
+                for stratum, count in {**summary["strata"], "failed": summary["failed"]}.items()
+            }
             for name, summary in value["sequences"].items()
         }
         stops = tuple(

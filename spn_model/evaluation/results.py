@@ -57,13 +57,13 @@ class RunResults:
         path = self.folder / ERRORS
         if not path.is_file():
             raise InputError("does not exist; run spn-model evaluate first", path=path)
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        if not rows:
-            raise FormatError(f"{path}: has no rows")
         try:
+            with path.open(encoding="utf-8", newline="") as file:
+                rows = list(csv.DictReader(file))
+            if not rows:
+                raise ValueError("it has no rows")
             return {column: _column([row[column] for row in rows], column) for column in rows[0]}
-        except (KeyError, TypeError, ValueError) as error:
+        except (OSError, csv.Error, KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path}: cannot be read ({error})") from error
 
 

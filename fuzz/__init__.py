@@ -1,0 +1,1 @@
+"""Fuzzing of every reader of a file from outside: mutated files in child processes with limits."""

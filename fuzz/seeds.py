@@ -1,0 +1,285 @@
+"""Valid files that mutations start from: made by the project's own programs, and real ones where present.
+
+python -m fuzz.seeds FOLDER
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import torch
+from click.testing import CliRunner
+from PIL import Image
+from spn_cli.data import main as data_command
+from spn_cli.model import main as model_command
+
+from spn_data.simulate import preset, simulate
+from spn_model.export.bundle_checks import BundleOptions
+from spn_model.export.bundle_export import export
+from spn_model.models import checkpoint
+from spn_model.training.training_state import Position, save_state
+from tests.worlds.box_world import write_box
+from tests.worlds.bundle_world import LENS, learnt
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+_XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+120.5" '
+    b'drone-dji:RelativeAltitude="+30.1" drone-dji:GimbalYawDegree="12.3" drone-dji:GimbalPitchDegree="-90.0" '
+    b'drone-dji:GimbalRollDegree="+0.00" drone-dji:GpsLatitude="49.01" drone-dji:GpsLongitude="8.42" '
+    b'drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.011" drone-dji:RtkStdLat="0.012" '
+    b'drone-dji:RtkStdHgt="0.02"/></rdf:RDF></x:xmpmeta>'
+)
+_GPX = """<?xml version="1.0"?>
+<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+{}
+</trkseg></trk></gpx>
+"""
+_ASS = """[Script Info]
+ScriptType: v4.00+
+
+[Events]
+Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
+{}
+"""
+
+
+def make(folder: Path) -> None:
+    """Write the seeds, a folder for each subject, unless the folder is complete."""
+    if (folder / "complete").exists():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    _flight_and_area(folder)
+    _network(folder)
+    make_small(folder, folder / "flight" / "mapping")
+    _copy_shared(folder)
+
+
+def make_small(folder: Path, flight: Path) -> None:
+    """Write the seeds that take a second in all: telemetry, photos and videos, also from a simulated flight."""
+    _telemetry(folder / "telemetry", flight)
+    _pictures(folder / "photos")
+    _videos(folder / "video")
+    (folder / "complete").touch()
+
+
+def _run(command: object, *arguments: object) -> None:
+    result = CliRunner().invoke(command, [str(a) for a in arguments])  # type: ignore[arg-type]
+    if result.exit_code:
+        raise SystemExit(f"seeds: {arguments[0]}: {result.output}{result.exception!r}")
+
+
+def _flight_and_area(folder: Path) -> None:
+    """Simulate 9 s of flight, make an area of it with an evaluation sequence, data set and network."""
+    options = replace(
+        preset("standard", seed=3),
+        **{"width": 320, "height": 180, "fps": 2.0, "length_factor": 0.12, "texels_per_m": 40.0},
+        only=("flight1",),
+    )
+    flight, area = folder / "flight", folder / "area"
+    simulate(flight, options, workers=1)
+    _run(
+        *(data_command, "reconstruct", flight / "mapping", "--area", area),
+        *("--max-features", 800, "--threads", 1, "--fov", 72),
+    )
+    again = folder / "again"
+    again.mkdir()
+    with av.open(str(flight / "mapping" / "flight1.mp4")) as container:
+        images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+    _write_video(again / "again.mp4", images[3:11])
+    _run(
+        data_command,
+        "register",
+        again / "again.mp4",
+        "--name",
+        "again",
+        "--all-frames",
+        "--area",
+        area,
+    )
+    _run(data_command, "register", "--all-frames", "--area", area)
+    _run(data_command, "coverage", "--area", area)
+    _run(data_command, "split", "--area", area)
+    recipe = folder / "recipe" / "short.toml"
+    recipe.parent.mkdir()
+    recipe.write_text(
+        (Path(checkpoint.__file__).parents[1] / "training" / "recipes" / "default.toml").read_text()
+    )
+    _run(
+        *(model_command, "train", "--area", area, "--images", 64, "--validations", 1),
+        *("--threads", 1),
+    )
+    _run(model_command, "evaluate", "--run", "default", "--area", area, "--threads", 1)
+
+
+def _telemetry(folder: Path, flight: Path) -> None:
+    folder.mkdir()
+    shutil.copy(flight / "flight1.SRT", folder / "simulated.SRT")
+    rows = range(20)
+    (folder / "a.gpx").write_text(
+        _GPX.format(
+            "\n".join(
+                f'<trkpt lat="{49 + k * 1e-5:.7f}" lon="8.42"><ele>{120 + k}</ele>'
+                f"<time>2026-05-01T10:00:{k:02d}Z</time></trkpt>"
+                for k in rows
+            )
+        )
+    )
+    (folder / "a.ass").write_text(
+        _ASS.format(
+            "\n".join(
+                f"Dialogue: 0,0:00:{k:02d}.00,0:00:{k + 1:02d}.00,Default,,0,0,0,,"
+                f"[latitude: {49 + k * 1e-5:.6f}] [longitude: 8.42] [rel_alt: 1.2 abs_alt: 120.5]"
+                for k in rows
+            )
+        )
+    )
+    dialects = {
+        "plain.csv": ("time_s,lat_deg,lon_deg,alt_m,yaw,pitch", "{k},{lat},8.42,120.5,12,-90"),
+        "airdata.csv": (
+            "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),"
+            "gimbal_heading(degrees),gimbal_pitch(degrees)",
+            "{ms},2026-05-01 10:00:{k:02d},{lat},8.42,100.1,12,-90",
+        ),
+        "px4.csv": (
+            "time_us,lat,lon,alt,alt_ellipsoid,eph,epv",
+            "{us},{e7},84200000,120500,168000,1.2,2",
+        ),
+        "semi.csv": (
+            "time;latitude;longitude;altitude [m]",
+            "2026-05-01T10:00:{k:02d}Z;{lat};8,42;120,5",
+        ),
+        "tab.tsv": ("time\tlat\tlon\tele", "2026-05-01 10:00:{k:02d}\t{lat}\t8.42\t120"),
+    }
+    for name, (header, row) in dialects.items():
+        cells = [
+            row.format(
+                k=k, ms=1000 * k, us=10**6 * k + 10**9, lat=49 + k / 1e5, e7=490000000 + 100 * k
+            )
+            for k in rows
+        ]
+        (folder / name).write_text("\n".join([header, *cells]) + "\n")
+    (folder / "waypoints").mkdir()
+    (folder / "waypoints" / "w.csv").write_text(
+        "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg\n49.0,8.4,30,90,-45\n49.001,8.4,31,9,-9\n"
+    )
+
+
+def _pictures(folder: Path) -> None:
+    folder.mkdir()
+    pixels = np.random.default_rng(1).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    image = Image.fromarray(cv2.GaussianBlur(pixels, (0, 0), 2))
+    exif = Image.Exif()
+    exif.update({0x010F: "DJI", 0x0110: "FC300S", 0x0112: 6, 0x0132: "2026:05:01 10:00:00"})
+    exif.get_ifd(0x8769).update({0x9003: "2026:05:01 10:00:00", 0x920A: 3.6, 0xA405: 20})
+    exif.get_ifd(0x8825).update(
+        {
+            1: "N",
+            2: (49.0, 1.0, 5.5),
+            3: "E",
+            4: (8.0, 25.0, 1.5),
+            5: b"\0",
+            6: 120.5,
+            7: (8.0, 0.0, 0.0),
+        }
+    )
+    image.save(folder / "a.jpg", exif=exif, xmp=_XMP)
+    image.save(folder / "a.png", exif=exif)
+    image.save(folder / "a.tif", exif=exif)
+    image.save(folder / "a.webp", exif=exif, xmp=_XMP)
+    image.save(folder / "a.bmp")
+    deep = (np.random.default_rng(2).integers(0, 65535, (48, 64))).astype(np.uint16)
+    cv2.imwrite(str(folder / "deep.png"), deep)
+    cv2.imwrite(str(folder / "deep.tif"), deep)
+    masks = folder.parent / "masks"
+    masks.mkdir()
+    cv2.imwrite(str(masks / "m.png"), (deep > 30000).astype(np.uint8) * 255)
+
+
+def _write_video(path: Path, images: list[np.ndarray], codec: str = "libx264") -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=2)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode())
+
+
+def _videos(folder: Path) -> None:
+    """Write one short video in each container, and two with a stream of subtitles."""
+    folder.mkdir()
+    images = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(8)]
+    for name in ("a.mp4", "a.mkv", "a.ts", "a.avi"):
+        _write_video(folder / name, images, "mpeg4" if name == "a.avi" else "libx264")
+    subtitled = folder.parent / "subtitled"
+    subtitled.mkdir()
+    for name, codec in (("s.mp4", "mov_text"), ("s.mkv", "subrip")):
+        with av.open(str(subtitled / name), "w") as container:
+            stream = container.add_stream("libx264", rate=2)
+            stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv420p"
+            track = container.add_mux_stream(codec)
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode())
+            for k in range(len(images)):
+                text = f"[latitude: {49 + k / 1e5}] [longitude: 8.42] [rel_alt: {k} abs_alt: 160.25]".encode()
+                data = len(text).to_bytes(2, "big") + text if codec == "mov_text" else text
+                packet = av.Packet(data)
+                packet.stream, packet.time_base = track, Fraction(1, 1000)
+                packet.pts = packet.dts = 500 * k
+                packet.duration = 100
+                container.mux(packet)
+
+
+def _network(folder: Path) -> None:
+    """Write bundle, checkpoint, training state and parameters of a small network."""
+    torch.set_num_threads(1)
+    (folder / "box").mkdir()
+    dataset = write_box(folder / "box" / "dataset.h5", train=4)
+    network = learnt(dataset)
+    bundle = folder / "bundle"
+    export(network, dataset, bundle, {}, lambda *_: None, BundleOptions(calibration_images=4))
+    (bundle / "camera.json").write_text(
+        f'{{"model": "OPENCV", "width": 640, "height": 360, "params": {LENS.params.tolist()}}}'
+    )
+    cv2.imwrite(str(bundle / "image.jpg"), np.full((360, 640, 3), 90, np.uint8))
+    run = folder / "run"
+    run.mkdir()
+    checkpoint.save(run / "checkpoint.safetensors", network.model, network.view, network.facts)
+    save_state(run / "state.safetensors", network.model.network, None, Position())
+    weights = folder / "weights"
+    weights.mkdir()
+    small = {name: t for name, t in list(network.model.network.state_dict().items())[:4]}
+    torch.save(small, weights / "w.pth")
+
+
+def _copy_shared(folder: Path) -> None:
+    """Add real files where the folder of real data lies beside the repository."""
+    for path in sorted((SHARED / "data" / "srt").glob("*.[sS][rR][tT]")):
+        lines = path.read_bytes().split(b"\n")[:400]
+        (folder / "telemetry" / f"real-{path.name}").write_bytes(b"\n".join(lines))
+    real = folder / "real-photos"
+    real.mkdir()
+    for path in sorted((SHARED / "data" / "photos-dji-xmp").glob("*.JPG"))[:2]:
+        shutil.copy(path, real)
+    lists = folder / "lists"
+    lists.mkdir()
+    for path in sorted((SHARED / "cases" / "labels" / "base").rglob("*")):
+        if path.is_file():
+            (lists / path.relative_to(SHARED / "cases" / "labels" / "base")).parent.mkdir(
+                parents=True, exist_ok=True
+            )
+            shutil.copy(path, lists / path.relative_to(SHARED / "cases" / "labels" / "base"))
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]))
