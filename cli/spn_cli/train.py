@@ -120,4 +120,5 @@ def train(
             f"Next: spn-model evaluate --run {run.name}",
             soft_wrap=True,
         )
-        page.refresh_if_free(area)
+    # Also after a training that was complete: the run that finished it may have been killed before this.
+    page.refresh_if_free(area)
