@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test test-slow lint docs clean
+.PHONY: demo test test-slow kill lint docs clean
 
 $(VENV)/installed: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -42,6 +42,10 @@ test: $(VENV)/readers
 
 test-slow: $(VENV)/installed
 	$(BIN)/python -m pytest -m slow
+
+# Kills every command at each change of a file on a small area, runs it again and compares; needs Linux and cc.
+kill: $(VENV)/installed
+	PYTHONPATH=.:cli $(BIN)/python -m faults.kill
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

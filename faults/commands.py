@@ -39,6 +39,8 @@ ONE = ("--threads", "1")
 SMALL = (*AREA, *ONE, "--max-features", "800")
 TRAIN = (*AREA, *ONE, "--device", "cpu", "--precision", "float32", "--validations", "2")
 SECOND = "second/flight2.mp4"
+NAMED = ("--name", "medium", "--rate", "1", "--any-telemetry")
+ANEW = ("--seed", "3", "--gap", "0.5", "--overwrite")
 RUN = (*AREA, *ONE, "--device", "cpu", "--run", "real")
 
 
@@ -89,8 +91,7 @@ _DATA: tuple[Command, ...] = (
     ),
     Command(
         "register",
-        ("spn-data", "register", SECOND, "--name", "medium", "--rate", "1", "--any-telemetry")
-        + (*AREA, *ONE),
+        ("spn-data", "register", SECOND, *NAMED, *AREA, *ONE),
         "reconstruct",
         ("area/4-eval", "area/report.html", "area/area.toml"),
     ),
@@ -114,8 +115,7 @@ _DATA: tuple[Command, ...] = (
     ),
     Command(
         "split --overwrite",
-        ("spn-data", "split", *AREA, "--size", "160", "--seed", "3", "--gap", "0.5")
-        + ("--overwrite",),
+        ("spn-data", "split", *AREA, "--size", "160", *ANEW),
         "split",
         ("area/5-split", "area/report.html"),
     ),

@@ -66,8 +66,6 @@ def counter(work: Path) -> Path:
 def prepare() -> None:
     """Import what the commands need, so that a forked process starts at once."""
     import cv2
-    import spn_cli.data
-    import spn_cli.model
     import torch
 
     from spn_data.work.parallel import WorkerPool
@@ -208,8 +206,11 @@ def _is_written(name: str, command: Command) -> bool:
 
 def _is_stage(name: str) -> bool:
     parts = name.split("/")
-    return parts[0] == "area" and len(parts) in (2, 3) and not parts[-1].startswith(".") and (
-        len(parts) == 2 or parts[1] in ("4-eval", "4-tracked")
+    return (
+        parts[0] == "area"
+        and len(parts) in (2, 3)
+        and not parts[-1].startswith(".")
+        and (len(parts) == 2 or parts[1] in ("4-eval", "4-tracked"))
     )
 
 
@@ -250,7 +251,9 @@ def campaign(names: list[str], folder: Path, kills: int, jobs: int) -> list[Kill
         done = [kill for kill in tried if kill.output != "ended before the kill"]
         lost, different = (sum(bool(getattr(k, a)) for k in done) for a in ("lost", "different"))
         took = time.monotonic() - began
-        print(f"{name:<28}{changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}", flush=True)
+        print(
+            f"{name:<28}{changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}", flush=True
+        )
         found += done
         for kill in done:
             if kill.lost or kill.different:

@@ -11,7 +11,7 @@ from spn_data.simulate import preset, simulate
 
 
 def write_flight1(out: Path) -> Path:
-    """Simulate a flight of 9 s at 320 x 180 below a folder; return the folder with its video and telemetry."""
+    """Simulate a flight of 9 s at 320 x 180 below a folder; return the folder of its files."""
     options = replace(
         preset("standard", seed=3),
         width=320,
