@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test test-slow fuzz lint docs clean
+.PHONY: demo test test-slow fuzz kill lint docs clean
 
 $(VENV)/installed: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -38,7 +38,7 @@ demo: $(VENV)/installed
 	$(BIN)/python tools/run_page.py docs/python.md
 
 test: $(VENV)/readers
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
 test-slow: $(VENV)/installed
 	$(BIN)/python -m pytest -m slow
@@ -46,6 +46,10 @@ test-slow: $(VENV)/installed
 # Mutated files through every reader, 12,000 of them in about ten minutes; failing ones stay in build/fuzz/failures.
 fuzz: $(VENV)/installed
 	PYTHONPATH=. $(BIN)/python -m fuzz --inputs 12000 --seconds 900
+
+# Kills every command at each change of a file on a small area, runs it again and compares; needs Linux and cc.
+kill: $(VENV)/installed
+	PYTHONPATH=.:cli $(BIN)/python -m faults.kill
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

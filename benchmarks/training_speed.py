@@ -74,6 +74,10 @@ class Silent:
         """Never request a stop."""
         return False
 
+    def is_stopping(self) -> bool:
+        """Never request a stop."""
+        return False
+
 
 class Contest:
     """Alternative loops over the same steps of one stage."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+# A size in the environment when a console is made would hold against the size that a test sets.
+for _size in ("COLUMNS", "LINES"):
+    os.environ.pop(_size, None)
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SHARED_CASES = SHARED_DATA.parent / "cases"
@@ -63,43 +67,17 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def flight1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of one simulated flight of 9 s at 320 x 180: flight1.mp4 and flight1.SRT."""
-    from spn_data.simulate import preset, simulate
+    from tests.worlds.short_flights import write_flight1
 
-    options = replace(
-        preset("standard", seed=3),
-        width=320,
-        height=180,
-        fps=2.0,
-        length_factor=0.12,
-        texels_per_m=40.0,
-        only=("flight1",),
-    )
-    out = tmp_path_factory.mktemp("short") / "flights"
-    simulate(out, options, workers=1)
-    return out / "mapping"
+    return write_flight1(tmp_path_factory.mktemp("short") / "flights")
 
 
 @pytest.fixture(scope="session")
 def flight2(flight1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of flight2.mp4 and flight2.SRT: most of the first flight, flown backwards."""
-    import av
+    from tests.worlds.short_flights import write_flight2
 
-    folder = tmp_path_factory.mktemp("backwards")
-    with av.open(str(flight1 / "flight1.mp4")) as container:
-        images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
-    with av.open(str(folder / "flight2.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=2)
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for image in images[:3:-1]:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode())
-    records = [text.splitlines() for text in (flight1 / "flight1.SRT").read_text().split("\n\n")]
-    records = [lines for lines in records if len(lines) > 2]
-    turned = [[*a[:-1], b[-1]] for a, b in zip(records, records[:3:-1], strict=False)]
-    text = "\n\n".join("\n".join(lines) for lines in turned)
-    (folder / "flight2.SRT").write_text(text + "\n\n")
-    return folder
+    return write_flight2(tmp_path_factory.mktemp("backwards"), flight1)
 
 
 @pytest.fixture(scope="session")

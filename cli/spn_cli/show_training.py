@@ -40,7 +40,7 @@ class TrainingDisplay:
         self._stages = {stage.name: k for k, stage in enumerate(recipe.stages)}
         self._shares = recipe.budget_shares
         self._unit, self._shows = "m", is_main_process()
-        self._stop = False
+        self._stop = self._has_begun = False
         self._validated: list[tuple[str, ...]] = []
         self._status = "Preparing the training images."
         self._printed = -_PLAIN_EVERY_S
@@ -71,11 +71,18 @@ class TrainingDisplay:
             self._live.stop()
 
     def stop(self) -> None:
-        """Request a stop after the current step."""
+        """Request a stop after the current step; before the first step there is nothing to save."""
         self._stop = True
+        if not self._has_begun:
+            raise KeyboardInterrupt
         self.say("Stopping after this step.")
 
     def wants_stop(self) -> bool:
+        """Return whether a stop was requested; from the first call on, a stop waits for the step."""
+        self._has_begun = True
+        return self._stop
+
+    def is_stopping(self) -> bool:
         """Return whether a stop was requested."""
         return self._stop
 
@@ -157,18 +164,17 @@ def _errors(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 @contextmanager
 def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on SIGINT and SIGTERM within the block; a second Ctrl-C interrupts at once."""
-    signals = (int(signal.SIGINT), int(signal.SIGTERM))
-    before: dict[int, Any] = {}
+    """Call `stop` on Ctrl-C within the block; a second Ctrl-C interrupts at once.
 
-    def handle(number: int, _: object) -> None:
+    SIGTERM arrives as Ctrl-C too, see `spn_cli.console`.
+    """
+
+    def handle(*_: object) -> None:
+        signal.signal(signal.SIGINT, before)
         stop()
-        signal.signal(signal.SIGINT, before[signals[0]])
 
-    for number in signals:
-        before[number] = signal.signal(number, handle)
+    before: Any = signal.signal(signal.SIGINT, handle)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGINT, before)

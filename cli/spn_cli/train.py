@@ -87,7 +87,8 @@ def train(
     from spn_model.runs.run_files import RunFiles
     from spn_model.runs.run_training import TrainRequest, train_run
     from spn_model.training.recipe import read_recipe
-    from spn_model.training.train import Data, TrainingStopped, TrainOptions
+    from spn_model.training.train import Data, TrainOptions
+    from spn_model.training.training_record import TrainingStopped
 
     area = options.open_area(area_folder)
     chosen = read_recipe(recipe).with_budget(images, minutes)
@@ -120,4 +121,5 @@ def train(
             f"Next: spn-model evaluate --run {run.name}",
             soft_wrap=True,
         )
-        page.refresh_if_free(area)
+    # Also after a training that was complete: the run that finished it may have been killed before this.
+    page.refresh_if_free(area)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -87,7 +88,10 @@ def spread_rows(count: int, limit: int) -> np.ndarray:
 
 
 def validate(
-    model: PoseModel, frames: ValidationImages, rows: np.ndarray
+    model: PoseModel,
+    frames: ValidationImages,
+    rows: np.ndarray,
+    check: Callable[[], None] = lambda: None,
 ) -> tuple[ValidationErrors, PoseEstimates]:
     """Estimate the poses of some rows and compare them with the true poses.
 
@@ -99,6 +103,8 @@ def validate(
         Images with true poses.
     rows : ndarray of int
         Rows of `frames` to use.
+    check : callable
+        Called before each batch; may raise an exception to stop.
 
     Returns
     -------
@@ -111,6 +117,7 @@ def validate(
     intrinsics = frames.intrinsics
     found = []
     for first in range(0, len(rows), _BATCH):
+        check()
         part = rows[first : first + _BATCH]
         images = np.stack([frames.image(int(row)) for row in part])
         found.append(model.estimate(images, intrinsics[part]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from spn_data.dataset.hdf5_reader import DatasetGroup, FramePoints
@@ -26,6 +28,8 @@ class TrainingSet:
         Largest size of the images kept in memory.
     up_is_known : bool
         Whether z points up in the world.
+    check : callable, optional
+        Called before each image is read; may raise an exception to stop.
 
     Attributes
     ----------
@@ -51,6 +55,7 @@ class TrainingSet:
         *groups: DatasetGroup,
         memory_bytes: int = MEMORY_BYTES,
         up_is_known: bool = True,
+        check: Callable[[], None] | None = None,
     ):
         for group in groups:
             if not len(group):
@@ -70,7 +75,11 @@ class TrainingSet:
         self.poses: Poses = Poses.concatenate([group.poses for group in groups])
         self.intrinsics: np.ndarray = np.concatenate([group.intrinsics for group in groups])
         kept = min(len(self._rows), memory_bytes // (self.size[0] * self.size[1] * 3))
-        self._images = [group.image(k) for group, k in self._rows[:kept]]
+        self._images = []
+        for group, k in self._rows[:kept]:
+            if check is not None:
+                check()
+            self._images.append(group.image(k))
         every_pixel = all(group.all_valid for group in groups)
         self._valid = None if every_pixel else [group.valid(k) for group, k in self._rows]
         self.has_points = groups[0].points_for_training

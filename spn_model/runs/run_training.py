@@ -123,6 +123,8 @@ def train_run(
     with _locked(run) if is_main else nullcontext():
         config = _existing_config(run, record, overwrite=overwrite, is_main=is_main)
         if config is not None and config["facts"] is not None:
+            if is_main:  # left by a run that was killed in between
+                run.state.unlink(missing_ok=True)
             return TrainedRun(facts=config["facts"], unit=unit, is_new=False) if is_main else None
         if config is None:
             config = _config(request, record)
@@ -222,7 +224,8 @@ def _existing_config(
 
 
 def _remove_files(run: RunFiles) -> None:
-    for entry in run.folder.iterdir():
+    # The configuration last: without it, what a kill leaves would belong to no known training.
+    for entry in sorted(run.folder.iterdir(), key=lambda entry: entry == run.config):
         if entry.name != LOCK:
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,15 @@ from spn_model.training.machine import Machine, Ranks, choose, limited_threads, 
 from spn_model.training.muon import Muon
 from spn_model.training.recipe import ALL, AREA, PRETRAINING, Recipe, Stage
 from spn_model.training.training_loss import Diverged, LossMonitor
-from spn_model.training.training_record import Clock, Files, Record, Watch, select_validation_frames
+from spn_model.training.training_record import (
+    Clock,
+    Files,
+    Record,
+    TrainingStopped,
+    Watch,
+    raise_if_stopping,
+    select_validation_frames,
+)
 from spn_model.training.training_state import Position, read_state
 
 _logger = logging.getLogger(__name__)
@@ -79,10 +88,6 @@ class Data:
         """Return the data set file that a stage trains on."""
         named = {AREA: self.area, PRETRAINING: self.pretraining or self.area}
         return named.get(stage.data, Path(stage.data))
-
-
-class TrainingStopped(Exception):
-    """Raised when the watcher requested a stop; the state is saved."""
 
 
 def train(
@@ -147,6 +152,8 @@ def train(
             record = Record(files, watch, model, view_of(area), judged, position, facts)
             stack.enter_context(closing(record))
         path, frames, images = None, "", None
+        # Several processes can only stop together, in a step.
+        check = partial(raise_if_stopping, watch) if ranks.world == 1 else None
         for index in range(position.stage, len(recipe.stages)):
             stage = recipe.stages[index]
             if images is None or (data.of(stage), stage.frames) != (path, frames):
@@ -154,7 +161,7 @@ def train(
                 path, frames = data.of(stage), stage.frames
                 dataset = area if path == data.area else stack.enter_context(Dataset(path))
                 groups = _groups_of(dataset, frames)
-                images = TrainingSet(*groups, up_is_known=dataset.info.up_is_known)
+                images = TrainingSet(*groups, up_is_known=dataset.info.up_is_known, check=check)
                 if is_new and state is None:
                     model.fit(images)
             if record is not None:
@@ -217,6 +224,9 @@ def run_stage(
         prefetch_batches(part_of, at.step * stage.parts, machine.workers, 2 * stage.parts) as ahead,
         gradient_workers(model, parameters, stage.parts, machine) as gradient,
     ):
+        if at.is_due:
+            with _divergence_as_stage_error(at):
+                _validate(record, stage, progress, at, optimizer)
         waited_s = at.wait_s
         model.network.train()
         while progress < 1:
@@ -250,7 +260,7 @@ def run_stage(
                     means["images_per_s"] = (at.shown - shown) / max(now - logged, 1e-9)
                     record.steps(stage.name, progress, rate, means)
                     if is_judged:
-                        record.validate(stage.name, progress)
+                        _validate(record, stage, progress, at, optimizer)
                         model.network.train()
                     if is_saved:
                         began = time.perf_counter()
@@ -260,6 +270,24 @@ def run_stage(
                     raise TrainingStopped
             logged, shown = time.perf_counter(), at.shown
             saved = logged if is_saved else saved
+
+
+def _validate(
+    record: Record | None,
+    stage: Stage,
+    progress: float,
+    at: Position,
+    optimizer: torch.optim.Optimizer,
+) -> None:
+    """Validate in the first process; if it is stopped, the resumed training begins with it."""
+    if record is not None:
+        at.is_due = True
+        try:
+            record.validate(stage.name, progress)
+        except TrainingStopped:
+            record.save(optimizer)
+            raise
+    at.is_due = False
 
 
 def make_part(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,7 +76,20 @@ class Watch(Protocol):
         """
 
     def wants_stop(self) -> bool:
-        """Return whether to save the state and end the training; called at each step."""
+        """Return whether to save the state and end the training; called once in each step."""
+
+    def is_stopping(self) -> bool:
+        """Return whether a stop was requested; called between steps, often in what takes long."""
+
+
+class TrainingStopped(Exception):
+    """Raised when the watcher requested a stop; the state is saved."""
+
+
+def raise_if_stopping(watch: Watch) -> None:
+    """Raise TrainingStopped if a stop was requested."""
+    if watch.is_stopping():
+        raise TrainingStopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +101,11 @@ class ValidationFrames:
     rows: np.ndarray
     group: str = ""
 
-    def errors(self, model: PoseModel, *, scales: bool) -> ValidationErrors:
+    def errors(
+        self, model: PoseModel, *, scales: bool, check: Callable[[], None]
+    ) -> ValidationErrors:
         """Return the errors of the model's estimates; if `scales`, also rescale its covariances by them."""
-        errors, estimates = validate(model, self.frames, self.rows)
+        errors, estimates = validate(model, self.frames, self.rows, check)
         if scales:
             try:
                 factor = fit_covariance_scale(estimates, self.frames.poses[self.rows])
@@ -193,21 +208,34 @@ class Record:
     def _with_views(self) -> list[ValidationFrames]:
         """Return the frames to evaluate, including the stage's views, which are rendered on first use."""
         if self._images is not None:
-            views = self.model.held_out_views(self._images, _VIEWS)
+            views = self.model.held_out_views(self._images, _VIEWS, self._check)
             if views is not None:
                 rows = np.arange(len(views.poses))
                 self.judged = [ValidationFrames("views", views, rows), *self.judged]
             self._images = None
         return self.judged
 
+    def _check(self) -> None:
+        """Raise TrainingStopped if a stop was requested; several processes stop together, in a step."""
+        if self.facts.get("processes", 1) == 1:
+            raise_if_stopping(self.watch)
+
     def validate(self, stage: str, progress: float) -> None:
-        """Evaluate the model; save a checkpoint if it is among the best or nothing can validate it."""
+        """Evaluate the model; save a checkpoint if it is among the best or nothing can validate it.
+
+        Raises TrainingStopped if a stop is requested before the evaluation is complete.
+        """
         at = self.position
         began = time.perf_counter()
         judged = self._with_views()
         events = [frames.event for frames in judged]
         by = next((event for event in _SCALING if event in events), None)
-        results = {f.event: f.errors(self.model, scales=f.event == by) for f in judged}
+        # The scaling changes the model, so it comes last, when nothing can stop any more.
+        found = {
+            f.event: f.errors(self.model, scales=f.event == by, check=self._check)
+            for f in sorted(judged, key=lambda f: f.event == by)
+        }
+        results = {event: found[event] for event in events}
         at.validate_s += time.perf_counter() - began
         for event, errors in results.items():
             plain = errors.plain()

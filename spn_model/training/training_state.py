@@ -52,6 +52,8 @@ class Position:
         Errors at the last validation.
     log_bytes : int
         Length of the log.
+    is_due : bool
+        Whether a validation was begun after the last step and stopped.
     """
 
     stage: int = 0
@@ -68,6 +70,7 @@ class Position:
     kept: dict[str, Any] | None = None
     latest: dict[str, Any] = field(default_factory=dict)
     log_bytes: int = 0
+    is_due: bool = False
 
 
 def save_state(

@@ -17,9 +17,10 @@ from click.testing import CliRunner, Result
 from spn_cli.model import main
 from spn_cli.train import train
 
+from spn_data.dataset.hdf5_reader import DatasetGroup
 from spn_model.models.checkpoint import load
 from spn_model.training.training_state import COLUMNS
-from tests.worlds.training_world import write_field
+from tests.worlds.training_world import TinyModel, register_tiny, write_field
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
 
@@ -158,6 +159,67 @@ def test_ctrl_c_keeps_the_state_and_the_same_command_goes_on(place):
     ]
     assert all(torch.equal(both[0][name], both[1][name]) for name in both[0])
     assert not (folder / "state.safetensors").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["reading the data set", "validation"])
+def test_a_first_signal_outside_the_steps_stops_at_once(place, monkeypatch, number, moment):
+    """The first signal while images are read or validated stops there, and the resumed run is the same."""
+    whole = trained(place, "--run", "whole")
+    assert whole.exit_code == 0
+    images = []
+    inner = DatasetGroup.image if moment == "reading the data set" else TinyModel.estimate
+
+    def interrupted(*arguments):
+        images.append(1)
+        if len(images) == 2:
+            os.kill(os.getpid(), number)
+        return inner(*arguments)
+
+    if moment == "validation":
+        monkeypatch.setattr(TinyModel, "estimate", interrupted)
+    else:
+        monkeypatch.setattr(DatasetGroup, "image", interrupted)
+    cut = trained(place, "--run", "cut")
+    assert cut.exit_code == 128 + number, cut.output
+    assert len(images) == 2
+    monkeypatch.undo()
+    register_tiny()
+    resumed = trained(place, "--run", "cut")
+    assert resumed.exit_code == 0, resumed.output
+    for name in ("last", "checkpoint"):
+        both = [
+            load(place / "area" / "runs" / run / f"{name}.safetensors").model.network.state_dict()
+            for run in ("whole", "cut")
+        ]
+        assert all(torch.equal(both[0][key], both[1][key]) for key in both[0])
+
+
+def test_a_kill_before_the_state_is_removed_leaves_nothing(place):
+    """The state that a kill at the end of a training leaves is removed by the next run."""
+    assert trained(place).exit_code == 0
+    state = place / "area" / "runs" / "tiny" / "state.safetensors"
+    state.write_bytes(b"left")
+    assert "is already trained" in trained(place).output
+    assert not state.exists()
+
+
+def test_a_kill_while_a_run_is_replaced_leaves_its_configuration(place, monkeypatch):
+    """--overwrite removes config.json last, so that the same command can go on after a kill."""
+    assert trained(place).exit_code == 0
+    folder = place / "area" / "runs" / "tiny"
+    removed = []
+    unlink = Path.unlink
+
+    def record(path, missing_ok=False):
+        if path.parent == folder and not path.name.startswith("."):
+            removed.append(path.name)
+        unlink(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", record)
+    assert trained(place, "--seed", "1", "--overwrite").exit_code == 0
+    assert removed.index("config.json") == 3
+    assert set(removed[:3]) == {"checkpoint.safetensors", "last.safetensors", "log.csv"}
 
 
 def test_a_full_disk_is_one_line(place, monkeypatch):

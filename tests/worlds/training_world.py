@@ -215,6 +215,9 @@ class Follower:
         self._left -= 1
         return self._left < 0
 
+    def is_stopping(self) -> bool:
+        return self._left < 0
+
 
 def files(folder: Path) -> Files:
     """Return the files of a training in a folder, which is created."""

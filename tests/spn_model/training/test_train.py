@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -294,7 +295,9 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
     """
     stages = []
 
-    def views(self: TinyModel, data: TrainingSet, count: int) -> HeldOutViews:
+    def views(
+        self: TinyModel, data: TrainingSet, count: int, check: Callable[[], None] = lambda: None
+    ) -> HeldOutViews:
         stages.append(len(data))
         shown = 12
         poses = data.poses[:shown]
