@@ -31,8 +31,8 @@ from tests.worlds.bundle_world import LENS, learnt
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 _XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    b'<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+120.5" '
-    b'drone-dji:RelativeAltitude="+30.1" drone-dji:GimbalYawDegree="12.3" drone-dji:GimbalPitchDegree="-90.0" '
+    b'<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+120" '
+    b'drone-dji:RelativeAltitude="+30.1" drone-dji:GimbalYawDegree="12.3" drone-dji:GimbalPitchDegree="-90" '
     b'drone-dji:GimbalRollDegree="+0.00" drone-dji:GpsLatitude="49.01" drone-dji:GpsLongitude="8.42" '
     b'drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.011" drone-dji:RtkStdLat="0.012" '
     b'drone-dji:RtkStdHgt="0.02"/></rdf:RDF></x:xmpmeta>'
@@ -64,7 +64,7 @@ def make(folder: Path) -> None:
 
 
 def make_small(folder: Path, flight: Path) -> None:
-    """Write the seeds that take a second in all: telemetry, photos and videos, also from a simulated flight."""
+    """Write the seeds that take a second in all: telemetry, photos and videos, also of a flight."""
     _telemetry(folder / "telemetry", flight)
     _pictures(folder / "photos")
     _videos(folder / "video")

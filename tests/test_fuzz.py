@@ -51,9 +51,9 @@ def test_a_short_campaign_finds_nothing(flight1, finished_area, tmp_path):
         "--folder",
         tmp_path,
         "--inputs",
-        "300",
+        "200",
         "--seconds",
-        "6",
+        "4",
     ]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "cli")])}
     done = subprocess.run(

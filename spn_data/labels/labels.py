@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 from tokenize import TokenError
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -24,10 +24,8 @@ from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000
 # Exceptions that NumPy raises for a damaged archive.
-_DAMAGED = (
-    *(OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error),
-    *(SyntaxError, TokenError),  # NumPy parses a header as Python
-)
+_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
+_UNPARSED = (SyntaxError, TokenError)  # NumPy parses the header of an array as Python
 _UPPER = np.triu_indices(6)
 
 
@@ -394,7 +392,7 @@ def read_label_observations(path: Path) -> LabelObservations:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             seen = LabelObservations(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
-    except _DAMAGED as error:
+    except (*_DAMAGED, *_UNPARSED) as error:
         raise InputError(f"is not an observations file ({error})", path=path) from error
     if seen.pixels.shape != (len(seen.frame_idx), 2):
         raise InputError("is not an observations file (shapes differ)", path=path)
