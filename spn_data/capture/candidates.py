@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,6 +16,7 @@ from spn_data.capture.photos import PhotoHeaders, decode_photo_gray, read_header
 from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, safe_name
 from spn_data.errors import InputError
+from spn_data.storage.array_files import ARRAY_DAMAGE
 from spn_data.storage.files import atomic_writer
 from spn_data.telemetry.exif import telemetry_from_photos
 from spn_data.telemetry.track import Telemetry
@@ -272,7 +272,7 @@ def _read_cache(path: Path, source: Source) -> Candidates | None:
             starts, notes = data["part_start_s"].tolist(), data["notes"].tolist()
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except ARRAY_DAMAGE as error:
         _logger.debug("%s: cannot be used (%r), measured again", path, error)
         return None
     return Candidates(source, measured, tuple(starts), None, None, tuple(notes))

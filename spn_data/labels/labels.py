@@ -5,14 +5,11 @@ Labels are stored as poses.csv, observations as observations.npz.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -20,12 +17,10 @@ from spn_data.capture.frames import Frames, check_name
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.geometry.rotations import canonical_quats
+from spn_data.storage.array_files import ARRAY_DAMAGE
 from spn_data.storage.files import atomic_writer, read_csv, write_csv
 
 _MAX_CSV_BYTES = 2_000_000_000
-# Exceptions that NumPy raises for a damaged archive.
-_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, BadZipFile, zlib.error)
-_UNPARSED = (SyntaxError, TokenError)  # NumPy parses the header of an array as Python
 _UPPER = np.triu_indices(6)
 
 
@@ -392,7 +387,7 @@ def read_label_observations(path: Path) -> LabelObservations:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             seen = LabelObservations(arrays["frame_idx"], arrays["point_ids"], arrays["pixels"])
-    except (*_DAMAGED, *_UNPARSED) as error:
+    except ARRAY_DAMAGE as error:
         raise InputError(f"is not an observations file ({error})", path=path) from error
     if seen.pixels.shape != (len(seen.frame_idx), 2):
         raise InputError("is not an observations file (shapes differ)", path=path)

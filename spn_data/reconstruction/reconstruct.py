@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from spn_data.errors import StageError
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
+from spn_data.reconstruction import saved_models
 from spn_data.reconstruction.attempts import Attempt, Chance, ReconstructOptions, attempts, chances
 from spn_data.reconstruction.contradiction import contradictions, focal_changes
 from spn_data.reconstruction.correspondences import (
@@ -34,7 +34,6 @@ from spn_data.reconstruction.notes import (
     failure_message,
     misplaced_note,
 )
-from spn_data.storage.files import write_atomically
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
@@ -281,9 +280,9 @@ def _map(
 ) -> list[Path]:
     """Return the sub-models, most images first. An interrupted run continues from its last snapshot."""
     folder = run.work / "-".join(["mapping", attempt.name, *([chance.name] if chance else [])])
-    done = folder / "models.json"
-    if done.exists():
-        return [folder / "models" / name for name in json.loads(done.read_text())]
+    finished = saved_models.read_submodels(folder)
+    if finished is not None:
+        return finished
     for name in ("models", "snapshots"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     snapshot = latest_snapshot(folder / "snapshots") or start_from
@@ -315,7 +314,7 @@ def _map(
             log=run.work / "mapping.log",
             progress=lambda registered: run.progress("mapping", min(registered, n), n),
         )
-    write_atomically(done, json.dumps([model.name for model in models]))
+    saved_models.write_submodels(folder, models)
     return models
 
 
@@ -325,18 +324,17 @@ def _settled(run: _Run, attempt: Attempt, model: Path, notes: list[str]) -> Path
     It is computed only once: later chances add matches to the database, and an interrupted run that
     recomputed it would continue from a different model.
     """
-    done = run.work / f"mapping-{attempt.name}" / "settled.json"
-    if not done.exists():
+    folder = run.work / f"mapping-{attempt.name}"
+    settled = saved_models.read_settled(folder, run.work)
+    if settled is None:
         messages: list[str] = []
         if attempt.thinned:
             model = _with_all_points(run, attempt, model)
         model = _without_misplaced(run, attempt.database, model, messages)
-        write_atomically(
-            done, json.dumps({"model": str(model.relative_to(run.work)), "told": messages})
-        )
-    found = json.loads(done.read_text())
-    notes += found["told"]
-    return run.work / found["model"]
+        saved_models.write_settled(folder, run.work, model, messages)
+        settled = model, messages
+    notes += settled[1]
+    return settled[0]
 
 
 def _with_all_points(run: _Run, attempt: Attempt, model: Path) -> Path:
