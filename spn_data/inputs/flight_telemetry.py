@@ -92,6 +92,13 @@ def source_telemetry(
     return check_overlap(track, clock, _names(source))
 
 
+def with_time_offset(track: Telemetry | None, offset_s: float | None) -> Telemetry | None:
+    """Return telemetry with the user's time offset; the tags of a photo are its own and have none."""
+    if track is None or track.kind == "exif":
+        return track
+    return track.shifted(offset_s or 0.0)
+
+
 def _video_telemetry(
     source: Source,
     starts_s: Sequence[float],

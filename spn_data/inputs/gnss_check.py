@@ -81,7 +81,9 @@ class GnssCheck:
         return text
 
 
-def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | None:
+def check_gnss(
+    labels: Labels, track: Telemetry, geo: GeoFit, *, time_is_known: bool = False
+) -> GnssCheck | None:
     """Compare registered frames with the fixes of their telemetry.
 
     Parameters
@@ -91,6 +93,8 @@ def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | Non
     track : Telemetry
     geo : GeoFit
         Georegistration of the map.
+    time_is_known : bool, optional
+        Whether the telemetry is on the clock of the video; otherwise its time offset is estimated.
 
     Returns
     -------
@@ -102,7 +106,7 @@ def check_gnss(labels: Labels, track: Telemetry, geo: GeoFit) -> GnssCheck | Non
     if len(registered) < _MIN_FIXES:
         return None
     offset_s = 0.0
-    if track.kind != "exif":
+    if track.kind != "exif" and not time_is_known:
         estimated = estimate_time_offset(registered.poses, registered.time_s, track)
         offset_s = estimated.applied_s
     rows = track.shifted(offset_s).at(registered.time_s)

@@ -64,12 +64,15 @@ class RegisterStageOptions:
         File of a calibrated camera to start from.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
+    time_offset_s : float or None
+        Seconds to add to the times of the telemetry; None: estimated for the comparison with GNSS.
     """
 
     register: RegisterOptions = field(default_factory=RegisterOptions)
     fov_deg: float | None = None
     camera_file: str | None = None
     any_telemetry: bool = False
+    time_offset_s: float | None = None
 
 
 def register(
@@ -113,6 +116,8 @@ def register(
     source = find_source(area, video, name)
     given = None if options.camera_file is None else read_camera(Path(options.camera_file))
     made_with = {**asdict(options), "camera_file": None if given is None else camera_to_json(given)}
+    if options.time_offset_s is None:
+        del made_with["time_offset_s"]  # unknown to earlier versions, whose results are equal
     stage = f"{EVALUATION}/{source.sequence}"
     inputs = fingerprints((source,), {})
     work = area.begin(stage, made_with, inputs, overwrite=overwrite)
@@ -136,7 +141,7 @@ def _register(
     stopwatch = Stopwatch()
     before = _map_hashes(area)
     with stopwatch.step("frames"):
-        check_telemetry(source)
+        check_telemetry(source, time_offset_s=options.time_offset_s)
         sampled = sample_frames(
             work.path,
             source,
@@ -145,6 +150,7 @@ def _register(
             rate_hz=options.register.rate_hz,
             fov_deg=options.fov_deg,
             any_telemetry=options.any_telemetry,
+            time_offset_s=options.time_offset_s,
         )
     chosen = sampled.frames.select(sampled.frames.chosen)
     found = register_sequence(
@@ -161,7 +167,7 @@ def _register(
         write_labels(work.path / POSES, labels)
         write_label_observations(work.path / OBSERVATIONS, found.seen)
         _write_camera(work.path / CAMERA, found, sampled.start)
-        gnss = _gnss(area, labels, sampled.track)
+        gnss = _gnss(area, labels, sampled.track, options.time_offset_s)
         after = _map_hashes(area)
         if after != before:
             raise StageError(f"{area.root}: the map changed while {source.sequence} was registered")
@@ -281,11 +287,13 @@ def _start_json(start: tuple[Camera, bool]) -> dict[str, Any]:
     return {**camera_to_json(start[0]), "focal_is_known": start[1]}
 
 
-def _gnss(area: Area, labels: Labels, track: Telemetry | None) -> GnssCheck | None:
+def _gnss(
+    area: Area, labels: Labels, track: Telemetry | None, given_offset_s: float | None
+) -> GnssCheck | None:
     geo = read_geo(area)
     if geo is None or track is None or not track.has_fix.any():
         return None
-    return check_gnss(labels, track, geo)
+    return check_gnss(labels, track, geo, time_is_known=given_offset_s is not None)
 
 
 def _counts(labels: Labels, camera: Camera, gnss: GnssCheck | None) -> dict[str, Any]:

@@ -139,3 +139,11 @@ def test_too_few_labels_or_fixes_are_no_check() -> None:
     assert check_gnss(labelled(failed=N - 4), telemetry, geo) is None
     blind = replace(telemetry, lat_lon_deg=np.full((len(telemetry.time_s), 2), np.nan))
     assert check_gnss(labelled(), blind, geo) is None
+
+
+def test_a_known_clock_is_not_estimated_again() -> None:
+    """With a time offset that the user gave, late fixes are compared as they are."""
+    geo = geo_fit(3)
+    found = check_gnss(labelled(), track(geo, (0.0, 0.0, 0.0), late_s=0.6), geo, time_is_known=True)
+    assert found is not None
+    assert found.time_offset_s == 0
