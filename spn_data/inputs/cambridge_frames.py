@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
@@ -218,7 +219,7 @@ def _image_file(folder: Path, name: str) -> Path | None:
     """Return the listed image file, or the same image converted to another format; None if missing."""
     path = folder / name
     candidates = [path, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if isfile(candidate)), None)
 
 
 def _without_missing_images(frames: ListedFrames, notes: list[str]) -> ListedFrames:

@@ -244,6 +244,14 @@ def test_a_missing_image_is_left_out_and_reported(scene, tmp_path):
     assert f"{NAMES[1]}: left out because the image is missing" in done.notes
 
 
+def test_a_name_too_long_for_the_file_system_is_a_missing_image(scene, tmp_path):
+    """A name of 300 characters in a list is reported as a missing image."""
+    path = scene / "dataset_train.txt"
+    path.write_text(path.read_text().replace(NAMES[1], f"{'x' * 300}.png"))
+    done = run(scene, tmp_path / "dataset.h5", width_px=80)
+    assert any("left out because the image is missing" in note for note in done.notes)
+
+
 def test_an_image_in_two_lists_is_refused(scene, tmp_path):
     """An image in both the training and the validation list is refused."""
     write_cambridge(scene / "dataset_validation.txt", [NAMES[0]], poses()[:1])
