@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spn_data.errors import InputError
+from spn_data.media.photo_file import JPEG_SUFFIXES, TWIN_SUFFIXES
 from spn_data.telemetry.exif import read_photo
 from spn_data.telemetry.photo_time import natural_order
 
@@ -46,11 +47,11 @@ def photos_in_order(paths: Sequence[Path]) -> tuple[Path, ...]:
 
 def one_file_per_photo(photos: Sequence[Path], ignored: list[tuple[Path, str]]) -> list[Path]:
     """Leave out the DNG or HEIC of which there is a JPEG of the same name in the same folder."""
-    jpegs = {(p.parent, p.stem.lower()): p for p in photos if p.suffix.lower() in (".jpg", ".jpeg")}
+    jpegs = {(p.parent, p.stem.lower()): p for p in photos if p.suffix.lower() in JPEG_SUFFIXES}
     kept = []
     for path in photos:
         twin = jpegs.get((path.parent, path.stem.lower()))
-        if twin is not None and path.suffix.lower() in (".dng", ".heic", ".heif"):
+        if twin is not None and path.suffix.lower() in TWIN_SUFFIXES:
             ignored.append((path, f"the same photo as {twin.name}, which is used"))
         else:
             kept.append(path)

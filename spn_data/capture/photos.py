@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from spn_data.errors import InputError
-from spn_data.media.photo_file import DAMAGE, develop, is_raw, open_photo, raw_size
+from spn_data.media.photo_file import DAMAGE, develop, is_raw, open_photo
 from spn_data.telemetry.exif import PhotoMetadata, read_photo
 
 _MIN_RANGE_16 = 64 * 256  # of 16-bit values: a quarter of the grey levels
@@ -131,8 +131,7 @@ def decode_photo(path: Path, *, upright: bool = True) -> np.ndarray:
 def decode_photo_gray(path: Path, *, max_width: int) -> np.ndarray:
     """Decode an upright grey image (h, w) uint8 at most `max_width` wide; JPEGs are decoded reduced."""
     if is_raw(path):
-        half_size = min(raw_size(path)) >= 2 * max_width
-        gray = cv2.cvtColor(develop(path, half_size=half_size), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(develop(path, enough_px=max_width), cv2.COLOR_RGB2GRAY)
     else:
         gray = _decode_gray(path, max_width)
     scale = max_width / gray.shape[1]

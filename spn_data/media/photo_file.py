@@ -15,11 +15,10 @@ from PIL import Image
 
 from spn_data.errors import InputError
 
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+TWIN_SUFFIXES = (".heic", ".heif", ".dng")  # cameras write a JPEG of the same name too
 # In order of preference among several files of one image.
-PHOTO_SUFFIXES = (
-    *(".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"),
-    *(".heic", ".heif", ".dng"),
-)
+PHOTO_SUFFIXES = (".png", *JPEG_SUFFIXES, ".bmp", ".webp", ".tif", ".tiff", *TWIN_SUFFIXES)
 RAW_SUFFIXES = (".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 RAW_REMEDY = "RAW photo that is not read: convert it to DNG (Adobe DNG Converter) or JPEG"
 MAX_PHOTO_PIXELS = 300_000_000
@@ -108,7 +107,7 @@ def raw_size(path: Path) -> tuple[int, int]:
         return (sizes.iheight, sizes.iwidth) if swapped else (sizes.iwidth, sizes.iheight)
 
 
-def develop(path: Path, *, upright: bool = True, half_size: bool = False) -> np.ndarray:
+def develop(path: Path, *, upright: bool = True, enough_px: int | None = None) -> np.ndarray:
     """Develop a DNG, with the same parameters for all photos.
 
     Parameters
@@ -117,8 +116,9 @@ def develop(path: Path, *, upright: bool = True, half_size: bool = False) -> np.
         The DNG.
     upright : bool
         Whether to apply its orientation.
-    half_size : bool
-        Whether to make one pixel of each 2 x 2 of the sensor, which is several times faster.
+    enough_px : int or None
+        If half the shorter side is at least this long, one pixel is made of each 2 x 2 of the sensor, which
+        is several times faster.
 
     Returns
     -------
@@ -128,6 +128,7 @@ def develop(path: Path, *, upright: bool = True, half_size: bool = False) -> np.
     """
     with _open_raw(path) as raw:
         rawpy = importlib.import_module("rawpy")
+        shorter = min(raw.sizes.iheight, raw.sizes.iwidth)
         try:
             raw.unpack()
             return np.asarray(
@@ -137,7 +138,7 @@ def develop(path: Path, *, upright: bool = True, half_size: bool = False) -> np.
                     use_camera_wb=True,
                     output_color=rawpy.ColorSpace.sRGB,
                     output_bps=8,
-                    half_size=half_size,
+                    half_size=enough_px is not None and shorter >= 2 * enough_px,
                     user_flip=None if upright else 0,
                 )
             )
