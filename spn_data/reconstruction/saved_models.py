@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import load_json, parse_json, reporting_damage
+from spn_data.storage.json_files import load_json, parse_file, reporting_damage
 
 _MAX_BYTES = 1_000_000
 _MODELS, _SETTLED = "models.json", "settled.json"
@@ -30,9 +30,7 @@ def read_submodels(folder: Path) -> list[Path] | None:
     if not path.exists():
         return None
     with reporting_damage(path, "a list of models"):
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError("too large")
-        names = parse_json(path.read_text(encoding="utf-8"))
+        names = parse_file(path, max_bytes=_MAX_BYTES)
         if not isinstance(names, list):
             raise TypeError("no list")
         return [_inside(folder / "models", name) for name in names]

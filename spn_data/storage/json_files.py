@@ -63,12 +63,17 @@ def load_json(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
         If the file is missing, damaged or too large, or holds something else.
     """
     with reporting_damage(path):
-        if path.stat().st_size > max_bytes:
-            raise ValueError(f"larger than {max_bytes / 1e6:.0f} MB")
-        value = parse_json(path.read_text(encoding="utf-8"))
+        value = parse_file(path, max_bytes=max_bytes)
         if not isinstance(value, dict):
             raise TypeError(f"{kind_of(value)} instead of an object")
     return value
+
+
+def parse_file(path: Path, *, max_bytes: int) -> Any:
+    """Parse a JSON file of any kind of value; raise OSError or ValueError if that is impossible."""
+    if path.stat().st_size > max_bytes:
+        raise ValueError(f"larger than {max_bytes / 1e6:.0f} MB")
+    return parse_json(path.read_text(encoding="utf-8"))
 
 
 def parse_json(text: str) -> Any:
