@@ -207,7 +207,7 @@ def _pairs(
             by_number.setdefault(number, []).append((k, event))
     pairs: dict[int, tuple[int, int]] = {}
     for row, name in enumerate(names):
-        found = _NUMBER.search(name.rpartition(".")[0] or name)
+        found = _NUMBER.search(Path(name).stem)
         choices = by_number.get(int(found[1]), []) if found else []
         if len(choices) > 1:
             apart = [_apart_m(photos.lat_lon_deg[row], files[k].lat_lon_deg[e]) for k, e in choices]
@@ -232,8 +232,7 @@ def _check_lenses(
     """Refuse two photos of one exposure, unless they are of several lenses (other letters at the end)."""
     seen: dict[tuple[int, int, str], str] = {}
     for row, (k, event) in pairs.items():
-        stem = names[row].rpartition(".")[0] or names[row]
-        lens = re.sub(r".*\d", "", stem)
+        lens = re.sub(r".*\d", "", Path(names[row]).stem)
         before = seen.setdefault((k, event, lens), names[row])
         if before != names[row]:
             raise InputError(
