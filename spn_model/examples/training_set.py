@@ -28,7 +28,7 @@ class TrainingSet:
         Largest size of the images kept in memory.
     up_is_known : bool
         Whether z points up in the world.
-    check : callable, optional
+    check : callable
         Called before each image is read; may raise an exception to stop.
 
     Attributes
@@ -55,7 +55,7 @@ class TrainingSet:
         *groups: DatasetGroup,
         memory_bytes: int = MEMORY_BYTES,
         up_is_known: bool = True,
-        check: Callable[[], None] | None = None,
+        check: Callable[[], None] = lambda: None,
     ):
         for group in groups:
             if not len(group):
@@ -77,8 +77,7 @@ class TrainingSet:
         kept = min(len(self._rows), memory_bytes // (self.size[0] * self.size[1] * 3))
         self._images = []
         for group, k in self._rows[:kept]:
-            if check is not None:
-                check()
+            check()
             self._images.append(group.image(k))
         every_pixel = all(group.all_valid for group in groups)
         self._valid = None if every_pixel else [group.valid(k) for group, k in self._rows]

@@ -142,6 +142,8 @@ def train(
             published = recipe.weights == "published"
             model.load_pretrained(model.weights_name if published else recipe.weights)
         area = stack.enter_context(Dataset(data.area))
+        # Several processes can only stop together, in a step.
+        check = partial(raise_if_stopping, watch) if ranks.world == 1 else lambda: None
         record = None
         if ranks.is_main:
             judged = select_validation_frames(
@@ -149,11 +151,9 @@ def train(
             )
             facts = {"recipe": recipe.plain(), "seed": options.seed, **machine.plain()}
             facts["processes"] = ranks.world
-            record = Record(files, watch, model, view_of(area), judged, position, facts)
+            record = Record(files, watch, model, view_of(area), judged, position, facts, check)
             stack.enter_context(closing(record))
         path, frames, images = None, "", None
-        # Several processes can only stop together, in a step.
-        check = partial(raise_if_stopping, watch) if ranks.world == 1 else None
         for index in range(position.stage, len(recipe.stages)):
             stage = recipe.stages[index]
             if images is None or (data.of(stage), stage.frames) != (path, frames):

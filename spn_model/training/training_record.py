@@ -163,6 +163,8 @@ class Record:
         Progress of the training, which is updated.
     facts : dict
         Facts that are written into the checkpoints.
+    check : callable
+        Called often during a validation; may raise TrainingStopped.
     """
 
     files: Files
@@ -172,6 +174,7 @@ class Record:
     judged: list[ValidationFrames]
     position: Position
     facts: dict[str, Any]
+    check: Callable[[], None] = lambda: None
     _learnt: list[str] = field(default_factory=list)
     _images: TrainingSet | None = None
     _log: Log = field(init=False)
@@ -208,17 +211,12 @@ class Record:
     def _with_views(self) -> list[ValidationFrames]:
         """Return the frames to evaluate, including the stage's views, which are rendered on first use."""
         if self._images is not None:
-            views = self.model.held_out_views(self._images, _VIEWS, self._check)
+            views = self.model.held_out_views(self._images, _VIEWS, self.check)
             if views is not None:
                 rows = np.arange(len(views.poses))
                 self.judged = [ValidationFrames("views", views, rows), *self.judged]
             self._images = None
         return self.judged
-
-    def _check(self) -> None:
-        """Raise TrainingStopped if a stop was requested; several processes stop together, in a step."""
-        if self.facts.get("processes", 1) == 1:
-            raise_if_stopping(self.watch)
 
     def validate(self, stage: str, progress: float) -> None:
         """Evaluate the model; save a checkpoint if it is among the best or nothing can validate it.
@@ -232,7 +230,7 @@ class Record:
         by = next((event for event in _SCALING if event in events), None)
         # The scaling changes the model, so it comes last, when nothing can stop any more.
         found = {
-            f.event: f.errors(self.model, scales=f.event == by, check=self._check)
+            f.event: f.errors(self.model, scales=f.event == by, check=self.check)
             for f in sorted(judged, key=lambda f: f.event == by)
         }
         results = {event: found[event] for event in events}
