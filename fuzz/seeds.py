@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -20,13 +19,14 @@ from PIL import Image
 from spn_cli.data import main as data_command
 from spn_cli.model import main as model_command
 
-from spn_data.simulate import preset, simulate
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export
 from spn_model.models import checkpoint
+from spn_model.training.recipe import SHIPPED
 from spn_model.training.training_state import Position, save_state
 from tests.worlds.box_world import write_box
 from tests.worlds.bundle_world import LENS, learnt
+from tests.worlds.short_flights import frames_of, write_flight1, write_video
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 _XMP = (
@@ -79,22 +79,15 @@ def _run(command: object, *arguments: object) -> None:
 
 def _flight_and_area(folder: Path) -> None:
     """Simulate 9 s of flight, make an area of it with an evaluation sequence, data set and network."""
-    options = replace(
-        preset("standard", seed=3),
-        **{"width": 320, "height": 180, "fps": 2.0, "length_factor": 0.12, "texels_per_m": 40.0},
-        only=("flight1",),
-    )
-    flight, area = folder / "flight", folder / "area"
-    simulate(flight, options, workers=1)
+    area = folder / "area"
+    flight = write_flight1(folder / "flight")
     _run(
-        *(data_command, "reconstruct", flight / "mapping", "--area", area),
+        *(data_command, "reconstruct", flight, "--area", area),
         *("--max-features", 800, "--threads", 1, "--fov", 72),
     )
     again = folder / "again"
     again.mkdir()
-    with av.open(str(flight / "mapping" / "flight1.mp4")) as container:
-        images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
-    _write_video(again / "again.mp4", images[3:11])
+    write_video(again / "again.mp4", frames_of(flight / "flight1.mp4")[3:11])
     _run(
         data_command,
         "register",
@@ -110,9 +103,7 @@ def _flight_and_area(folder: Path) -> None:
     _run(data_command, "split", "--area", area)
     recipe = folder / "recipe" / "short.toml"
     recipe.parent.mkdir()
-    recipe.write_text(
-        (Path(checkpoint.__file__).parents[1] / "training" / "recipes" / "default.toml").read_text()
-    )
+    shutil.copy(SHIPPED / "default.toml", recipe)
     _run(
         *(model_command, "train", "--area", area, "--images", 64, "--validations", 1),
         *("--threads", 1),
@@ -204,22 +195,12 @@ def _pictures(folder: Path) -> None:
     cv2.imwrite(str(masks / "m.png"), (deep > 30000).astype(np.uint8) * 255)
 
 
-def _write_video(path: Path, images: list[np.ndarray], codec: str = "libx264") -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=2)
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode())
-
-
 def _videos(folder: Path) -> None:
     """Write one short video in each container, and two with a stream of subtitles."""
     folder.mkdir()
     images = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(8)]
     for name in ("a.mp4", "a.mkv", "a.ts", "a.avi"):
-        _write_video(folder / name, images, "mpeg4" if name == "a.avi" else "libx264")
+        write_video(folder / name, images, "mpeg4" if name == "a.avi" else "libx264")
     subtitled = folder.parent / "subtitled"
     subtitled.mkdir()
     for name, codec in (("s.mp4", "mov_text"), ("s.mkv", "subrip")):
@@ -263,7 +244,7 @@ def _network(folder: Path) -> None:
 
 
 def _copy_shared(folder: Path) -> None:
-    """Add real files where the folder of real data lies beside the repository."""
+    """Add real files if the folder of real data is next to the repository."""
     for path in sorted((SHARED / "data" / "srt").glob("*.[sS][rR][tT]")):
         lines = path.read_bytes().split(b"\n")[:400]
         (folder / "telemetry" / f"real-{path.name}").write_bytes(b"\n".join(lines))
@@ -271,14 +252,11 @@ def _copy_shared(folder: Path) -> None:
     real.mkdir()
     for path in sorted((SHARED / "data" / "photos-dji-xmp").glob("*.JPG"))[:2]:
         shutil.copy(path, real)
-    lists = folder / "lists"
-    lists.mkdir()
-    for path in sorted((SHARED / "cases" / "labels" / "base").rglob("*")):
-        if path.is_file():
-            (lists / path.relative_to(SHARED / "cases" / "labels" / "base")).parent.mkdir(
-                parents=True, exist_ok=True
-            )
-            shutil.copy(path, lists / path.relative_to(SHARED / "cases" / "labels" / "base"))
+    base = SHARED / "cases" / "labels" / "base"
+    for path in sorted(p for p in base.rglob("*") if p.is_file()):
+        target = folder / "lists" / path.relative_to(base)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, target)
 
 
 if __name__ == "__main__":

@@ -141,8 +141,13 @@ def _import(path: Path) -> None:
     )
 
 
+def _root(path: Path) -> Path:
+    """Return the area that a file is in."""
+    return next(folder for folder in path.parents if (folder / "1-frames").is_dir())
+
+
 def _area(path: Path) -> None:
-    root = next(folder for folder in path.parents if (folder / "1-frames").is_dir())
+    root = _root(path)
     area, reader = Area(root), open_area(root)
     read_facts(root / "area.toml")
     for stage in area.stages():
@@ -158,14 +163,16 @@ def _area(path: Path) -> None:
 
 
 def _run(path: Path) -> None:
-    root = next(folder for folder in path.parents if (folder / "1-frames").is_dir())
-    read_runs(Area(root))
+    read_runs(Area(_root(path)))
     _ = read_run(path.parent).errors
 
 
 def _bundle(path: Path) -> None:
     read_bundle(path.parent)
-    localizer = Localizer(path.parent)
+    _localize(Localizer(path.parent))
+
+
+def _localize(localizer: Localizer) -> None:
     localizer.localize(np.random.default_rng(0).integers(0, 255, (360, 640, 3), np.uint8), _CAMERA)
 
 
@@ -176,8 +183,7 @@ def _graph(path: Path) -> None:
     precision = next(p for p, name in GRAPHS.items() if name == path.name)
     table["graphs"][precision].update(bytes=path.stat().st_size, sha256=sha256_of(path))
     document.write_text(json.dumps(table))
-    localizer = Localizer(path.parent, int8=precision == "int8")
-    localizer.localize(np.random.default_rng(0).integers(0, 255, (360, 640, 3), np.uint8), _CAMERA)
+    _localize(Localizer(path.parent, int8=precision == "int8"))
 
 
 def _log(path: Path) -> None:

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import av
 import click
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from spn_data.area.area import Area
 from spn_data.area.names import FRAMES, MODEL
 from spn_data.errors import StageError
 from spn_data.storage.json_files import VERSION
+from tests.worlds.short_flights import frames_of, write_video
 
 FAST = ("--max-features", "800", "--threads", "1", "--fov", "72")
 
@@ -49,23 +49,6 @@ def refused(*arguments: object) -> str:
 def contents(folder: Path) -> dict[str, bytes]:
     """Return the bytes of all files in a folder by relative path."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def frames_of(video: Path) -> list[np.ndarray]:
-    """Decode all frames of a video as BGR images."""
-    with av.open(str(video)) as container:
-        return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
-
-
-def write_video(path: Path, images: list[np.ndarray]) -> None:
-    """Encode BGR images as an H.264 video with 2 frames per second."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=2)
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode())
 
 
 @pytest.fixture

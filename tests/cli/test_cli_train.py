@@ -20,34 +20,16 @@ from spn_cli.train import train
 from spn_data.dataset.hdf5_reader import DatasetGroup
 from spn_model.models.checkpoint import load
 from spn_model.training.training_state import COLUMNS
-from tests.worlds.training_world import TinyModel, register_tiny, write_field
+from tests.worlds.training_world import TINY_RECIPE, TinyModel, register_tiny, write_field
 
 pytestmark = pytest.mark.usefixtures("tiny_kind")
-
-TOML = """\
-kind = "tiny"
-weights = "none"
-
-[[stages]]
-name = "head"
-images = 40
-batch = 5
-rate = 0.02
-options = { frozen = true }
-
-[[stages]]
-name = "all"
-images = 120
-batch = 6
-rate = 0.02
-"""
 
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
     """A folder with dataset.h5 and tiny.toml."""
     write_field(tmp_path / "dataset.h5", 12, 3)
-    (tmp_path / "tiny.toml").write_text(TOML)
+    (tmp_path / "tiny.toml").write_text(TINY_RECIPE)
     return tmp_path
 
 
@@ -238,7 +220,7 @@ def test_a_full_disk_is_one_line(place, monkeypatch):
 
 def test_what_nothing_can_be_trained_with_leaves_no_run(place):
     """An unknown recipe, device or stage option and a bad run name are rejected and leave no run."""
-    (place / "bad.toml").write_text(TOML.replace("frozen = true", "frosen = true"))
+    (place / "bad.toml").write_text(TINY_RECIPE.replace("frozen = true", "frosen = true"))
     for words, told in (
         (("--recipe", "nothing"), "unknown recipe 'nothing'"),
         (("--device", "tpu"), "unknown device 'tpu'"),

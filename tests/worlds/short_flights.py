@@ -6,8 +6,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import av
+import numpy as np
 
 from spn_data.simulate import preset, simulate
+
+
+def frames_of(video: Path) -> list[np.ndarray]:
+    """Decode all frames of a video as BGR images."""
+    with av.open(str(video)) as container:
+        return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+
+
+def write_video(path: Path, images: list[np.ndarray], codec: str = "libx264") -> None:
+    """Encode BGR images as a video with 2 frames per second."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=2)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode())
 
 
 def write_flight1(out: Path) -> Path:
@@ -27,15 +45,8 @@ def write_flight1(out: Path) -> Path:
 
 def write_flight2(folder: Path, flight1: Path) -> Path:
     """Write most of the first flight, flown backwards, as flight2.mp4 and flight2.SRT; return the folder."""
-    with av.open(str(flight1 / "flight1.mp4")) as container:
-        images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
-    with av.open(str(folder / "flight2.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=2)
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for image in images[:3:-1]:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode())
+    images = frames_of(flight1 / "flight1.mp4")
+    write_video(folder / "flight2.mp4", images[:3:-1])
     records = [text.splitlines() for text in (flight1 / "flight1.SRT").read_text().split("\n\n")]
     records = [lines for lines in records if len(lines) > 2]
     turned = [[*a[:-1], b[-1]] for a, b in zip(records, records[:3:-1], strict=False)]

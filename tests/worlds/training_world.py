@@ -38,6 +38,26 @@ HEIGHT_M, PX_PER_M = 10.0, 4.0
 ONE_THREAD = TrainOptions(seed=5, threads=1, device="cpu", precision="float32", validations=4)
 
 
+# In two stages, within seconds.
+TINY_RECIPE = """\
+kind = "tiny"
+weights = "none"
+
+[[stages]]
+name = "head"
+images = 40
+batch = 5
+rate = 0.02
+options = { frozen = true }
+
+[[stages]]
+name = "all"
+images = 120
+batch = 6
+rate = 0.02
+"""
+
+
 def field_image() -> np.ndarray:
     """Paint the field (400, 400, 3) uint8: red grows eastwards, green northwards; blue blobs never repeat."""
     y, x = np.mgrid[0:400, 0:400] / 400.0
