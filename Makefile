@@ -47,7 +47,7 @@ test-slow: $(VENV)/installed
 fuzz: $(VENV)/installed
 	PYTHONPATH=. $(BIN)/python -m fuzz --inputs 12000 --seconds 900
 
-# Kills every command at each change of a file on a small area, runs it again and compares; needs Linux and cc.
+# Kills every command at up to 30 of its changes of files on a small area, reruns and compares; Linux and cc only.
 kill: $(VENV)/installed
 	PYTHONPATH=.:cli $(BIN)/python -m faults.kill
 

@@ -8,21 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-RECIPE = """\
-kind = "tiny"
-weights = "none"
-[[stages]]
-name = "head"
-images = 30
-batch = 5
-rate = 0.02
-options = { frozen = true }
-[[stages]]
-name = "all"
-images = 60
-batch = 6
-rate = 0.02
-"""
 # A small network that can be exported, with a few steps of training.
 REAL = """\
 kind = "scene-coordinates"
@@ -40,7 +25,7 @@ SMALL = (*AREA, *ONE, "--max-features", "800")
 TRAIN = (*AREA, *ONE, "--device", "cpu", "--precision", "float32", "--validations", "2")
 SECOND = "second/flight2.mp4"
 NAMED = ("--name", "medium", "--rate", "1", "--any-telemetry")
-ANEW = ("--seed", "3", "--gap", "0.5", "--overwrite")
+REDONE = ("--seed", "3", "--gap", "0.5", "--overwrite")
 RUN = (*AREA, *ONE, "--device", "cpu", "--run", "real")
 
 
@@ -115,7 +100,7 @@ _DATA: tuple[Command, ...] = (
     ),
     Command(
         "split --overwrite",
-        ("spn-data", "split", *AREA, "--size", "160", *ANEW),
+        ("spn-data", "split", *AREA, "--size", "160", *REDONE),
         "split",
         ("area/5-split", "area/report.html"),
     ),
@@ -207,11 +192,12 @@ ALL = {**COMMANDS, **{command.name: command for command in _HELPERS}}
 def write_flights(work: Path) -> None:
     """Write the two short flights and the recipes into a folder."""
     from tests.worlds.short_flights import write_flight1, write_flight2
+    from tests.worlds.training_world import TINY_RECIPE
 
     flight1 = write_flight1(work / "flights")
     (work / "second").mkdir()
     write_flight2(work / "second", flight1)
-    (work / "tiny.toml").write_text(RECIPE)
+    (work / "tiny.toml").write_text(TINY_RECIPE)
     (work / "real.toml").write_text(REAL)
 
 

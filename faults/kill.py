@@ -79,13 +79,13 @@ def prepare() -> None:
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     register_tiny()
-    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    _adopt()
 
 
 def run(command: Command, work: Path, at: int = -1, output: Path | None = None) -> int:
     """Run a command in a folder in a forked process; return its exit code, or -signal.
 
-    `at`: the change at which it is killed; 0: only count them, into the file `count` beside the folder.
+    `at`: the change at which it is killed; 0: only count them, into the file `count` next to the folder.
     """
     pid = os.fork()
     if pid == 0:
@@ -149,8 +149,19 @@ def _inside(command: Command, work: Path, at: int, output: Path) -> int:
     return code
 
 
-def undisturbed(command: Command, folder: Path) -> tuple[int, dict[str, str]]:
-    """Return the number of changes of an undisturbed run, and the contents it leaves in folder/whole."""
+@dataclass(frozen=True)
+class Undisturbed:
+    """An undisturbed run: folders and contents before and after it, and its number of changes."""
+
+    start: Path
+    before: dict[str, str]
+    whole: Path
+    after: dict[str, str]
+    changes: int
+
+
+def undisturbed(command: Command, folder: Path) -> Undisturbed:
+    """Run a command as a whole, in folder/whole."""
     states = folder / "states"
     start = state(command.start, states, run)
     own = folder / "whole" / command.name.replace(" ", "_")
@@ -159,26 +170,25 @@ def undisturbed(command: Command, folder: Path) -> tuple[int, dict[str, str]]:
     code = run(command, own / "work", 0)
     if code:
         raise SystemExit(f"{command.name}: ended with {code}: {(own / 'output').read_text()}")
-    return int((own / "count").read_text()), contents(own / "work")
+    changes = int((own / "count").read_text())
+    work = own / "work"
+    return Undisturbed(start, contents(start), work, contents(work), changes)
 
 
-def kill_once(command: Command, folder: Path, at: int) -> Kill:
-    """Kill a command at one change and run it again."""
-    start = folder / "states" / command.start.replace(" ", "_")
-    whole = folder / "whole" / command.name.replace(" ", "_") / "work"
+def kill_once(command: Command, whole: Undisturbed, folder: Path, at: int) -> Kill | None:
+    """Kill a command at one change and run it again; None if it ended before the kill."""
     own = folder / f"worker-{os.getpid()}"
     work = own / "work"
     shutil.rmtree(own, ignore_errors=True)
-    shutil.copytree(start, work)
-    before = contents(start)
+    shutil.copytree(whole.start, work)
     code = run(command, work, at)
     if code == 0:
-        return Kill(command.name, at, (), (), "ended before the kill")
+        return None
     if code != -signal.SIGKILL:
         return Kill(command.name, at, (), (f"exit code {code} instead of a kill",))
-    lost = _lost(command, before, work)
+    lost = _lost(command, whole.before, work)
     code = run(command, work, output=own / "again")
-    lost += _lost(command, before, work)
+    lost += _lost(command, whole.before, work)
     different = [f"exit code {code}"] if code else []
     if not code:
         different = _different(command, whole, work)
@@ -187,7 +197,7 @@ def kill_once(command: Command, folder: Path, at: int) -> Kill:
 
 
 def _lost(command: Command, before: dict[str, str], work: Path) -> list[str]:
-    """Return what was changed or removed beside what the command may write."""
+    """Return what was changed or removed outside what the command may write."""
     from spn_data.area.area import Area
 
     if (work / "area").is_dir():  # every command begins so; it completes renames
@@ -214,15 +224,14 @@ def _is_stage(name: str) -> bool:
     )
 
 
-def _different(command: Command, whole: Path, work: Path) -> list[str]:
+def _different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
     """Return in what the result differs from that of an undisturbed run."""
-    one, other = contents(whole), contents(work)
-    found = differences(one, other)
+    found = differences(whole.after, contents(work))
     if not command.is_mapped or not found:
         return found
     from benchmarks.interruption import difference
 
-    near = difference(whole / "area", work / "area")
+    near = difference(whole.whole / "area", work / "area")
     if not near.same_frames or near.position_m > 0.01 or near.rotation_deg > 0.05:
         return [*found, f"poses differ by {near.position_m:.3g} m, {near.rotation_deg:.2g} deg"]
     return [name for name in found if name[0] != "~" or name.startswith("~area/1-frames/")]
@@ -243,16 +252,17 @@ def campaign(names: list[str], folder: Path, kills: int, jobs: int) -> list[Kill
     for name in names:
         began = time.monotonic()
         command = COMMANDS[name]
-        changes, _ = undisturbed(command, folder)
-        ks = evenly(changes, kills)
+        whole = undisturbed(command, folder)
+        ks = evenly(whole.changes, kills)
         context = multiprocessing.get_context("fork")
         with ProcessPoolExecutor(jobs, mp_context=context, initializer=_adopt) as pool:
-            tried = list(pool.map(partial(kill_once, command, folder), ks))
-        done = [kill for kill in tried if kill.output != "ended before the kill"]
-        lost, different = (sum(bool(getattr(k, a)) for k in done) for a in ("lost", "different"))
+            tried = list(pool.map(partial(kill_once, command, whole, folder), ks))
+        done = [kill for kill in tried if kill is not None]
+        lost, different = totals(done)
         took = time.monotonic() - began
         print(
-            f"{name:<28}{changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}", flush=True
+            f"{name:<28}{whole.changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}",
+            flush=True,
         )
         found += done
         for kill in done:
@@ -260,6 +270,11 @@ def campaign(names: list[str], folder: Path, kills: int, jobs: int) -> list[Kill
                 print(f"  at {kill.at}: lost {kill.lost[:6]} different {kill.different[:6]}")
                 print(f"    {kill.output.strip().splitlines()[-1:]}", flush=True)
     return found
+
+
+def totals(kills: list[Kill]) -> tuple[int, int]:
+    """Return the number of kills after which something was lost, and of those with a different result."""
+    return sum(bool(kill.lost) for kill in kills), sum(bool(kill.different) for kill in kills)
 
 
 def _adopt() -> None:
@@ -283,7 +298,7 @@ def main() -> None:
         environment = {**os.environ, "LD_PRELOAD": library, "OMP_NUM_THREADS": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "faults.kill", *sys.argv[1:]], environment)
     kills = campaign(given.only, folder, given.kills, given.jobs)
-    lost, different = (sum(bool(getattr(k, a)) for k in kills) for a in ("lost", "different"))
+    lost, different = totals(kills)
     print(f"{len(kills)} kills: {lost} lost, {different} different")
     if given.json is not None:
         given.json.write_text(json.dumps([asdict(kill) for kill in kills], indent=1) + "\n")
