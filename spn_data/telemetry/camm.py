@@ -1,4 +1,4 @@
-"""Positions of a CAMM track (Camera Motion Metadata of Street View cameras): packets of type 5 and 6."""
+"""Positions of a CAMM track (Street View cameras): packets of type 5 and 6."""
 
 from __future__ import annotations
 
@@ -48,10 +48,14 @@ def read_camm(packets: Sequence[DataPacket], source: str) -> Telemetry:
         ) from error
     by_type: dict[int, list[tuple[float, Any]]] = {_MIN_GPS: [], _GPS: []}
     for packet in packets:
-        kind = packet.payload[2]  # little-endian, below 8; sizes were checked when the track was recognized
+        kind = packet.payload[
+            2
+        ]  # little-endian, below 8; sizes were checked when the track was recognized
         if kind in by_type and math.isfinite(packet.time_s) and len(packet.payload) in (28, 60):
             try:
-                by_type[kind].append((packet.time_s, module.CAMMSampleData.parse(packet.payload).data))
+                by_type[kind].append(
+                    (packet.time_s, module.CAMMSampleData.parse(packet.payload).data)
+                )
             except module.C.ConstructError:
                 continue
     full = bool(by_type[_GPS])
@@ -87,7 +91,9 @@ def _row(lat: float, lon: float, alt: float, sigma: Sigma, fix: int) -> tuple[fl
 
 def _full_row(data: Any) -> tuple[float, ...]:
     horizontal_m, vertical_m = data.horizontal_accuracy, data.vertical_accuracy
-    stated = all(math.isfinite(accuracy_m) and accuracy_m > 0 for accuracy_m in (horizontal_m, vertical_m))
+    stated = all(
+        math.isfinite(accuracy_m) and accuracy_m > 0 for accuracy_m in (horizontal_m, vertical_m)
+    )
     sigma = (horizontal_m, horizontal_m, vertical_m) if stated else NAN_SIGMA
     return _row(data.latitude, data.longitude, data.altitude, sigma, data.gps_fix_type)
 

@@ -104,7 +104,8 @@ def _tracks(container: Any, streams: list[Any], start_s: float, path: Path) -> l
             continue
         if total_bytes + packet.size > _MAX_BYTES or count >= _MAX_PACKETS:
             raise InputError(
-                f"its data tracks exceed {_MAX_BYTES / 1e6:.0f} MB or {_MAX_PACKETS:,} packets", path=path
+                f"its data tracks exceed {_MAX_BYTES / 1e6:.0f} MB or {_MAX_PACKETS:,} packets",
+                path=path,
             )
         payload = bytes(packet)
         if index not in tracks:

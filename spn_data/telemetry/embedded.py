@@ -18,8 +18,8 @@ _logger = logging.getLogger(__name__)
 _ORDER = (TrackFormat.GPMF, TrackFormat.CAMM, TrackFormat.KLV, TrackFormat.DJI)
 _READERS = {TrackFormat.GPMF: read_gpmf, TrackFormat.CAMM: read_camm, TrackFormat.KLV: read_misb}
 _DJI_REMEDY = (
-    "its telemetry is DJI's own track (djmd), which is not read: record with subtitles switched on, or export "
-    "the flight log as CSV or the track as GPX (exiftool -ee -p gpx.fmt)"
+    "its telemetry is DJI's own track (djmd), which is not read: record with subtitles switched on, or "
+    "export the flight log as CSV or GPX"
 )
 
 
@@ -67,8 +67,8 @@ def _read(track: DataTrack, path: Path) -> Telemetry:
     telemetry = _READERS[track.format](track.packets, str(path))
     if not telemetry.has_fix.any():
         raise InputError(
-            f"its {track.format.value} track has {len(telemetry)} records, none with a fix: the receiver had no "
-            "satellites",
+            f"its {track.format.value} track has {len(telemetry)} records, none with a fix: the receiver "
+            "had no satellites",
             path=path,
         )
     return telemetry

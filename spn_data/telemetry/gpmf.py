@@ -1,7 +1,7 @@
 """GoPro's GPMF: positions of the camera (GPS5, GPS9) or of the drone that carries it (Karma: GPRI, GLPI).
 
-The packages' own reader (`extract_gopro_info` of mapillary-tools) drops the height reference GPSA and does not
-know the Karma. Its parser of values is used here, on pieces whose counts are checked before.
+The package's own reader (`extract_gopro_info` of mapillary-tools) drops the height reference GPSA and does
+not know the Karma. Its parser of values is used here, on pieces whose counts are checked before.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ class _Found:
 
     fixes: dict[bytes, list[_Fix]] = field(default_factory=dict)
     references: dict[bytes, set[bytes]] = field(default_factory=dict)
-    heights: list[tuple[float, float, float]] = field(default_factory=list)  # stamp, absolute, relative
+    heights: list[tuple[float, float, float]] = field(
+        default_factory=list
+    )  # stamp, absolute, relative
     clock: list[tuple[float, float]] = field(default_factory=list)  # stamp since power-on, UTC
     stamp_zero_s: list[float] = field(default_factory=list)  # video time at stamp 0, by record
     no_fix: int = 0
@@ -89,7 +91,9 @@ def read_gpmf(packets: Sequence[DataPacket], source: str) -> Telemetry:
             found.damaged += 1
     kinds = [kind for kind in (b"GPS9", b"GPS5", b"GPRI") if found.fixes.get(kind)]
     if not kinds:
-        damaged = f"; {found.damaged} of its {len(packets)} payloads are damaged" if found.damaged else ""
+        damaged = (
+            f"; {found.damaged} of its {len(packets)} payloads are damaged" if found.damaged else ""
+        )
         raise InputError(
             f"its GoPro track holds no positions (was the camera's GPS off?){damaged}", path=source
         )
@@ -110,7 +114,9 @@ def _parser(source: str) -> Any:
 
     def parse(body: bytes) -> _Values:
         try:
-            return {bytes(item["key"]): list(item["data"]) for item in module.GPMFSampleData.parse(body)}
+            return {
+                bytes(item["key"]): list(item["data"]) for item in module.GPMFSampleData.parse(body)
+            }
         except construct.ConstructError as error:
             raise ValueError("a damaged GPMF stream") from error
 
@@ -244,7 +250,9 @@ def _utc_s(value: Any) -> float:
     """Parse GPSU, such as 240501120000.123; NaN if it is no time."""
     text = bytes(value[0] if isinstance(value, list) else value).decode("ascii", errors="replace")
     try:
-        return datetime.strptime(text.strip("\0 "), "%y%m%d%H%M%S.%f").replace(tzinfo=UTC).timestamp()
+        return (
+            datetime.strptime(text.strip("\0 "), "%y%m%d%H%M%S.%f").replace(tzinfo=UTC).timestamp()
+        )
     except ValueError:
         return math.nan
 
@@ -298,15 +306,19 @@ def _height_reference(kind: bytes, stated: set[bytes]) -> tuple[HeightReference,
         return HeightReference.AMSL, []
     if stated == {b""} and kind == b"GPS5":
         return HeightReference.ELLIPSOID, []
-    names = ", ".join(sorted(value.decode("ascii", errors="replace") or "none" for value in stated)[:4])
-    return HeightReference.UNKNOWN, [f"the height reference of its GoPro track is unknown (GPSA: {names})"]
+    names = ", ".join(
+        sorted(value.decode("ascii", errors="replace") or "none" for value in stated)[:4]
+    )
+    return HeightReference.UNKNOWN, [
+        f"the height reference of its GoPro track is unknown (GPSA: {names})"
+    ]
 
 
 def _karma_columns(found: _Found, stamps_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return heights above take-off, UTC, and notes, at the stamps of the raw fixes of a Karma."""
     notes = [
-        "positions, accuracy and heights above sea level are those of the Karma drone, whose streams have the "
-        "layout of MAVLink's GPS_RAW_INT"
+        "positions, accuracy and heights above sea level are those of the Karma drone, whose streams have "
+        "the layout of MAVLink's GPS_RAW_INT"
     ]
     rel_alt_m = np.full(len(stamps_s), np.nan)
     if len(found.heights) > 1:

@@ -1,4 +1,4 @@
-"""MISB ST 0601 metadata (KLV) in videos of larger drones: position, attitude and field of view of the sensor."""
+"""MISB ST 0601 metadata (KLV) in videos of larger drones: position, attitude and field of view."""
 
 from __future__ import annotations
 
@@ -78,15 +78,23 @@ def read_misb(packets: Sequence[DataPacket], source: str) -> Telemetry:
                 near_s.append(packet.near_s)
         except _DamagedSetError:
             damaged += 1
-    values = dict(zip(_COLUMNS, np.array(rows, dtype=np.float64).reshape(-1, len(_COLUMNS)).T, strict=True))
+    values = dict(
+        zip(_COLUMNS, np.array(rows, dtype=np.float64).reshape(-1, len(_COLUMNS)).T, strict=True)
+    )
     lat_lon_deg = np.column_stack([values[13], values[14]])
     lat_lon_deg[(lat_lon_deg == 0).all(axis=1) | np.isnan(lat_lon_deg).any(axis=1)] = np.nan
     if not np.isfinite(lat_lon_deg).any():
-        wrong = f"; {damaged} of its {len(packets)} packets have a wrong checksum or length" if damaged else ""
-        raise InputError(f"its KLV track holds no sensor position (MISB ST 0601){wrong}", path=source)
+        wrong = (
+            f"; {damaged} of its {len(packets)} packets have a wrong checksum or length"
+            if damaged
+            else ""
+        )
+        raise InputError(
+            f"its KLV track holds no sensor position (MISB ST 0601){wrong}", path=source
+        )
     utc_s = np.array(stamps_s)
     time_s, notes = _times(np.array(times_s), utc_s, np.array(near_s), source)
-    alt_m, reference = _heights(values, np.isfinite(lat_lon_deg).all(axis=1))
+    alt_m, reference = _heights(values, np.isfinite(lat_lon_deg.sum(axis=1)))
     if damaged:
         notes.append(f"KLV packets with a wrong checksum or length left out: {damaged}")
     index, more = time_order(time_s)
@@ -189,7 +197,7 @@ def _imapb(raw: bytes, low: float, high: float) -> float:
     step = 2.0 ** (math.ceil(math.log2(high - low)) - (8 * len(raw) - 1))
     zero = 0.0
     if low < 0 < high:
-        zero = -low / step - math.floor(-low / step)
+        zero = low / step - math.floor(low / step)
     value = step * (int.from_bytes(raw, "big") - zero) + low
     return value if low - step <= value <= high + step else math.nan
 
@@ -219,9 +227,13 @@ def _times(
     return utc_s + float(np.nanmedian(zero_s)), [note]
 
 
-def _heights(values: dict[int, np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, HeightReference]:
+def _heights(
+    values: dict[int, np.ndarray], fixed: np.ndarray
+) -> tuple[np.ndarray, HeightReference]:
     """Return heights above the ellipsoid if all fixes state them, otherwise above sea level."""
-    ellipsoid_m = np.where(np.isfinite(values[_HEIGHT_EXTENDED]), values[_HEIGHT_EXTENDED], values[75])
+    ellipsoid_m = np.where(
+        np.isfinite(values[_HEIGHT_EXTENDED]), values[_HEIGHT_EXTENDED], values[75]
+    )
     if np.isfinite(ellipsoid_m[fixed]).all() or not np.isfinite(values[15]).any():
         return ellipsoid_m, HeightReference.ELLIPSOID
     return values[15], HeightReference.AMSL
@@ -230,8 +242,8 @@ def _heights(values: dict[int, np.ndarray], fixed: np.ndarray) -> tuple[np.ndarr
 def _camera_angles(values: dict[int, np.ndarray]) -> np.ndarray:
     """Return heading, pitch, roll of the camera: the sensor's angles on those of the platform.
 
-    Both turn about the axes forward, right, down in the order heading, pitch, roll. Without the sensor's roll,
-    which does not move the optical axis, only roll is unknown.
+    Both turn about the axes forward, right, down in the order heading, pitch, roll. Without the sensor's
+    roll, which does not move the optical axis, only roll is unknown.
     """
     pitch = np.where(np.isfinite(values[90]), values[90], values[6])
     roll = np.where(np.isfinite(values[91]), values[91], values[7])
