@@ -81,6 +81,10 @@ def read_data_tracks(path: Path) -> list[DataTrack]:
             return _tracks(container, streams, _start_s(video), path)
     except (av.FFmpegError, OSError) as error:
         raise InputError(f"its data tracks cannot be read: {error.strerror}", path=path) from error
+    except IndexError as error:  # PyAV does not know streams that appear while a file is read
+        raise InputError(
+            "its data tracks cannot be read: a track appears in the middle of the file", path=path
+        ) from error
 
 
 def _start_s(video: Any) -> float:

@@ -353,6 +353,26 @@ def test_a_dji_track_and_all_round_videos_are_named_with_the_remedy(
             discover(tmp_path / name)
 
 
+def test_a_damaged_transport_stream_gives_fixes_or_one_line(tmp_path: Path) -> None:
+    """An MPEG-TS with changed bytes, even with late tracks, gives fixes, nothing or an InputError."""
+    whole = tmp_path / "whole.ts"
+    write_klv_video(whole, [(i / 2, _klv(_flight_items(), i / 2)) for i in range(8)])
+    data = whole.read_bytes()
+    random.seed(3)
+    late = 0
+    for _ in range(250):
+        changed = bytearray(data)
+        for _ in range(60):
+            changed[random.randrange(len(changed))] = random.randrange(256)
+        path = tmp_path / "changed.ts"
+        path.write_bytes(changed)
+        try:
+            read_embedded(path)
+        except InputError as error:
+            late += "appears in the middle" in str(error)
+    assert late > 0
+
+
 def test_damaged_payloads_give_fixes_or_one_line() -> None:
     """Bytes changed at random give fixes or an InputError, in bounded time."""
     random.seed(1)
