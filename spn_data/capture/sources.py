@@ -28,6 +28,11 @@ PHOTO_SUFFIXES = frozenset(photo_file.PHOTO_SUFFIXES)
 EVENTS_SUFFIX = ".mrk"  # DJI: exposures of the photos in the same folder
 SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
 TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX}
+# Videos of cameras that see all around, whose images are no pinhole images.
+ALL_ROUND_SUFFIXES = {
+    ".insv": "Insta360 recording of two fisheye images: export a flat view as MP4, and its track as GPX",
+    ".360": "GoPro MAX recording of cube faces: export a flat view as MP4, and its track as GPX",
+}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
 # Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
@@ -239,6 +244,8 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
             ignored.append((path, "hidden"))
         elif suffix in PROXY_SUFFIXES:
             ignored.append((path, "preview or thumbnail made by the camera"))
+        elif suffix in ALL_ROUND_SUFFIXES:
+            ignored.append((path, ALL_ROUND_SUFFIXES[suffix]))
         elif suffix in VIDEO_SUFFIXES:
             kinds["video"].append(path)
         elif suffix in PHOTO_SUFFIXES:
@@ -256,6 +263,8 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
 
 def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
     if not folder.is_dir():
+        if folder.suffix.lower() in ALL_ROUND_SUFFIXES:
+            return f"cannot be read: {ALL_ROUND_SUFFIXES[folder.suffix.lower()]}"
         if folder.suffix.lower() in photo_file.RAW_SUFFIXES:
             return f"is a {photo_file.RAW_REMEDY}"
         return f"is not a video or photo: unsupported suffix {folder.suffix or '(none)'}"

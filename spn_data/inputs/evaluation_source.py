@@ -176,7 +176,8 @@ def sample_frames(
             path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
-    starts = start_cameras(frames, candidates.photos, fov, {} if given is None else {"*": given})
+    cameras = {} if given is None else {"*": given}
+    starts = start_cameras(frames, candidates.photos, fov, cameras, track)
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from spn_data.capture.sources import EVENTS_SUFFIX, SUBTITLE_SUFFIXES, Source, S
 from spn_data.capture.video import VideoInfo, probe
 from spn_data.errors import InputError
 from spn_data.inputs.telemetry_clocks import ImageClock, check_overlap, on_image_clock
+from spn_data.telemetry.embedded import read_embedded
 from spn_data.telemetry.mrk import read_mrk, with_exposures
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
@@ -65,8 +67,8 @@ def source_telemetry(
     Returns
     -------
     Telemetry or None
-        From the file next to each video part, else from its subtitle track; for photos from their metadata
-        or a log. None if there is none.
+        From the file next to each video part, else from its subtitle track, else from a data track in it; for
+        photos from their metadata or a log. None if there is none.
 
     Raises
     ------
@@ -110,6 +112,7 @@ def _video_telemetry(
 ) -> Telemetry | None:
     """Return the telemetry of all parts of a video on its clock, from files and, if asked, its own tracks."""
     parts = []
+    failures: list[str] = []
     for part, start_s, duration_s in zip(source.parts, starts_s, durations_s, strict=True):
         files = [t for t in source.telemetry if t.stem.lower() == part.stem.lower()]
         # Prefer the subtitle file: it is on the clock of the video, a log is not.
@@ -126,11 +129,40 @@ def _video_telemetry(
                 track = _on_video_clock(track, clock, files[0].name)
             elif not accept:
                 _check_length(track, duration_s, files[0].name)
-        elif info.has_subtitles and embedded:
-            track = read_subtitles(part)
+            if _telemetry_names(info):
+                note = f"read from {files[0].name}; data tracks of the video are not used"
+                track = replace(track, notes=(*track.notes, note))
+        elif embedded:
+            track = _own_telemetry(part, info, failures)
         if track is not None:
             parts.append(track.shifted(start_s))
-    return Telemetry.concatenate(parts) if parts else None
+    if not parts:
+        return None
+    joined = Telemetry.concatenate(parts)
+    return replace(joined, notes=(*joined.notes, *failures))
+
+
+def _own_telemetry(part: Path, info: VideoInfo, failures: list[str]) -> Telemetry | None:
+    """Return the telemetry of a video's subtitle track, else of its data tracks; note why one has none."""
+    unusable: InputError | None = None
+    if info.has_subtitles:
+        try:
+            track = read_subtitles(part)
+        except InputError as error:
+            unusable = error
+        else:
+            if track is not None:
+                note = "read from its subtitle track"
+                note += "; its data tracks are not used" if _telemetry_names(info) else ""
+                return replace(track, notes=(*track.notes, note))
+    try:
+        track = read_embedded(part) if info.data_streams else None
+    except InputError as error:
+        failures.append(str(error))
+        track = None
+    if track is None and unusable is not None:
+        raise unusable
+    return track
 
 
 def _video_clock(
@@ -218,13 +250,27 @@ def _are_dated(photos: Telemetry) -> bool:
     return bool(known.any() and np.allclose(zero_s, zero_s[0], rtol=0, atol=1e-3))
 
 
+def _telemetry_names(info: VideoInfo) -> list[str]:
+    """Return the names of a video's data tracks but time codes, of which cameras write one."""
+    codes = ("timecode", "tcd", "tmcd")
+    return [name for name in info.data_streams if not any(code in name.lower() for code in codes)]
+
+
 def unread_tracks(source: Source) -> list[str]:
-    """Return a note if a video without readable telemetry has data tracks that are not supported."""
+    """Return notes why the data tracks of a video without telemetry give none, and what to do."""
     if source.kind is SourceKind.PHOTOS:
         return []
-    names = sorted({name for part in source.parts for name in probe(part).data_streams})
-    return [
-        f"{source.sequence}: its data tracks ({', '.join(names)}) are not supported; "
-        "convert GoPro GPMF or DJI metadata to GPX or CSV"
-        for _ in names[:1]
-    ]
+    notes = []
+    for part in source.parts:
+        names = _telemetry_names(probe(part))
+        try:
+            if not names or read_embedded(part) is not None:
+                continue
+        except InputError as error:
+            notes.append(f"{source.sequence}: {error}")
+            continue
+        notes.append(
+            f"{source.sequence}: its data tracks ({', '.join(names)}) hold no telemetry in a known format "
+            "(GPMF, CAMM, KLV); if they do, convert it to GPX or CSV"
+        )
+    return list(dict.fromkeys(notes))

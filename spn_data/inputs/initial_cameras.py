@@ -11,6 +11,8 @@ from spn_data.capture.frames import Frames
 from spn_data.capture.photos import PhotoHeaders
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length, camera_to_json
+from spn_data.telemetry import misb_klv
+from spn_data.telemetry.track import Telemetry
 
 # Focal length over the longer image side: 71 degrees, as most drones have. It is estimated in any case.
 _GUESSED_FOCAL_SHARE = 0.7
@@ -21,8 +23,11 @@ def start_cameras(
     photos: PhotoHeaders | None,
     fov_deg: Mapping[str, float],
     given: Mapping[str, Camera],
+    track: Telemetry | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Return the initial intrinsics of each camera of one source: given, from photo metadata, or a guess.
+    """Return the initial intrinsics of each camera of one source: given, stated, or a guess.
+
+    Stated is the focal length in photo metadata, or the median field of view in MISB metadata of a video.
 
     What the user gives applies only to the first camera of the source, because another zoom is another lens.
 
@@ -36,6 +41,8 @@ def start_cameras(
         Horizontal field of view by sequence; "*" for all.
     given : mapping of str to Camera
         Calibrated cameras by sequence; "*" for all.
+    track : Telemetry or None
+        Telemetry of the source.
 
     Returns
     -------
@@ -64,6 +71,9 @@ def start_cameras(
             source = f"horizontal field of view of {fov:g} deg, as given"
         elif focal_px is not None:
             camera, source = camera_from_focal_length(focal_px, width, height), "photo metadata"
+        elif (share := _stated_share(track, frames.time_s[frames.cameras == key])) is not None:
+            camera = camera_from_focal_length(share * width, width, height)
+            source = "field of view in the video's metadata"
         else:
             guess = _GUESSED_FOCAL_SHARE * max(width, height)
             camera, source = camera_from_focal_length(guess, width, height), "guess"
@@ -73,3 +83,12 @@ def start_cameras(
             "source": source,
         }
     return cameras
+
+
+def _stated_share(track: Telemetry | None, time_s: np.ndarray) -> float | None:
+    """Return the median focal length over the image width that telemetry states at times (N,), if any."""
+    if track is None or track.kind != misb_klv.KIND or len(track) == 0:
+        return None
+    shares = track.at(time_s).zoom
+    shares = shares[np.isfinite(shares)]
+    return float(np.median(shares)) if len(shares) else None

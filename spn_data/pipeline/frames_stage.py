@@ -242,7 +242,7 @@ def choose_frames(
         frames = _frames_with_telemetry(one, track, choice)
         if stored is not None:
             write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", stored)
-        cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
+        cameras.update(start_cameras(frames, one.photos, options.fov_deg, given, track))
         if one.source.sequence in masks:
             write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:

@@ -8,6 +8,7 @@ from spn_data.errors import InputError
 from spn_data.telemetry.ass_file import read_ass
 from spn_data.telemetry.csv_log import read_csv_log
 from spn_data.telemetry.dji_srt import read_dji_srt
+from spn_data.telemetry.embedded import read_embedded
 from spn_data.telemetry.gpx import read_gpx
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
@@ -17,7 +18,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".m4v", ".ts", ".avi")
 
 
 def read_telemetry(path: Path | str) -> Telemetry:
-    """Read telemetry from an .srt, .ass, .gpx, .csv (.tsv, .txt) or the subtitle track of a video.
+    """Read telemetry from an .srt, .ass, .gpx, .csv (.tsv, .txt) or a track of a video.
 
     Parameters
     ----------
@@ -39,13 +40,17 @@ def read_telemetry(path: Path | str) -> Telemetry:
     if suffix in VIDEO_SUFFIXES:
         telemetry = read_subtitles(path)
         if telemetry is None:
-            raise InputError("the video has no subtitle track to read telemetry from", path=path)
+            telemetry = read_embedded(path)
+        if telemetry is None:
+            raise InputError(
+                "the video has no subtitle or data track to read telemetry from", path=path
+            )
         return telemetry
     if suffix not in TELEMETRY_SUFFIXES:
         raise InputError(
             f"{suffix or 'a file without a suffix'} is not a telemetry format; supported are "
             "subtitles of drones (.srt, .ass), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
-            f"videos with a subtitle track ({', '.join(VIDEO_SUFFIXES)})",
+            f"videos with a subtitle or data track ({', '.join(VIDEO_SUFFIXES)})",
             path=path,
         )
     if suffix == ".gpx":
