@@ -412,7 +412,7 @@ def test_unsupported_files_are_refused(tmp_path, name, message):
 
 def test_a_video_without_track_is_refused(tmp_path):
     """A video given as telemetry without a subtitle track is refused."""
-    with pytest.raises(InputError, match="has no subtitle track"):
+    with pytest.raises(InputError, match="has no subtitle or data track"):
         read_telemetry(video(tmp_path / "a.mp4", [], None))
 
 
