@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from spn_data.errors import InputError
+from spn_data.media.extras import import_extra
 
 # In order of preference among several files of one image.
 PHOTO_SUFFIXES = (
@@ -165,14 +166,7 @@ def _open_raw(path: Path) -> Iterator[Any]:
 def _reader(path: Path, suffix: str) -> Any:
     """Import the package that reads photos of a suffix."""
     package, extra = _EXTRAS[suffix]
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"reading {suffix[1:].upper()} photos needs another package: "
-            f"pip install 'squeezeposenet-toolkit[{extra}]'",
-            path=path,
-        ) from error
+    return import_extra(package, extra, f"{suffix[1:].upper()} photos", path)
 
 
 def _too_many_pixels(path: Path) -> InputError:

@@ -1,0 +1,116 @@
+"""Writers of flight logs of all formats from one flight, independent of the readers."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+UTC_S = 1_714_564_800.0  # 2024-05-01 12:00:00 UTC
+BOOT_S = 100.0  # clock of the autopilot at the first record
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """Truth of a flight: records (N,) of the time, position, heights, lock and camera angles."""
+
+    time_s: np.ndarray
+    lat_deg: np.ndarray
+    lon_deg: np.ndarray
+    amsl_m: np.ndarray
+    geoid_m: float
+    rel_m: np.ndarray
+    fix_type: np.ndarray
+    gimbal_deg: np.ndarray
+    sigma_m: tuple[float, float] = (0.6, 0.9)
+    utc_s: float = UTC_S
+
+    @property
+    def ellipsoid_m(self) -> np.ndarray:
+        """Height above the ellipsoid (N,)."""
+        return self.amsl_m + self.geoid_m
+
+
+def make_flight(count: int = 40, step_s: float = 0.2, no_lock: int = 3) -> Flight:
+    """Return a climbing flight to the north-east, without a lock in its first records."""
+    k = np.arange(count, dtype=np.float64)
+    kind = np.where(k < no_lock, 1, 3)
+    gimbal = np.stack([40 + k, -30 - 0.5 * k, 0.1 * k], axis=1)
+    return Flight(
+        k * step_s, -35.36 + 1e-5 * k, 149.16 + 2e-5 * k, 600 + 0.5 * k, 19.3, 0.5 * k, kind, gimbal
+    )
+
+
+def quaternion(heading_deg: float, pitch_deg: float, roll_deg: float) -> list[float]:
+    """Return the quaternion, scalar first, from forward, right, down to north, east, down."""
+    y, p, r = np.radians([heading_deg, pitch_deg, roll_deg]) / 2
+    cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
+    return [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+
+
+_ULOG_TYPES = {"uint64_t": "Q", "int32_t": "i", "float": "f", "double": "d", "uint8_t": "B"}
+_ULOG_TYPES |= {"bool": "?", "uint16_t": "H"}
+_ULOG_OLD = (
+    "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;int32_t alt_ellipsoid;"
+    "float eph;float epv;uint8_t fix_type;"
+)
+_ULOG_NEW = (
+    "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;"
+    "double altitude_msl_m;double altitude_ellipsoid_m;float eph;float epv;uint8_t fix_type;"
+)
+_ULOG_OTHERS = {
+    "vehicle_global_position": "uint64_t timestamp;double lat;double lon;float alt;bool alt_valid;",
+    "home_position": "uint64_t timestamp;float alt;bool valid_alt;",
+    "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+    "gimbal_device_attitude_status": "uint64_t timestamp;float[4] q;uint16_t device_flags;",
+}
+
+
+def write_ulog(path: Path, flight: Flight, *, old: bool = False, in_vehicle: bool = False) -> None:
+    """Write a ULog as its format is documented, with the fields of PX4 before or after 1.14."""
+    position = "vehicle_gps_position" if old else "sensor_gps"
+    formats = {position: _ULOG_OLD if old else _ULOG_NEW, **_ULOG_OTHERS}
+    out = io.BytesIO()
+    out.write(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", int(BOOT_S * 1e6)))
+
+    def message(kind: str, body: bytes) -> None:
+        out.write(struct.pack("<HB", len(body), ord(kind)) + body)
+
+    message("B", bytes(40))
+    for name, fields in formats.items():
+        message("F", f"{name}:{fields}".encode())
+    for number, name in enumerate(formats):
+        message("A", struct.pack("<BH", 0, number) + name.encode())
+
+    def record(name: str, *values: float) -> None:
+        fields = formats[name].replace("float[4] q;", "float a;float b;float c;float d;")
+        codes = "".join(_ULOG_TYPES[field.split()[0]] for field in fields.split(";") if field)
+        message("D", struct.pack(f"<H{codes}", list(formats).index(name), *values))
+
+    start_us = int(BOOT_S * 1e6)
+    record("home_position", start_us, float(flight.amsl_m[0] - flight.rel_m[0]), True)
+    for k, time_s in enumerate(flight.time_s):
+        us, utc_us = start_us + round(time_s * 1e6), round((flight.utc_s + time_s) * 1e6)
+        lat, lon = flight.lat_deg[k], flight.lon_deg[k]
+        place: tuple[float, ...] = (lat, lon, flight.amsl_m[k], flight.ellipsoid_m[k])
+        if old:
+            scales = (1e7, 1e7, 1e3, 1e3)
+            place = tuple(round(value * scale) for value, scale in zip(place, scales, strict=True))
+        kind = int(flight.fix_type[k])
+        record(position, us, utc_us if kind > 1 else 0, *place, *flight.sigma_m, kind)
+        record("vehicle_global_position", us, lat, lon, flight.amsl_m[k], True)
+        heading, pitch, roll = flight.gimbal_deg[k]
+        record("vehicle_attitude", us, *quaternion(30.0, 2.0, -3.0))
+        quat = quaternion(heading - (30.0 if in_vehicle else 0.0), pitch, roll)
+        record("gimbal_device_attitude_status", us, *quat, 32 if in_vehicle else 64)
+    path.write_bytes(out.getvalue())
