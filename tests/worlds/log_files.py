@@ -114,3 +114,59 @@ def write_ulog(path: Path, flight: Flight, *, old: bool = False, in_vehicle: boo
         quat = quaternion(heading - (30.0 if in_vehicle else 0.0), pitch, roll)
         record("gimbal_device_attitude_status", us, *quat, 32 if in_vehicle else 64)
     path.write_bytes(out.getvalue())
+
+
+_DATAFLASH = {
+    "GPS": ("QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
+    "GPA": ("QBCCCCfBIHf", "TimeUS,I,VDop,HAcc,VAcc,SAcc,YAcc,VV,SMS,Delta,Und"),
+    "POS": ("QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
+    "ATT": ("Qccccf", "TimeUS,DesRoll,Roll,DesPitch,Pitch,Yaw"),
+    "MNT": ("QBfffffff", "TimeUS,I,DRoll,Roll,DPitch,Pitch,DYawB,YawB,YawE"),
+    "CAM": ("QBHIHLLfff", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt"),
+}
+
+
+def gps_week(utc_s: float) -> tuple[int, int]:
+    """Return GPS week and milliseconds of it, 18 s ahead of UTC since 2017."""
+    seconds = utc_s - datetime(1980, 1, 6, tzinfo=UTC).timestamp() + 18
+    return int(seconds // 604_800), round(seconds % 604_800 * 1000)
+
+
+def write_dataflash(path: Path, flight: Flight, *, yaw_in_earth: bool = True) -> None:
+    """Write a dataflash log by pymavlink's own formats."""
+    from pymavlink.DFReader import DFFormat, DFReader_binary
+
+    pack = DFReader_binary.make_msgbuf
+    formats = {
+        name: DFFormat(150 + k, name, 0, codes, columns)
+        for k, (name, (codes, columns)) in enumerate(_DATAFLASH.items())
+    }
+    own = DFFormat(0x80, "FMT", 89, "BBnNZ", "Type,Length,Name,Format,Columns")
+
+    def definition(form: DFFormat) -> bytes:
+        length = struct.calcsize(form.msg_struct) + 3
+        names = (form.name.encode(), form.format.encode(), ",".join(form.columns).encode())
+        return pack(None, own, [form.type, length, *names])
+
+    out = [definition(own), *(definition(form) for form in formats.values())]
+    start_us = int(BOOT_S * 1e6)
+    for k, time_s in enumerate(flight.time_s):
+        us = start_us + round(time_s * 1e6)
+        week, ms = gps_week(flight.utc_s + time_s)
+        kind = int(flight.fix_type[k])
+        lat, lon = round(flight.lat_deg[k] * 1e7), round(flight.lon_deg[k] * 1e7)
+        amsl, rel = float(flight.amsl_m[k]), float(flight.rel_m[k])
+        heading, pitch, roll = flight.gimbal_deg[k]
+        week, ms = (week, ms) if kind > 1 else (0, 0)
+        sigma = [round(100 * value) for value in flight.sigma_m]
+        rows: dict[str, list[float]] = {
+            "GPS": [us, 0, kind, ms, week, 12, 80, lat, lon, round(100 * amsl), 0, 0, 0, 0, 1],
+            "GPA": [us, 0, 120, *sigma, 20, 0, 1, 0, 200, flight.geoid_m],
+            "POS": [us, lat, lon, amsl, rel, rel],
+            "ATT": [us, 0, 0, 0, 0, 30.0],
+            "MNT": [us, 0, 0, roll, 0, pitch, 0, heading - 30, heading if yaw_in_earth else np.nan],
+        }
+        if k % 10 == 5:
+            rows["CAM"] = [us, 0, k, ms, week, lat, lon, amsl, rel, amsl]
+        out += [pack(None, formats[name], row) for name, row in rows.items()]
+    path.write_bytes(b"".join(out))
