@@ -45,17 +45,17 @@ class Series:
     values: np.ndarray
 
     def near(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the values nearest in time, NaN where there is none within 2.5 s."""
-        known = np.isfinite(self.values.reshape(len(self.values), -1)).all(axis=1)
+        """Return values (M, 3) nearest in time, or numbers (M,) interpolated; NaN without one within 2.5 s."""
+        known = np.isfinite(self.values.reshape(len(self.values), -1)).any(axis=1)
         index, _ = time_order(self.time_s[known])
-        known_s, values = self.time_s[known][index], self.values[known][index]
+        known_s, values = self.time_s[known][index], self.values[known][index].astype(np.float64)
         if len(known_s) == 0:
             return np.full((len(time_s), *self.values.shape[1:]), np.nan)
         right = np.clip(np.searchsorted(known_s, time_s), 1, max(len(known_s) - 1, 1))
         right = np.minimum(right, len(known_s) - 1)
         left = np.maximum(right - 1, 0)
         nearest = np.where(time_s - known_s[left] < known_s[right] - time_s, left, right)
-        result = values[nearest].astype(np.float64)
+        result = np.interp(time_s, known_s, values) if values.ndim == 1 else values[nearest]
         result[np.abs(known_s[nearest] - time_s) > _NEAR_S] = np.nan
         return result
 
@@ -129,7 +129,7 @@ def log_track(
     lat_lon[~on_earth] = np.nan
     if not on_earth.any():
         found.append(f"none of its {len(rows)} position records has a fix")
-    height_m = np.where(on_earth, fixes.abs_alt_m[rows], np.nan)
+    height_m = np.where(on_earth & np.isfinite(fixes.abs_alt_m[rows]), fixes.abs_alt_m[rows], np.nan)
     sigma_m = np.where((fixes.sigma_m[rows] > 0) & (fixes.sigma_m[rows] < 1e4), fixes.sigma_m[rows], np.nan)
     utc_s, utc_notes = _steady_utc(time_s[rows], fixes.utc_s[rows])
     found += utc_notes
@@ -221,15 +221,14 @@ def gimbal_angles(
     notes = []
     if turns_with_vehicle.any():
         if attitude is None:
-            angles[turns_with_vehicle] = np.nan
+            angles[turns_with_vehicle, 0] = np.nan
             notes.append(
-                "gimbal angles are left out: their yaw is relative to the vehicle, whose attitude is missing"
+                "headings of the gimbal are left out: they are relative to the vehicle, whose attitude is missing"
             )
         else:
             heading = attitude.near(np.asarray(time_s))[:, 0]
             turned = (angles[:, 0] + heading) % 360.0
             angles[:, 0] = np.where(turns_with_vehicle, turned, angles[:, 0])
-    angles[~np.isfinite(angles).all(axis=1)] = np.nan
     return Series(np.asarray(time_s, dtype=np.float64), angles), notes
 
 

@@ -170,3 +170,46 @@ def write_dataflash(path: Path, flight: Flight, *, yaw_in_earth: bool = True) ->
             rows["CAM"] = [us, 0, k, ms, week, lat, lon, amsl, rel, amsl]
         out += [pack(None, formats[name], row) for name, row in rows.items()]
     path.write_bytes(b"".join(out))
+
+
+def write_tlog(
+    path: Path, flight: Flight, *, system: int = 1, gimbal: str = "device", delay_s: float = 0.3
+) -> None:
+    """Write a telemetry log by pymavlink; messages arrive late, by a delay that varies."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    mavlink = dialect.MAVLink(None, srcSystem=system, srcComponent=1)
+    out: list[bytes] = []
+
+    def send(time_s: float, message: object) -> None:
+        late_s = delay_s * (1 + 0.5 * np.sin(7 * time_s))
+        out.append(struct.pack(">Q", round((flight.utc_s + time_s + late_s) * 1e6)))
+        out.append(message.pack(mavlink))  # type: ignore[attr-defined]
+        mavlink.seq = (mavlink.seq + 1) % 256
+
+    send(0.0, mavlink.heartbeat_encode(2, 3, 0, 0, 4))
+    for k, time_s in enumerate(flight.time_s):
+        boot_ms = round((BOOT_S + time_s) * 1e3)
+        kind = int(flight.fix_type[k])
+        lat, lon = round(flight.lat_deg[k] * 1e7), round(flight.lon_deg[k] * 1e7)
+        amsl, hae, rel = (
+            round(1000 * float(value[k])) for value in (flight.amsl_m, flight.ellipsoid_m, flight.rel_m)
+        )
+        sigma = [round(1000 * value) for value in flight.sigma_m]
+        if kind > 1 and k % 5 == 0:
+            utc_us = round((flight.utc_s + time_s) * 1e6)
+            send(time_s, mavlink.system_time_encode(utc_us, boot_ms))
+        gps = (boot_ms * 1000, kind, lat, lon, amsl, 80, 120, 0, 0, 12, hae, *sigma, 0, 0, 0)
+        send(time_s, mavlink.gps_raw_int_encode(*gps))
+        send(time_s, mavlink.global_position_int_encode(boot_ms, lat, lon, amsl, rel, 0, 0, 0, 0))
+        yaw = np.radians(30.0)
+        send(time_s, mavlink.attitude_encode(boot_ms, 0.0, 0.0, yaw, 0, 0, 0))
+        heading, pitch, roll = flight.gimbal_deg[k]
+        if gimbal == "device":
+            quat = quaternion(heading - 30, pitch, roll)
+            fields = (0, 0, boot_ms, 32, quat, 0.0, 0.0, 0.0, 0)
+            send(time_s, mavlink.gimbal_device_attitude_status_encode(*fields))
+        else:
+            angles = (round(100 * pitch), round(100 * roll), round(100 * (heading - 30)))
+            send(time_s, mavlink.mount_status_encode(0, 0, *angles))
+    path.write_bytes(b"".join(out))
