@@ -213,3 +213,75 @@ def write_tlog(
             angles = (round(100 * pitch), round(100 * roll), round(100 * (heading - 30)))
             send(time_s, mavlink.mount_status_encode(0, 0, *angles))
     path.write_bytes(b"".join(out))
+
+
+def nmea_lines(
+    flight: Flight, *, geoid: bool = True, gst: bool = True, date: bool = True, quality: int = 1
+) -> list[str]:
+    """Return the sentences of a receiver with checksums of their own."""
+
+    def sentence(body: str) -> str:
+        total = 0
+        for byte in body.encode():
+            total ^= byte
+        return f"${body}*{total:02X}"
+
+    def angle(value: float, digits: int, letters: str) -> str:
+        whole = int(abs(value))
+        minutes = (abs(value) - whole) * 60
+        return f"{whole:0{digits}d}{minutes:09.6f},{letters[int(value < 0)]}"
+
+    lines = []
+    for k, time_s in enumerate(flight.time_s):
+        now = datetime.fromtimestamp(flight.utc_s + time_s, UTC)
+        clock = now.strftime("%H%M%S.") + f"{now.microsecond // 10_000:02d}"
+        place = f"{angle(flight.lat_deg[k], 2, 'NS')},{angle(flight.lon_deg[k], 3, 'EW')}"
+        fixed = flight.fix_type[k] > 1
+        if date:
+            status, day = ("A", now.strftime("%d%m%y")) if fixed else ("V", "")
+            lines.append(sentence(f"GPRMC,{clock},{status},{place},0.1,0.0,{day},,,A"))
+        separation = f"{flight.geoid_m:.1f}" if geoid else ""
+        kind = quality if fixed else 0
+        height = f"{flight.amsl_m[k]:.2f},M,{separation},M"
+        lines.append(sentence(f"GPGGA,{clock},{place},{kind},12,0.8,{height},,"))
+        if gst:
+            east, up = flight.sigma_m
+            lines.append(sentence(f"GPGST,{clock},1.0,1.0,1.0,0.0,{east},{east},{up}"))
+    return lines
+
+
+def write_nmea(path: Path, flight: Flight, **options: bool | int) -> None:
+    """Write an NMEA log."""
+    path.write_text("\r\n".join(nmea_lines(flight, **options)) + "\r\n")  # type: ignore[arg-type]
+
+
+def fit_crc(data: bytes) -> int:
+    """Return the checksum of Garmin's FIT."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+    return crc
+
+
+def write_fit(path: Path, flight: Flight) -> None:
+    """Write a FIT activity of records once per whole second, as its protocol is documented."""
+    fields = [(253, 4, 0x86), (0, 4, 0x85), (1, 4, 0x85), (78, 4, 0x86), (31, 1, 0x02)]
+    body = struct.pack("<BBBHB", 0x40, 0, 0, 20, len(fields))
+    body += b"".join(struct.pack("<BBB", *one) for one in fields)
+    epoch_s = datetime(1989, 12, 31, tzinfo=UTC).timestamp()
+    for k, time_s in enumerate(flight.time_s):
+        if abs(time_s - round(time_s)) > 1e-6:
+            continue
+        fixed = flight.fix_type[k] > 1
+        place = [
+            round(value[k] * 2**31 / 180) if fixed else 0x7FFFFFFF
+            for value in (flight.lat_deg, flight.lon_deg)
+        ]
+        height = round((float(flight.amsl_m[k]) + 500) * 5)
+        seconds = round(flight.utc_s + time_s - epoch_s)
+        body += struct.pack("<BIiiIB", 0, seconds, *place, height, 3)
+    header = struct.pack("<BBHI4s", 14, 0x20, 2100, len(body), b".FIT")
+    header += struct.pack("<H", fit_crc(header))
+    path.write_bytes(header + body + struct.pack("<H", fit_crc(header + body)))
