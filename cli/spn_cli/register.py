@@ -58,6 +58,12 @@ if TYPE_CHECKING:
     help="Use telemetry even if its length, time or time zone does not match its images.",
 )
 @click.option(
+    "--time-offset",
+    "time_offset_s",
+    type=options.Finite(-4e8, 4e8),
+    help="Seconds to add to telemetry times.  [default: 0; the check against GNSS estimates the rest]",
+)
+@click.option(
     "--video",
     "video_folder",
     type=click.Path(path_type=Path, exists=True),
@@ -140,6 +146,7 @@ def _register(
     fixed_lens: bool,
     map_frames: int,
     any_telemetry: bool,
+    time_offset_s: float | None,
     workers: int,
     cluster: str,
     seed: int,
@@ -157,6 +164,7 @@ def _register(
         fov_deg=fov_deg,
         camera_file=camera_file,
         any_telemetry=any_telemetry,
+        time_offset_s=time_offset_s,
     )
     with dispatch_to(cluster, workers) as dispatch:
         return stage(

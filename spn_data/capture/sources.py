@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 from spn_data.capture.photo_order import one_file_per_photo, photos_in_order
 from spn_data.errors import InputError
 from spn_data.media import photo_file
+from spn_data.telemetry.dataflash import is_dataflash
 
 if TYPE_CHECKING:
     from spn_data.capture.video import VideoInfo
@@ -27,7 +28,13 @@ VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".
 PHOTO_SUFFIXES = frozenset(photo_file.PHOTO_SUFFIXES)
 EVENTS_SUFFIX = ".mrk"  # DJI: exposures of the photos in the same folder
 SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
-TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX}
+LOG_SUFFIXES = frozenset([".ulg", ".bin", ".tlog", ".fit", ".nmea"])
+TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX} | LOG_SUFFIXES
+# What lies beside videos and is not read, with the remedy.
+_NOT_READ = {
+    ".ubx": "raw data of u-blox receivers, which are not read: convert them to NMEA or CSV",
+    ".dat": "not read; if it is a flight log of DJI, convert it to CSV",
+}
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
 # Cameras split a recording just below 4 GiB, the largest file that FAT32 allows.
@@ -245,7 +252,9 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
             kinds["photo"].append(path)
         elif suffix in photo_file.RAW_SUFFIXES:
             ignored.append((path, photo_file.RAW_REMEDY))
-        elif suffix in TELEMETRY_SUFFIXES:
+        elif suffix in _NOT_READ:
+            ignored.append((path, _NOT_READ[suffix]))
+        elif suffix in TELEMETRY_SUFFIXES and (suffix != ".bin" or is_dataflash(path)):
             kinds["telemetry"].append(path)
         else:
             ignored.append((path, "not a video, photo or telemetry file"))

@@ -17,7 +17,7 @@ from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
-from spn_data.inputs.flight_telemetry import source_telemetry
+from spn_data.inputs.flight_telemetry import source_telemetry, with_offset
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.source_fingerprints import fingerprints
@@ -112,6 +112,7 @@ def sample_frames(
     rate_hz: float,
     fov_deg: float | None,
     any_telemetry: bool,
+    time_offset_s: float | None = None,
 ) -> SampledSequence:
     """Sample frames of a sequence and write them as images, with its telemetry and frame table.
 
@@ -129,6 +130,8 @@ def sample_frames(
         Horizontal field of view, if known.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
+    time_offset_s : float or None
+        Added to the times of the telemetry, also of that which is written.
 
     Returns
     -------
@@ -155,7 +158,10 @@ def sample_frames(
     )
     reason = np.where(measured.readable, reason, measured.problem)
     choice = FrameChoice(status, reason, np.full(len(status), np.nan))
-    track = source_telemetry(source, candidates, any_telemetry=any_telemetry)
+    track = source_telemetry(
+        source, candidates, any_telemetry=any_telemetry, time_offset_s=time_offset_s
+    )
+    track = with_offset(track, time_offset_s)
     zoom = None if track is None else track.at(measured.time_s).zoom
     frames = build_frames(candidates, choice, focal=zoom)
     if track is not None:

@@ -211,6 +211,13 @@ def _are_dated(photos: Telemetry) -> bool:
     return bool(known.any() and np.allclose(zero_s, zero_s[0], rtol=0, atol=1e-3))
 
 
+def with_offset(track: Telemetry | None, time_offset_s: float | None) -> Telemetry | None:
+    """Return telemetry with the user's time offset; the tags of a photo are its own and have none."""
+    if track is None or track.kind == "exif":
+        return track
+    return track.shifted(time_offset_s or 0.0)
+
+
 def unread_tracks(source: Source) -> list[str]:
     """Return a note if a video without readable telemetry has data tracks that are not supported."""
     if source.kind is SourceKind.PHOTOS:

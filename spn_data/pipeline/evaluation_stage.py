@@ -64,12 +64,15 @@ class RegisterStageOptions:
         File of a calibrated camera to start from.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
+    time_offset_s : float or None
+        Added to the times of the telemetry, those of photos with positions of their own excepted.
     """
 
     register: RegisterOptions = field(default_factory=RegisterOptions)
     fov_deg: float | None = None
     camera_file: str | None = None
     any_telemetry: bool = False
+    time_offset_s: float | None = None
 
 
 def register(
@@ -113,6 +116,8 @@ def register(
     source = find_source(area, video, name)
     given = None if options.camera_file is None else read_camera(Path(options.camera_file))
     made_with = {**asdict(options), "camera_file": None if given is None else camera_to_json(given)}
+    if options.time_offset_s is None:  # so that sequences from before this option stay valid
+        del made_with["time_offset_s"]
     stage = f"{EVALUATION}/{source.sequence}"
     inputs = fingerprints((source,), {})
     work = area.begin(stage, made_with, inputs, overwrite=overwrite)
@@ -136,7 +141,7 @@ def _register(
     stopwatch = Stopwatch()
     before = _map_hashes(area)
     with stopwatch.step("frames"):
-        check_telemetry(source)
+        check_telemetry(source, time_offset_s=options.time_offset_s)
         sampled = sample_frames(
             work.path,
             source,
@@ -145,6 +150,7 @@ def _register(
             rate_hz=options.register.rate_hz,
             fov_deg=options.fov_deg,
             any_telemetry=options.any_telemetry,
+            time_offset_s=options.time_offset_s,
         )
     chosen = sampled.frames.select(sampled.frames.chosen)
     found = register_sequence(

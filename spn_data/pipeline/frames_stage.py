@@ -25,7 +25,12 @@ from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.geometry.geodesy import metres_from_first_fix
 from spn_data.inputs.file_links import link_or_copy
-from spn_data.inputs.flight_telemetry import check_telemetry, source_telemetry, unread_tracks
+from spn_data.inputs.flight_telemetry import (
+    check_telemetry,
+    source_telemetry,
+    unread_tracks,
+    with_offset,
+)
 from spn_data.inputs.initial_cameras import start_cameras
 from spn_data.inputs.sequence_masks import check_mask, find_masks, write_mask
 from spn_data.inputs.source_fingerprints import fingerprints
@@ -227,7 +232,7 @@ def choose_frames(
         found, work.path / ".analysis", options, progress, stopwatch, on_telemetry, offsets_s
     )
     shifted = [
-        _shifted(track, s, offsets_s) for track, s in zip(tracks, found.sources, strict=True)
+        with_offset(track, offsets_s[s.sequence]) for track, s in zip(tracks, found.sources, strict=True)
     ]
     choices = _choose(candidates, shifted, options.selection)
     done_before = 0
@@ -309,15 +314,6 @@ def _offset(time_offset_s: Mapping[str, float] | None, sequence: str) -> float |
     """Return the time offset that the user gave for a sequence, or for all."""
     given = time_offset_s or {}
     return given.get(sequence, given.get("*"))
-
-
-def _shifted(
-    track: Telemetry | None, source: Source, offsets_s: Mapping[str, float | None]
-) -> Telemetry | None:
-    """Return telemetry with the user's time offset; the tags of a photo are its own and have none."""
-    if track is None or track.kind == "exif":
-        return track
-    return track.shifted(offsets_s[source.sequence] or 0.0)
 
 
 def _frames_with_telemetry(

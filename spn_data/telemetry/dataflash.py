@@ -34,6 +34,7 @@ def is_dataflash(path: Path) -> bool:
         return False
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of numbers in damaged messages
 def read_dataflash(path: Path) -> Telemetry:
     """Read the positions of a dataflash log; raise InputError if it has none or pymavlink is missing.
 

@@ -87,7 +87,9 @@ def _collect(
             height_m = _number(frame, "altitude") if math.isnan(height_m) else height_m
             utc_s = _number(frame, "utc_timestamp") if number == _GPS else _number(frame, "timestamp")
             utc_s = _FIT_EPOCH_S + utc_s if utc_s >= _FIRST_DATE else _NAN
-            rows[number].append((_time(frame), lat, lon, height_m, _number(frame, "gps_accuracy"), utc_s))
+            time_s = _time(frame)
+            utc_s += time_s % 1.0
+            rows[number].append((time_s, lat, lon, height_m, _number(frame, "gps_accuracy"), utc_s))
             if len(rows[number]) > MAX_FIXES:
                 raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
 

@@ -46,7 +46,8 @@ class Series:
 
     def near(self, time_s: np.ndarray) -> np.ndarray:
         """Return values (M, 3) nearest in time, or numbers (M,) interpolated; NaN without one within 2.5 s."""
-        known = np.isfinite(self.values.reshape(len(self.values), -1)).any(axis=1)
+        finite = np.isfinite(self.values)
+        known = finite if finite.ndim == 1 else finite.any(axis=1)
         index, _ = time_order(self.time_s[known])
         known_s, values = self.time_s[known][index], self.values[known][index].astype(np.float64)
         if len(known_s) == 0:
@@ -110,14 +111,17 @@ def log_track(
     Raises
     ------
     InputError
-        If there are too many records.
+        If there are too many records, or none has a time.
     """
     if len(fixes.time_s) > MAX_FIXES:
         raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
     found = [*notes]
     time_s = fixes.time_s
     near = np.isfinite(time_s)
-    near[near] = np.abs(time_s[near] - np.median(time_s[near])) <= _LONGEST_S
+    if not near.any():
+        raise InputError("contains no positions: none of its position records has a time", path=path)
+    middle_s = np.sort(time_s[near])[(near.sum() - 1) // 2]
+    near[near] = np.abs(time_s[near] - middle_s) <= _LONGEST_S
     if not near.all():
         found.append(f"records left out because their time is more than a day off: {np.sum(~near)}")
     rows = np.flatnonzero(near)

@@ -42,6 +42,7 @@ _NAN = float("nan")
 _US, _MS = 1e-6, 1e-3
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of numbers in damaged messages
 def read_tlog(path: Path) -> Telemetry:
     """Read the positions of a telemetry log; raise InputError if it has none or pymavlink is missing.
 
@@ -69,6 +70,7 @@ class _Vehicle:
 
     def __init__(self) -> None:
         self.is_autopilot = self.has_boot_times = False
+        self.stale = 0
         self.boot = _Boot()
         self.boots = [self.boot]
         self.fixes: list[tuple[_Boot, float, tuple[float, ...]]] = []
@@ -147,8 +149,12 @@ class _Log:
             time_s = message.time_usec * _US
             if time_s >= 1e9:  # seconds since 1970
                 boot = _UNIX
-            elif vehicle.has_boot_times:  # without a lock, the time of the last fix is repeated
+            elif vehicle.has_boot_times:
                 boot = vehicle.boot
+                # Without a lock the time of the last fix is repeated; after a restart, others come later.
+                if time_s < boot.last_s - _REBOOT_S:
+                    vehicle.stale += 1
+                    return
             else:
                 boot = vehicle.seen(time_s, received_s)
             vehicle.fixes.append((boot, time_s, (message.get_srcComponent(), *_gps_values(message))))
@@ -258,6 +264,10 @@ def _track(path: Path, vehicle: _Vehicle, notes: list[str]) -> Telemetry:
         notes.append(f"the autopilot was started {len(boots)} times: their times are joined by the date")
     if any(not boot.stated_s for boot in boots):
         notes.append("its dates are those of the ground station's computer, as the autopilot states none")
+    if vehicle.stale:
+        notes.append(
+            f"position records left out because their time is {_REBOOT_S:.0f} s or more behind: {vehicle.stale}"
+        )
     fixes, fix_notes = _fixes(vehicle)
     heights = vehicle.rows.get(_GLOBAL, [])
     rel_alt = None

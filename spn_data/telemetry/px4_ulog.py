@@ -36,6 +36,7 @@ _US = 1e-6
 _Data = dict[str, np.ndarray]
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of numbers in damaged messages
 def read_ulog(path: Path) -> Telemetry:
     """Read the positions of a ULog; raise InputError if it has none or pyulog is missing.
 
