@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,12 @@ from spn_data.telemetry.flight_log import (
     quiet,
 )
 from spn_data.telemetry.track import Telemetry
+from spn_data.telemetry.ulog_messages import MAX_MESSAGE_BYTES, needed_messages
 
 _POSITIONS = ("vehicle_gps_position", "sensor_gps")
 _HEIGHT, _HOME = "vehicle_global_position", "home_position"
 _ATTITUDE, _GIMBAL = "vehicle_attitude", "gimbal_device_attitude_status"
 _WANTED = (*_POSITIONS, _HEIGHT, _HOME, _ATTITUDE, _GIMBAL)
-_MAX_MESSAGE_BYTES = 256_000_000  # of the wanted messages together
 _MAX_FIELDS = 20_000  # of the wanted messages together; PX4's have at most some hundreds
 _MAX_FORMAT_FIELDS = 200_000
 _US = 1e-6
@@ -43,23 +44,29 @@ def read_ulog(path: Path) -> Telemetry:
     Positions, accuracies and UTC are those of the receiver; heights above take-off are PX4's estimate above
     its home, and camera angles those that a gimbal reports. Records before damage are used.
     """
-    size = check_size(path)
+    check_size(path)
     core = import_extra("pyulog.core", "px4", "PX4's ULog", path)
-    with path.open("rb") as raw:
-        stream = _Limited(raw, 4 * size + 1_000_000)
-        log = _log_class(core)()
-        try:
-            with quiet():
-                log._load_file(stream, list(_WANTED))
-        except (core.ULogException, ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise InputError(f"is not a ULog that can be read: {_words(error)}", path=path) from error
-        except (OSError, RecursionError, MemoryError) as error:
-            raise InputError(f"cannot be read as a ULog: {_words(error)}", path=path) from error
+    try:
+        needed = needed_messages(path, _WANTED)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    log = _log_class(core)()
+    try:
+        with quiet():
+            log._load_file(io.BytesIO(needed.data), list(_WANTED))
+    except (
+        *(core.ULogException, ArithmeticError, LookupError, RecursionError),
+        *(TypeError, ValueError, struct.error),
+    ) as error:
+        words = str(error).replace("\n", " ")[:200] or type(error).__name__
+        raise InputError(f"is not a ULog that can be read: {words}", path=path) from error
     notes = []
-    if log.file_corruption or stream.is_cut:
-        notes.append("it is damaged: only the records that can still be read are used")
-    if log.limits.bytes_left < 0:
-        notes.append(f"only the first {_MAX_MESSAGE_BYTES / 1e6:.0f} MB of its records are used")
+    if needed.skipped_bytes or log.file_corruption:
+        notes.append(
+            f"it is damaged: {needed.skipped_bytes} bytes are skipped, and records that contradict their format"
+        )
+    if needed.is_full:
+        notes.append(f"only the first {MAX_MESSAGE_BYTES / 1e6:.0f} MB of its records are used")
     tables = {
         (data.name, data.multi_id): {
             name: np.nan_to_num(column, nan=np.nan, posinf=np.nan, neginf=np.nan)
@@ -188,69 +195,6 @@ def _quats(table: _Data) -> np.ndarray:
     return np.stack([np.asarray(table[name], dtype=np.float64) for name in names], axis=1)
 
 
-def _words(error: BaseException) -> str:
-    return str(error).replace("\n", " ")[:200] or type(error).__name__
-
-
-class _Limited(io.RawIOBase):
-    """A file that ends once it was read so often that a damaged log would be searched for hours."""
-
-    def __init__(self, file: Any, max_bytes: int):
-        super().__init__()
-        self._file, self._left = file, max_bytes
-        self.is_cut = False
-
-    def read(self, size: int = -1) -> bytes:
-        """Read at most `size` bytes; none once the limit is reached."""
-        data: bytes = self._file.read(size)
-        self._left -= len(data) + 4
-        self.is_cut |= self._left < 0 or 0 < len(data) < size
-        return data if self._left >= 0 else b""
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Move as the file does."""
-        return int(self._file.seek(offset, whence))
-
-    def tell(self) -> int:
-        """Return the position in the file."""
-        return int(self._file.tell())
-
-
-class _Limits:
-    """Bytes and fields of the wanted messages that a log may still take."""
-
-    def __init__(self) -> None:
-        self.bytes_left, self.fields_left = _MAX_MESSAGE_BYTES, _MAX_FIELDS
-
-
-class _Buffer(bytearray):
-    """Records of one message, which stop growing once all of them together reach the limit."""
-
-    def __init__(self, limits: _Limits):
-        super().__init__()
-        self._limits = limits
-
-    def __iadd__(self, data: Any) -> _Buffer:
-        self._limits.bytes_left -= len(data)
-        if self._limits.bytes_left >= 0:
-            self.extend(data)
-        return self
-
-
-class _Nothing(list[Any]):
-    """A list that stays empty: text messages and parameters are not used."""
-
-    def append(self, _: Any) -> None:
-        """Keep nothing."""
-
-
-class _NoEntries(dict[Any, Any]):
-    """A dictionary that stays empty: information messages are not used."""
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        """Keep nothing."""
-
-
 class _Formats(dict[str, Any]):
     """Formats of messages, of which a damaged log cannot have any number."""
 
@@ -267,41 +211,25 @@ class _Formats(dict[str, Any]):
 
 
 def _log_class(core: Any) -> Any:
-    """Return pyulog's log with bounded memory: the wanted messages, and nothing of the others."""
+    """Return pyulog's log with bounds for formats that contain themselves or many others."""
 
     class Message(core.ULog._MessageAddLogged):  # type: ignore[misc]
-        def __init__(self, data: bytes, header: Any, formats: Any, *, limits: _Limits):
-            self.limits = limits
-            name = data[3:].decode("utf-8", "ignore")
-            if name in _WANTED:
-                super().__init__(data, header, formats)
-                self.buffer = _Buffer(limits)
-            else:
-                self.message_name, self.msg_id = name, int.from_bytes(data[1:3], "little")
+        def __init__(self, *arguments: Any, log: Any):
+            self.log = log
+            super().__init__(*arguments)
 
         def _parse_nested_type(self, prefix: str, type_name: str, formats: Any) -> None:
             fields = formats[type_name].fields
-            self.limits.fields_left -= sum(max(size, 1) for _, size, _ in fields) + 1
-            if self.limits.fields_left < 0:
+            self.log.fields_left -= sum(max(size, 1) for _, size, _ in fields) + 1
+            if self.log.fields_left < 0:
                 raise ValueError("too many fields")
             super()._parse_nested_type(prefix, type_name, formats)
 
     class Log(core.ULog):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__(None)
-            self.limits = _Limits()
-            self._MessageAddLogged = partial(Message, limits=self.limits)
+            self.fields_left = _MAX_FIELDS
+            self._MessageAddLogged = partial(Message, log=self)
             self._message_formats = _Formats()
-            self._logged_messages, self._dropouts = _Nothing(), _Nothing()
-            self._changed_parameters = _Nothing()
-            self._logged_messages_tagged = _NoEntries()
-            self._msg_info_dict, self._msg_info_dict_types = _NoEntries(), _NoEntries()
-            self._initial_parameters = _NoEntries()
-
-        def _add_parameter_default(self, _: Any) -> None:
-            """Keep nothing."""
-
-        def _add_message_info_multiple(self, _: Any) -> None:
-            """Keep nothing."""
 
     return Log

@@ -18,7 +18,7 @@ from spn_data.capture.sources import discover
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.rotations import rotations_from_angles
-from spn_data.telemetry import px4_ulog
+from spn_data.telemetry import ulog_messages
 from spn_data.telemetry.accuracy import sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
 from spn_data.telemetry.flight_log import camera_angles, utc_from_gps
@@ -287,13 +287,13 @@ def test_formats_that_contain_each_other_are_refused(tmp_path):
         text = b"\0\0\0sensor_gps"
         out += struct.pack("<H", len(text)) + b"A" + text
         (tmp_path / "a.ulg").write_bytes(out)
-        with pytest.raises(InputError, match="contains no positions|cannot be read"):
+        with pytest.raises(InputError, match="contains no positions|is not a ULog that can be read"):
             read_telemetry(tmp_path / "a.ulg")
 
 
 def test_a_log_beyond_the_limit_of_memory_is_cut_with_a_note(tmp_path, monkeypatch):
     """Records beyond the limit are left out, and a note says so."""
-    monkeypatch.setattr(px4_ulog, "_MAX_MESSAGE_BYTES", 5000)
+    monkeypatch.setattr(ulog_messages, "MAX_MESSAGE_BYTES", 5000)
     track = written(tmp_path, "a.ulg", make_flight(count=200))
     assert 0 < len(track) < 200
     assert any("only the first" in note for note in track.notes)
