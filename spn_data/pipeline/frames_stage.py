@@ -232,7 +232,8 @@ def choose_frames(
         found, work.path / ".analysis", options, progress, stopwatch, on_telemetry, offsets_s
     )
     shifted = [
-        with_offset(track, offsets_s[s.sequence]) for track, s in zip(tracks, found.sources, strict=True)
+        with_offset(track, offsets_s[s.sequence])
+        for track, s in zip(tracks, found.sources, strict=True)
     ]
     choices = _choose(candidates, shifted, options.selection)
     done_before = 0

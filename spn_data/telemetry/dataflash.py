@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import FIX_2D, FIX_3D, sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
-from spn_data.telemetry.flight_log import Fixes, Series, check_size, log_track, utc_from_gps
+from spn_data.telemetry.flight_log import LoggedFixes, Series, check_size, log_track, utc_from_gps
 from spn_data.telemetry.track import Telemetry
-from spn_data.geometry.geodesy import HeightReference
 
 HEAD = b"\xa3\x95"
 _FORMAT_TYPE, _FORMAT_BYTES = 0x80, 89
@@ -150,7 +150,10 @@ class _Log:
             if form.name in tables or not bodies:
                 continue  # a second definition of the same message
             dtype = np.dtype(
-                [(f"{k}", _numpy_code(struct_code)) for k, struct_code in enumerate(self._codes(form))]
+                [
+                    (f"{k}", _numpy_code(struct_code))
+                    for k, struct_code in enumerate(self._codes(form))
+                ]
             )
             rows = np.frombuffer(bodies, dtype=dtype)
             columns: _Table = {}
@@ -172,7 +175,7 @@ def _numpy_code(struct_code: str) -> str:
 
 
 def _receiver(tables: dict[str, _Table], path: Path) -> tuple[_Table, list[str]]:
-    """Return the records of one receiver: that which the autopilot used most, else the one with most fixes."""
+    """Return the records of the receiver that the autopilot used most, else of that with most fixes."""
     found: list[_Table] = []
     for name in ("GPS", "GPS2"):
         table = tables.get(name)
@@ -180,11 +183,13 @@ def _receiver(tables: dict[str, _Table], path: Path) -> tuple[_Table, list[str]]
             continue
         number = table.get("I", np.zeros(len(table["TimeUS"])))
         found += [
-            {key: values[number == one] for key, values in table.items()} for one in np.unique(number)[:8]
+            {key: values[number == one] for key, values in table.items()}
+            for one in np.unique(number)[:8]
         ]
     if not found:
         raise InputError(
-            "contains no positions: it has no GPS messages with TimeUS, Status, Lat, Lng and Alt", path=path
+            "contains no positions: it has no GPS messages with TimeUS, Status, Lat, Lng and Alt",
+            path=path,
         )
     used = [
         (int((one.get("U", np.zeros(1)) > 0).sum()), int((one["Status"] >= FIX_2D).sum()))
@@ -212,7 +217,7 @@ def _accuracies(tables: dict[str, _Table], gps: _Table) -> _Table:
     return result
 
 
-def _fixes(gps: _Table, accuracy: _Table) -> Fixes:
+def _fixes(gps: _Table, accuracy: _Table) -> LoggedFixes:
     kind = np.nan_to_num(gps["Status"]).astype(np.int64)
     count = len(kind)
     nothing = np.full(count, np.nan)
@@ -223,12 +228,13 @@ def _fixes(gps: _Table, accuracy: _Table) -> Fixes:
         kind.tolist(), accuracy["HAcc"], accuracy["VAcc"], hdop, accuracy["VDop"], strict=True
     )
     sigma_m = [
-        sigma_from_fix(k, horizontal_m=h, vertical_m=v, hdop=hd, vdop=vd) for k, h, v, hd, vd in stated
+        sigma_from_fix(k, horizontal_m=h, vertical_m=v, hdop=hd, vdop=vd)
+        for k, h, v, hd, vd in stated
     ]
     utc_s = nothing
     if {"GMS", "GWk"} <= gps.keys():
         utc_s = utc_from_gps(gps["GWk"], gps["GMS"] * _MS)
-    return Fixes(
+    return LoggedFixes(
         gps["TimeUS"] * _US,
         np.where(kind >= FIX_2D, utc_s, np.nan),
         lat_lon,

@@ -14,7 +14,7 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.media.extras import import_extra
 from spn_data.telemetry.accuracy import FIX_3D, sigma_from_fix
-from spn_data.telemetry.flight_log import MAX_FIXES, Fixes, check_size, log_track
+from spn_data.telemetry.flight_log import MAX_FIXES, LoggedFixes, check_size, log_track
 from spn_data.telemetry.track import Telemetry
 
 _MAX_BYTES = 100_000_000  # a day of records each second has some megabytes
@@ -52,19 +52,24 @@ def read_fit(path: Path) -> Telemetry:
         ) as error:
             words = str(error).replace("\n", " ")[:150] or type(error).__name__
             if not any(rows.values()):
-                raise InputError(f"is not a FIT file that can be read: {words}", path=path) from error
+                raise InputError(
+                    f"is not a FIT file that can be read: {words}", path=path
+                ) from error
             notes.append(f"it is damaged ({words}): only the records before are used")
     if caught and not notes:
         notes.append(f"it is damaged ({str(caught[0].message)[:150]}): its values may be wrong")
     counts = {number: sum(math.isfinite(row[1]) for row in found) for number, found in rows.items()}
     best = max(counts, key=lambda number: counts[number])
     if not counts[best]:
-        raise InputError("contains no positions: no record states latitude and longitude", path=path)
+        raise InputError(
+            "contains no positions: no record states latitude and longitude", path=path
+        )
     table = np.array(rows[best], dtype=np.float64)
     if len(starts_s):
         first_s = starts_s[0] - float(np.nanmin(table[:, 0]))
         notes.append(
-            f"video recordings by the device: {len(starts_s)}, the first {first_s:.1f} s after the first record"
+            f"video recordings by the device: {len(starts_s)}, the first {first_s:.1f} s after the first "
+            "record"
         )
     return log_track(path, "fit", _fixes(table), notes=tuple(notes))
 
@@ -85,7 +90,9 @@ def _collect(
             lat, lon = (_number(frame, name) * _DEGREES for name in _FIELDS[1:])
             height_m = _number(frame, "enhanced_altitude")
             height_m = _number(frame, "altitude") if math.isnan(height_m) else height_m
-            utc_s = _number(frame, "utc_timestamp") if number == _GPS else _number(frame, "timestamp")
+            utc_s = (
+                _number(frame, "utc_timestamp") if number == _GPS else _number(frame, "timestamp")
+            )
             utc_s = _FIT_EPOCH_S + utc_s if utc_s >= _FIRST_DATE else _NAN
             time_s = _time(frame)
             utc_s += time_s % 1.0
@@ -109,11 +116,11 @@ def _number(frame: Any, name: str) -> float:
     return float(value) if math.isfinite(value) else _NAN
 
 
-def _fixes(table: np.ndarray) -> Fixes:
+def _fixes(table: np.ndarray) -> LoggedFixes:
     """Return fixes of rows (N, 6) of time, latitude, longitude, altitude, accuracy and UTC."""
     lat_lon = table[:, 1:3].copy()
     sigma_m = [sigma_from_fix(FIX_3D, horizontal_m=accuracy) for accuracy in table[:, 4].tolist()]
-    return Fixes(
+    return LoggedFixes(
         table[:, 0],
         table[:, 5],
         lat_lon,

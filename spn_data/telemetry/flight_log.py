@@ -45,7 +45,7 @@ class Series:
     values: np.ndarray
 
     def near(self, time_s: np.ndarray) -> np.ndarray:
-        """Return values (M, 3) nearest in time, or numbers (M,) interpolated; NaN without one within 2.5 s."""
+        """Return the values nearest in time, numbers interpolated; NaN if there is none within 2.5 s."""
         finite = np.isfinite(self.values)
         known = finite if finite.ndim == 1 else finite.any(axis=1)
         index, _ = time_order(self.time_s[known])
@@ -62,7 +62,7 @@ class Series:
 
 
 @dataclass(frozen=True, eq=False)
-class Fixes:
+class LoggedFixes:
     """The N position records of a log in the order of the file; NaN is not stated.
 
     `time_s` (N,) is on the clock of the log and `utc_s` (N,) the receiver's time; `lat_lon_deg` (N, 2) is
@@ -80,7 +80,7 @@ class Fixes:
 def log_track(
     path: Path,
     kind: str,
-    fixes: Fixes,
+    fixes: LoggedFixes,
     *,
     rel_alt: Series | None = None,
     gimbal: Series | None = None,
@@ -94,7 +94,7 @@ def log_track(
         The log.
     kind : str
         Its format, as in `Telemetry.kind`.
-    fixes : Fixes
+    fixes : LoggedFixes
         Its position records, at least one.
     rel_alt, gimbal : Series or None
         Heights above take-off, and headings, pitches and rolls of the camera.
@@ -119,7 +119,9 @@ def log_track(
     time_s = fixes.time_s
     near = np.isfinite(time_s)
     if not near.any():
-        raise InputError("contains no positions: none of its position records has a time", path=path)
+        raise InputError(
+            "contains no positions: none of its position records has a time", path=path
+        )
     middle_s = np.sort(time_s[near])[(near.sum() - 1) // 2]
     near[near] = np.abs(time_s[near] - middle_s) <= _LONGEST_S
     if not near.all():
@@ -133,8 +135,12 @@ def log_track(
     lat_lon[~on_earth] = np.nan
     if not on_earth.any():
         found.append(f"none of its {len(rows)} position records has a fix")
-    height_m = np.where(on_earth & np.isfinite(fixes.abs_alt_m[rows]), fixes.abs_alt_m[rows], np.nan)
-    sigma_m = np.where((fixes.sigma_m[rows] > 0) & (fixes.sigma_m[rows] < 1e4), fixes.sigma_m[rows], np.nan)
+    height_m = np.where(
+        on_earth & np.isfinite(fixes.abs_alt_m[rows]), fixes.abs_alt_m[rows], np.nan
+    )
+    sigma_m = np.where(
+        (fixes.sigma_m[rows] > 0) & (fixes.sigma_m[rows] < 1e4), fixes.sigma_m[rows], np.nan
+    )
     utc_s, utc_notes = _steady_utc(time_s[rows], fixes.utc_s[rows])
     found += utc_notes
     found.append(
@@ -170,8 +176,8 @@ def absolute_heights(
     if known.any() and np.isfinite(ellipsoid_m[known]).all():
         if both.any() and np.abs(amsl_m[both] - ellipsoid_m[both]).max() < _SAME_HEIGHT_M:
             note = (
-                "its heights above sea level and above the ellipsoid are the same: their reference is unknown "
-                "(give --height-reference)"
+                "its heights above sea level and above the ellipsoid are the same: their reference is "
+                "unknown (give --height-reference)"
             )
             return ellipsoid_m, HeightReference.UNKNOWN, [note]
         return ellipsoid_m, HeightReference.ELLIPSOID, []
@@ -186,18 +192,18 @@ def utc_from_gps(week: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def camera_angles(quats_wxyz: np.ndarray) -> np.ndarray:
-    """Return heading, pitch and roll (N, 3) of rotations (N, 4) from forward, right, down to north, east, down.
+    """Return heading, pitch, roll (N, 3) of quaternions (N, 4) from forward, right, down to north, east, down.
 
     Quaternions that are none become NaN. Within 0.1 degrees of straight down or up, heading is the direction
     of the image's top and roll is 0.
     """
     quats = np.asarray(quats_wxyz, dtype=np.float64)
     angles = np.full((len(quats), 3), np.nan)
-    good = np.isfinite(quats).all(axis=1)
-    good[good] = np.abs(np.linalg.norm(quats[good], axis=1) - 1) < 0.05
+    lengths = np.linalg.norm(np.nan_to_num(quats, posinf=0.0, neginf=0.0), axis=1)
+    good: np.ndarray = np.isfinite(quats).all(axis=1) & (np.abs(lengths - 1) < 0.05)
     if not good.any():
         return angles
-    ned = rotations_from_quats(quats[good] / np.linalg.norm(quats[good], axis=1, keepdims=True))
+    ned = rotations_from_quats(quats[good] / lengths[good, None])
     axes = np.swapaxes(ned, 1, 2)  # rows: forward, right, down, in north, east, down
     enu = np.stack([axes[..., 1], axes[..., 0], -axes[..., 2]], axis=-1)
     forward, right, down = enu[:, 0], enu[:, 1], enu[:, 2]
@@ -227,7 +233,8 @@ def gimbal_angles(
         if attitude is None:
             angles[turns_with_vehicle, 0] = np.nan
             notes.append(
-                "headings of the gimbal are left out: they are relative to the vehicle, whose attitude is missing"
+                "headings of the gimbal are left out: they are relative to the vehicle, whose attitude is "
+                "missing"
             )
         else:
             heading = attitude.near(np.asarray(time_s))[:, 0]

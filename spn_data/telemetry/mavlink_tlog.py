@@ -1,4 +1,4 @@
-"""Telemetry logs of ground stations (.tlog): MAVLink messages with the time of reception, decoded by pymavlink."""
+"""Telemetry logs of ground stations (.tlog): MAVLink with times of reception, decoded by pymavlink."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from spn_data.telemetry.accuracy import FIX_2D, FIX_3D, sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
 from spn_data.telemetry.flight_log import (
     MAX_FIXES,
-    Fixes,
+    LoggedFixes,
     Series,
     absolute_heights,
-    camera_angles,
     check_size,
     gimbal_angles,
     log_track,
@@ -86,7 +85,7 @@ class _Vehicle:
         return self.boot
 
     def times(self, rows: list[tuple[_Boot, float, tuple[float, ...]]]) -> np.ndarray:
-        """Return times (N,) of rows, in seconds since 1970 as the autopilots or the ground station state it."""
+        """Return times (N,) of rows, in seconds since 1970 as the autopilot or ground station states it."""
         return np.array([boot.zero_s + time_s for boot, time_s, _ in rows], dtype=np.float64)
 
 
@@ -157,7 +156,9 @@ class _Log:
                     return
             else:
                 boot = vehicle.seen(time_s, received_s)
-            vehicle.fixes.append((boot, time_s, (message.get_srcComponent(), *_gps_values(message))))
+            vehicle.fixes.append(
+                (boot, time_s, (message.get_srcComponent(), *_gps_values(message)))
+            )
             if len(vehicle.fixes) > MAX_FIXES:
                 raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
         else:
@@ -213,7 +214,7 @@ def _packets(file: BinaryIO, log: _Log) -> Iterator[tuple[int, Any]]:
 
 
 def _gps_values(m: Any) -> tuple[float, ...]:
-    """Return fix type, latitude, longitude, heights above sea level and ellipsoid, accuracies and HDOP, VDOP."""
+    """Return fix type, latitude, longitude, heights above sea level and ellipsoid, accuracies, dilutions."""
     stated = [value / 1e3 if 0 < value < 2**32 - 1 else _NAN for value in (m.h_acc, m.v_acc)]
     dops = [value / 100 if 0 < value < 65535 else _NAN for value in (m.eph, m.epv)]
     ellipsoid_m = m.alt_ellipsoid / 1e3 if m.alt_ellipsoid else _NAN
@@ -236,11 +237,13 @@ def _values(number: int, m: Any) -> tuple[float, ...]:
 def _vehicle(log: _Log, path: Path) -> tuple[_Vehicle, list[str]]:
     """Return the one vehicle with positions; raise InputError if there is none or several autopilots have."""
     found = {
-        number: one for number, one in sorted(log.vehicles.items()) if one.fixes or _GLOBAL in one.rows
+        number: one
+        for number, one in sorted(log.vehicles.items())
+        if one.fixes or _GLOBAL in one.rows
     }
     if not found:
         raise InputError(
-            "contains no positions: it has neither GPS_RAW_INT nor GLOBAL_POSITION_INT messages that can be read",
+            "contains no positions: it has no GPS_RAW_INT or GLOBAL_POSITION_INT that can be read",
             path=path,
         )
     autopilots = {number: one for number, one in found.items() if one.is_autopilot} or found
@@ -254,19 +257,26 @@ def _vehicle(log: _Log, path: Path) -> tuple[_Vehicle, list[str]]:
     others = [str(one) for one in found if one != number]
     notes = []
     if others:
-        notes.append(f"system {number} is used, the autopilot; positions of systems {', '.join(others)} are not")
+        notes.append(
+            f"system {number} is used, the autopilot; positions of systems {', '.join(others)} are not"
+        )
     return vehicle, notes
 
 
 def _track(path: Path, vehicle: _Vehicle, notes: list[str]) -> Telemetry:
     boots = [boot for boot in vehicle.boots if np.isfinite(boot.last_s)]
     if len(boots) > 1:
-        notes.append(f"the autopilot was started {len(boots)} times: their times are joined by the date")
+        notes.append(
+            f"the autopilot was started {len(boots)} times: their times are joined by the date"
+        )
     if any(not boot.stated_s for boot in boots):
-        notes.append("its dates are those of the ground station's computer, as the autopilot states none")
+        notes.append(
+            "its dates are those of the ground station's computer, as the autopilot states none"
+        )
     if vehicle.stale:
         notes.append(
-            f"position records left out because their time is {_REBOOT_S:.0f} s or more behind: {vehicle.stale}"
+            f"position records left out because their time is {_REBOOT_S:.0f} s or more behind: "
+            f"{vehicle.stale}"
         )
     fixes, fix_notes = _fixes(vehicle)
     heights = vehicle.rows.get(_GLOBAL, [])
@@ -284,7 +294,7 @@ def _track(path: Path, vehicle: _Vehicle, notes: list[str]) -> Telemetry:
     )
 
 
-def _fixes(vehicle: _Vehicle) -> tuple[Fixes, list[str]]:
+def _fixes(vehicle: _Vehicle) -> tuple[LoggedFixes, list[str]]:
     """Return the fixes of the receiver, or the autopilot's estimates if there are none."""
     notes: list[str] = []
     rows = vehicle.fixes
@@ -313,7 +323,10 @@ def _fixes(vehicle: _Vehicle) -> tuple[Fixes, list[str]]:
         sigma_from_fix(k, horizontal_m=h, vertical_m=v, hdop=hd, vdop=vd)
         for k, (h, v, hd, vd) in zip(kind.tolist(), table[:, 6:10].tolist(), strict=True)
     ]
-    return Fixes(time_s, time_s, lat_lon, height_m, np.array(sigma_m), reference), [*notes, *height_notes]
+    return LoggedFixes(time_s, time_s, lat_lon, height_m, np.array(sigma_m), reference), [
+        *notes,
+        *height_notes,
+    ]
 
 
 def _gimbal(vehicle: _Vehicle) -> tuple[Series | None, list[str]]:
@@ -323,7 +336,9 @@ def _gimbal(vehicle: _Vehicle) -> tuple[Series | None, list[str]]:
         rows = vehicle.rows.get(number, [])
         if not rows:
             return None
-        return Series(vehicle.times(rows), np.array([values for *_, values in rows], dtype=np.float64))
+        return Series(
+            vehicle.times(rows), np.array([values for *_, values in rows], dtype=np.float64)
+        )
 
     attitude = series(_ATTITUDE)
     device, orientation, status = (

@@ -23,7 +23,13 @@ from spn_data.telemetry.accuracy import (
     Sigma,
     sigma_from_fix,
 )
-from spn_data.telemetry.flight_log import MAX_FIXES, Fixes, absolute_heights, check_size, log_track
+from spn_data.telemetry.flight_log import (
+    MAX_FIXES,
+    LoggedFixes,
+    absolute_heights,
+    check_size,
+    log_track,
+)
 from spn_data.telemetry.track import Telemetry
 
 _MAX_BYTES = 500_000_000
@@ -75,7 +81,9 @@ class _Log:
 def is_nmea(start: str) -> bool:
     """Return whether a file with this beginning has NMEA sentences of a GNSS receiver."""
     lines = start.lstrip("\ufeff").splitlines()[:20]
-    return any(line[:1] == "$" and line[3:6] in ("GGA", "RMC", "GSV", "GSA", "GLL") for line in lines)
+    return any(
+        line[:1] == "$" and line[3:6] in ("GGA", "RMC", "GSV", "GSA", "GLL") for line in lines
+    )
 
 
 def read_nmea(path: Path) -> Telemetry:
@@ -98,7 +106,9 @@ def read_nmea(path: Path) -> Telemetry:
     positions = [epoch for epoch in log.epochs if epoch.from_gga or epoch.fix != NO_FIX]
     if not positions:
         why = f"; sentences that cannot be used: {log.bad_count}, {log.bad[0]}" if log.bad else ""
-        raise InputError(f"contains no positions: it has no usable GGA or RMC sentence{why}", path=path)
+        raise InputError(
+            f"contains no positions: it has no usable GGA or RMC sentence{why}", path=path
+        )
     notes = []
     if log.bad_count:
         notes.append(f"sentences left out: {log.bad_count}, the first at {log.bad[0]}")
@@ -133,7 +143,7 @@ def _add(log: _Log, pynmea2: Any, line: int, text: str) -> None:
     """Add what a sentence states to its epoch."""
     try:
         sentence = pynmea2.parse(text)
-        time = getattr(sentence, "timestamp", None)
+        time: Any = getattr(sentence, "timestamp", None)
         if not hasattr(time, "hour"):
             return  # before its first fix, a receiver does not know the time
         second = 3600.0 * time.hour + 60 * time.minute + time.second + time.microsecond * 1e-6
@@ -149,7 +159,12 @@ def _add(log: _Log, pynmea2: Any, line: int, text: str) -> None:
             epoch.sigma_m = (values[0], values[1], values[2])
         elif kind == "ZDA":
             epoch.day = sentence.datestamp
-        elif sentence.status == "A" and getattr(sentence, "mode_indicator", "A") not in ("N", "E", "M", "S"):
+        elif sentence.status == "A" and getattr(sentence, "mode_indicator", "A") not in (
+            "N",
+            "E",
+            "M",
+            "S",
+        ):
             if hasattr(sentence.datestamp, "year"):
                 epoch.day = sentence.datestamp
             if not epoch.from_gga:
@@ -208,7 +223,7 @@ def _times(epochs: list[_Epoch]) -> tuple[np.ndarray, bool]:
     return np.array(days) * _DAY_S + seconds, dated
 
 
-def _fixes(epochs: list[_Epoch], time_s: np.ndarray, dated: bool) -> tuple[Fixes, list[str]]:
+def _fixes(epochs: list[_Epoch], time_s: np.ndarray, dated: bool) -> tuple[LoggedFixes, list[str]]:
     lat_lon = np.array([epoch.lat_lon for epoch in epochs])
     known = np.isfinite(lat_lon).all(axis=1)
     amsl_m = np.where(known, [epoch.amsl_m for epoch in epochs], np.nan)
@@ -224,4 +239,4 @@ def _fixes(epochs: list[_Epoch], time_s: np.ndarray, dated: bool) -> tuple[Fixes
         for epoch in epochs
     ]
     utc_s = time_s if dated else np.full(len(epochs), np.nan)
-    return Fixes(time_s, utc_s, lat_lon, height_m, np.array(sigma_m), reference), notes
+    return LoggedFixes(time_s, utc_s, lat_lon, height_m, np.array(sigma_m), reference), notes

@@ -14,7 +14,7 @@ from spn_data.errors import InputError
 from spn_data.media.extras import import_extra
 from spn_data.telemetry.accuracy import FIX_2D, FIX_3D, sigma_from_fix
 from spn_data.telemetry.flight_log import (
-    Fixes,
+    LoggedFixes,
     Series,
     absolute_heights,
     camera_angles,
@@ -63,7 +63,8 @@ def read_ulog(path: Path) -> Telemetry:
     notes = []
     if needed.skipped_bytes or log.file_corruption:
         notes.append(
-            f"it is damaged: {needed.skipped_bytes} bytes are skipped, and records that contradict their format"
+            f"it is damaged: {needed.skipped_bytes} bytes are skipped, and records that contradict "
+            "their format"
         )
     if needed.is_full:
         notes.append(f"only the first {MAX_MESSAGE_BYTES / 1e6:.0f} MB of its records are used")
@@ -85,7 +86,8 @@ def _track(
     fixes, height_notes = _fixes(table)
     attitude = tables.get((_ATTITUDE, 0))
     body = None if attitude is None else Series(_seconds(attitude), camera_angles(_quats(attitude)))
-    gimbal, gimbal_notes = None, []
+    gimbal: Series | None = None
+    gimbal_notes: list[str] = []
     found = sorted(key for key in tables if key[0] == _GIMBAL and "device_flags" in tables[key])
     if found:
         data = tables[found[0]]
@@ -102,9 +104,7 @@ def _track(
     )
 
 
-def _positions(
-    tables: dict[tuple[str, int], _Data], path: Path
-) -> tuple[_Data, list[str]]:
+def _positions(tables: dict[tuple[str, int], _Data], path: Path) -> tuple[_Data, list[str]]:
     """Return the position messages: those PX4 selected, else of the receiver with most fixes."""
     found = {
         key: data
@@ -120,11 +120,13 @@ def _positions(
     notes = []
     receivers = len(found) - len(selected) if not selected else len(selected)
     if receivers > 1:
-        notes.append(f"of its {receivers} receivers, number {best[1] + 1} is used, which has most fixes")
+        notes.append(
+            f"of its {receivers} receivers, number {best[1] + 1} is used, which has most fixes"
+        )
     return found[best], notes
 
 
-def _fixes(table: _Data) -> tuple[Fixes, list[str]]:
+def _fixes(table: _Data) -> tuple[LoggedFixes, list[str]]:
     """Return the fixes of position messages, with integer fields up to PX4 1.13 and floats after it."""
     nothing = np.full(len(table["timestamp"]), np.nan)
 
@@ -153,11 +155,12 @@ def _fixes(table: _Data) -> tuple[Fixes, list[str]]:
         kind.tolist(), column("eph"), column("epv"), column("hdop"), column("vdop"), strict=True
     )
     sigma_m = [
-        sigma_from_fix(k, horizontal_m=h, vertical_m=v, hdop=hd, vdop=vd) for k, h, v, hd, vd in stated
+        sigma_from_fix(k, horizontal_m=h, vertical_m=v, hdop=hd, vdop=vd)
+        for k, h, v, hd, vd in stated
     ]
     utc_s = column("time_utc_usec") * _US
     # Before its first lock, a receiver may count from any date.
-    return Fixes(
+    return LoggedFixes(
         _seconds(table),
         np.where(kind >= FIX_2D, utc_s, np.nan),
         lat_lon,

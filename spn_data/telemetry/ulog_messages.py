@@ -1,4 +1,4 @@
-"""A pass over a ULog that keeps only the messages needed, so that a large log takes little time and memory."""
+"""A pass over a ULog that keeps only the messages needed, so that a large log takes little memory."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -193,7 +192,8 @@ def write_tlog(
         kind = int(flight.fix_type[k])
         lat, lon = round(flight.lat_deg[k] * 1e7), round(flight.lon_deg[k] * 1e7)
         amsl, hae, rel = (
-            round(1000 * float(value[k])) for value in (flight.amsl_m, flight.ellipsoid_m, flight.rel_m)
+            round(1000 * float(value[k]))
+            for value in (flight.amsl_m, flight.ellipsoid_m, flight.rel_m)
         )
         sigma = [round(1000 * value) for value in flight.sigma_m]
         if kind > 1 and k % 5 == 0:
