@@ -14,7 +14,7 @@ _SETTINGS = ("MAVLINK_DIALECT", "MAVLINK20", "MAV_IGNORE_CRC", "PYMAVLINK_FAST_I
 
 
 def pymavlink(module: str, what: str, path: Path) -> Any:
-    """Import a module of pymavlink with ArduPilot's dialect of MAVLink 2, and keep the environment as it was."""
+    """Import a module of pymavlink with ArduPilot's dialect of MAVLink 2, and leave the environment alone."""
     before = {name: os.environ.pop(name, None) for name in _SETTINGS}
     os.environ["MAVLINK_DIALECT"], os.environ["MAVLINK20"] = "ardupilotmega", "1"
     try:

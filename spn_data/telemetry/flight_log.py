@@ -192,7 +192,7 @@ def utc_from_gps(week: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def camera_angles(quats_wxyz: np.ndarray) -> np.ndarray:
-    """Return heading, pitch, roll (N, 3) of quaternions (N, 4) from forward, right, down to north, east, down.
+    """Return heading, pitch, roll (N, 3) of quaternions (N, 4) from the camera to north, east, down.
 
     Quaternions that are none become NaN. Within 0.1 degrees of straight down or up, heading is the direction
     of the image's top and roll is 0.
