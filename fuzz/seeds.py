@@ -24,6 +24,7 @@ from spn_model.export.bundle_export import export
 from spn_model.models import checkpoint
 from spn_model.training.recipe import SHIPPED
 from spn_model.training.training_state import Position, save_state
+from tests.worlds import log_files
 from tests.worlds.box_world import write_box
 from tests.worlds.bundle_world import LENS, learnt
 from tests.worlds.short_flights import frames_of, write_flight1, write_video
@@ -158,6 +159,12 @@ def _telemetry(folder: Path, flight: Path) -> None:
             for k in rows
         ]
         (folder / name).write_text("\n".join([header, *cells]) + "\n")
+    logged = log_files.make_flight(25)
+    log_files.write_ulog(folder / "a.ulg", logged)
+    log_files.write_dataflash(folder / "a.bin", logged)
+    log_files.write_tlog(folder / "a.tlog", logged)
+    log_files.write_fit(folder / "a.fit", logged)
+    log_files.write_nmea(folder / "a.nmea", logged)
     (folder / "waypoints").mkdir()
     (folder / "waypoints" / "w.csv").write_text(
         "lat_deg,lon_deg,height_takeoff_m,heading_deg,pitch_deg\n49.0,8.4,30,90,-45\n49.001,8.4,31,9,-9\n"

@@ -214,6 +214,11 @@ TARGETS = (
     Target("ass", "telemetry/*.ass", read_telemetry),
     Target("gpx", "telemetry/*.gpx", read_telemetry),
     Target("csv", "telemetry/*.csv telemetry/*.tsv", read_telemetry),
+    Target(
+        "flight logs",
+        "telemetry/*.ulg telemetry/*.bin telemetry/*.tlog telemetry/*.fit telemetry/*.nmea",
+        read_telemetry,
+    ),
     Target("subtitles", "subtitled/*", read_subtitles),
     Target("photos", "photos/*", _photo),
     Target("real photos", "real-photos/*", _photo),

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 from spn_data.capture.photo_order import one_file_per_photo, photos_in_order
 from spn_data.errors import InputError
 from spn_data.media import photo_file
+from spn_data.telemetry.dataflash import is_dataflash
 
 if TYPE_CHECKING:
     from spn_data.capture.video import VideoInfo
@@ -27,11 +28,15 @@ VIDEO_SUFFIXES = frozenset([*_MPEG_SUFFIXES, ".mov", ".mkv", ".webm", ".avi", ".
 PHOTO_SUFFIXES = frozenset(photo_file.PHOTO_SUFFIXES)
 EVENTS_SUFFIX = ".mrk"  # DJI: exposures of the photos in the same folder
 SUBTITLE_SUFFIXES = frozenset([".srt", ".ass"])  # on the clock of the video
-TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX}
-# Videos of cameras that see all around, whose images are no pinhole images.
-ALL_ROUND_SUFFIXES = {
+LOG_SUFFIXES = frozenset([".ulg", ".bin", ".tlog", ".fit", ".nmea"])
+TELEMETRY_SUFFIXES = SUBTITLE_SUFFIXES | {".gpx", ".csv", EVENTS_SUFFIX} | LOG_SUFFIXES
+# What lies beside videos and is not read, with the remedy.
+_NOT_READ = {
+    # Videos of cameras that see all around, whose images are no pinhole images.
     ".insv": "Insta360 recording of two fisheye images: export a flat view as MP4, and its track as GPX",
     ".360": "GoPro MAX recording of cube faces: export a flat view as MP4, and its track as GPX",
+    ".ubx": "raw data of u-blox receivers: convert them to NMEA or CSV",
+    ".dat": "not a known log; if it is a flight record of DJI, convert it to CSV",
 }
 PROXY_SUFFIXES = frozenset([".lrf", ".lrv", ".thm"])
 
@@ -244,15 +249,15 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
             ignored.append((path, "hidden"))
         elif suffix in PROXY_SUFFIXES:
             ignored.append((path, "preview or thumbnail made by the camera"))
-        elif suffix in ALL_ROUND_SUFFIXES:
-            ignored.append((path, ALL_ROUND_SUFFIXES[suffix]))
         elif suffix in VIDEO_SUFFIXES:
             kinds["video"].append(path)
         elif suffix in PHOTO_SUFFIXES:
             kinds["photo"].append(path)
         elif suffix in photo_file.RAW_SUFFIXES:
             ignored.append((path, photo_file.RAW_REMEDY))
-        elif suffix in TELEMETRY_SUFFIXES:
+        elif suffix in _NOT_READ:
+            ignored.append((path, _NOT_READ[suffix]))
+        elif suffix in TELEMETRY_SUFFIXES and (suffix != ".bin" or is_dataflash(path)):
             kinds["telemetry"].append(path)
         else:
             ignored.append((path, "not a video, photo or telemetry file"))
@@ -263,8 +268,8 @@ def _classify(files: Iterable[Path], ignored: list[tuple[Path, str]]) -> dict[st
 
 def _nothing_found(folder: Path, ignored: list[tuple[Path, str]]) -> str:
     if not folder.is_dir():
-        if folder.suffix.lower() in ALL_ROUND_SUFFIXES:
-            return f"cannot be read: {ALL_ROUND_SUFFIXES[folder.suffix.lower()]}"
+        if folder.suffix.lower() in _NOT_READ:
+            return f"cannot be read: {_NOT_READ[folder.suffix.lower()]}"
         if folder.suffix.lower() in photo_file.RAW_SUFFIXES:
             return f"is a {photo_file.RAW_REMEDY}"
         return f"is not a video or photo: unsupported suffix {folder.suffix or '(none)'}"

@@ -16,6 +16,11 @@ DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
     "gopro": (2.0, 4.0),
     "gpx": (2.0, 4.0),
     "exif": (1.0, 2.0),
+    "px4-ulog": (1.5, 2.5),
+    "ardupilot-bin": (1.5, 2.5),
+    "mavlink-tlog": (1.5, 2.5),
+    "nmea": (2.0, 4.0),
+    "fit": (3.0, 5.0),
 }
 UNKNOWN_KIND_SIGMA_M = (1.5, 2.5)
 

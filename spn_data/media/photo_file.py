@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from spn_data.errors import InputError
+from spn_data.media.extras import import_extra
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 TWIN_SUFFIXES = (".heic", ".heif", ".dng")  # cameras write a JPEG of the same name too
@@ -166,14 +167,7 @@ def _open_raw(path: Path) -> Iterator[Any]:
 def _reader(path: Path, suffix: str) -> Any:
     """Import the package that reads photos of a suffix."""
     package, extra = _EXTRAS[suffix]
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"reading {suffix[1:].upper()} photos needs another package: "
-            f"pip install 'squeezeposenet-toolkit[{extra}]'",
-            path=path,
-        ) from error
+    return import_extra(package, extra, f"{suffix[1:].upper()} photos", path)
 
 
 def _too_many_pixels(path: Path) -> InputError:

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from spn_data.errors import InputError
 from spn_data.telemetry.ass_file import read_ass
 from spn_data.telemetry.csv_log import read_csv_log
+from spn_data.telemetry.dataflash import read_dataflash
 from spn_data.telemetry.dji_srt import read_dji_srt
 from spn_data.telemetry.embedded import read_embedded
+from spn_data.telemetry.fit import read_fit
 from spn_data.telemetry.gpx import read_gpx
+from spn_data.telemetry.mavlink_tlog import read_tlog
+from spn_data.telemetry.nmea import is_nmea, read_nmea
+from spn_data.telemetry.px4_ulog import read_ulog
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
 
-TELEMETRY_SUFFIXES = (".srt", ".ass", ".gpx", ".csv", ".tsv", ".txt")
+# Logs that are read through optional packages.
+LOG_READERS: dict[str, Callable[[Path], Telemetry]] = {
+    ".ulg": read_ulog,
+    ".bin": read_dataflash,
+    ".tlog": read_tlog,
+    ".fit": read_fit,
+    ".nmea": read_nmea,
+}
+TELEMETRY_SUFFIXES = (".srt", ".ass", ".gpx", ".csv", ".tsv", ".txt", *LOG_READERS)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".m4v", ".ts", ".avi")
 
 
 def read_telemetry(path: Path | str) -> Telemetry:
-    """Read telemetry from an .srt, .ass, .gpx, .csv (.tsv, .txt) or a track of a video.
+    """Read telemetry from an .srt, .ass, .gpx, .csv (.tsv, .txt), a flight log or a track of a video.
 
     Parameters
     ----------
@@ -49,10 +63,13 @@ def read_telemetry(path: Path | str) -> Telemetry:
     if suffix not in TELEMETRY_SUFFIXES:
         raise InputError(
             f"{suffix or 'a file without a suffix'} is not a telemetry format; supported are "
-            "subtitles of drones (.srt, .ass), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt) and "
-            f"videos with a subtitle or data track ({', '.join(VIDEO_SUFFIXES)})",
+            "subtitles of drones (.srt, .ass), GPX (.gpx), CSV with named columns (.csv, .tsv, .txt), "
+            f"logs ({', '.join(LOG_READERS)}) and videos with a subtitle or data track "
+            f"({', '.join(VIDEO_SUFFIXES)})",
             path=path,
         )
+    if suffix in LOG_READERS:
+        return LOG_READERS[suffix](path)
     if suffix == ".gpx":
         return read_gpx(path)
     if suffix == ".ass":
@@ -63,6 +80,8 @@ def read_telemetry(path: Path | str) -> Telemetry:
         return read_gpx(path)
     if suffix == ".srt" or "-->" in start:
         return read_dji_srt(path)
+    if is_nmea(start):
+        return read_nmea(path)
     return read_csv_log(path)
 
 

@@ -43,7 +43,7 @@ class Telemetry:
     utc_is_local : bool
         Whether `utc_s` is local time.
     kind : str
-        Format of the source, such as "dji-srt", "gpx", "csv", "exif".
+        Format of the source, such as "dji-srt", "gpx", "csv", "exif", "px4-ulog".
     source : str
         Name of the file.
     notes : tuple of str
