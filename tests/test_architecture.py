@@ -72,8 +72,6 @@ def test_pyav_stays_with_video():
     assert _importers("av") == {
         "spn_data/capture/video_container.py",
         "spn_data/media/container.py",
-        "spn_data/telemetry/data_tracks.py",
-        "spn_data/telemetry/subtitles.py",
         "spn_data/simulate/video_out.py",
     }
 

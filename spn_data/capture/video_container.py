@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import InputError
+from spn_data.media.container import packets
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ def video_stream(container: Any, path: Path) -> Any:
 
 def decoded_frames(container: Any, stream: Any) -> Iterator[tuple[Any, int]]:
     """Yield (frame, 0) for each decoded frame and (None, 1) for each packet that cannot be decoded."""
-    packets = container.demux(stream)
+    demuxed = packets(container, [stream])
     while True:
         try:
-            packet = next(packets)
+            packet = next(demuxed)
         except StopIteration:
             return
         except av.error.FFmpegError:  # the container is cut off here

@@ -1,7 +1,10 @@
-"""Opening of video containers with PyAV: one local file, self-contained, and never a URL."""
+"""Opening and demuxing of video containers with PyAV: one local file, self-contained, and never a URL."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +36,46 @@ def open_container(path: Path) -> Any:
         raise InputError(_why_unreadable(path), path=path) from error
     except OSError as error:
         raise InputError(f"can't be read: {error.strerror}", path=path) from error
+
+
+@contextmanager
+def open_tracks(path: Path, what: str) -> Iterator[Any]:
+    """Open a container for its tracks other than pictures; damage is an InputError that names `what`."""
+    try:
+        with open_container(path) as container:
+            yield container
+    except (av.error.FFmpegError, OSError) as error:
+        raise InputError(f"{what} cannot be read: {error.strerror}", path=path) from error
+
+
+def packets(container: Any, streams: Sequence[Any]) -> Iterator[Any]:
+    """Yield the packets of streams in the order of the file, and at its end an empty one for each.
+
+    Tracks that appear while the file is read are left out: PyAV does not know them, and fails at the end of
+    the file, after the packets of all others.
+    """
+    demuxed = container.demux(streams)
+    while True:
+        try:
+            packet = next(demuxed)
+        except (StopIteration, IndexError):
+            return
+        yield packet
+
+
+def packet_time_s(packet: Any) -> float:
+    """Return the presentation time of a packet in seconds; NaN if it is not stated."""
+    if packet.pts is None or packet.time_base is None:
+        return math.nan
+    return float(packet.pts * packet.time_base)
+
+
+def first_picture_s(container: Any) -> float:
+    """Return the time of the first picture in seconds, 0 if it is not stated."""
+    video = container.streams.video[0] if container.streams.video else None
+    if video is None or video.start_time is None or video.time_base is None:
+        return 0.0
+    return float(video.start_time * video.time_base)
 
 
 def _why_unreadable(path: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.media.extras import import_extra
 from spn_data.telemetry.accuracy import NAN_SIGMA, Sigma
 from spn_data.telemetry.data_tracks import DataPacket
 from spn_data.telemetry.track import Telemetry, time_order
@@ -39,25 +39,19 @@ def read_camm(packets: Sequence[DataPacket], source: str) -> Telemetry:
     InputError
         If the package is missing, or the track holds no position.
     """
-    try:
-        module = importlib.import_module("mapillary_tools.camm.camm_parser")
-    except ImportError as error:
-        raise InputError(
-            "reading its CAMM track needs another package: pip install 'squeezeposenet-toolkit[gopro]'",
-            path=source,
-        ) from error
+    module = import_extra("mapillary_tools.camm.camm_parser", "gopro", "its CAMM track", source)
     by_type: dict[int, list[tuple[float, Any]]] = {_MIN_GPS: [], _GPS: []}
     for packet in packets:
-        kind = packet.payload[
-            2
-        ]  # little-endian, below 8; sizes were checked when the track was recognized
-        if kind in by_type and math.isfinite(packet.time_s) and len(packet.payload) in (28, 60):
-            try:
-                by_type[kind].append(
-                    (packet.time_s, module.CAMMSampleData.parse(packet.payload).data)
-                )
-            except module.C.ConstructError:
-                continue
+        if not (math.isfinite(packet.time_s) and len(packet.payload) in (28, 60)):
+            continue
+        records_of_kind = by_type.get(packet.payload[2])  # little-endian, below 8
+        if records_of_kind is None:
+            continue
+        try:
+            data = module.CAMMSampleData.parse(packet.payload).data
+        except module.C.ConstructError:
+            continue
+        records_of_kind.append((packet.time_s, data))
     full = bool(by_type[_GPS])
     records = by_type[_GPS] or by_type[_MIN_GPS]
     if not records:

@@ -9,16 +9,17 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-import av
-
 from spn_data.errors import InputError
-from spn_data.media.container import open_container
+from spn_data.media.container import first_picture_s, open_tracks, packet_time_s, packets
 
-_MAX_BYTES = 500_000_000
-_MAX_PACKETS = 2_000_000
+# A camera writes some 10 kB and 20 positions a second.
+_MAX_BYTES = 256_000_000
+_MAX_PACKET_BYTES = 4_000_000
+MAX_RECORDS = 500_000
 _MAX_OTHER_PACKETS = 1000  # of a track whose format is not recognized yet
 # CAMM: two zero bytes, the type, then a body of the size that the type has.
 _CAMM_SIZES = {0: 16, 1: 12, 2: 16, 3: 16, 4: 16, 5: 28, 6: 60, 7: 16}
+_CAMM_POSITIONS = (b"\5\0", b"\6\0")
 KLV_KEY_START = bytes.fromhex("060e2b34")
 
 
@@ -31,7 +32,7 @@ class TrackFormat(StrEnum):
     DJI = "DJI djmd"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class DataPacket:
     """One packet: its time after the first frame (NaN: not stated), how long it holds, and its bytes.
 
@@ -70,27 +71,14 @@ def read_data_tracks(path: Path) -> list[DataTrack]:
     InputError
         If the file is not a video, or the tracks exceed the limits.
     """
-    try:
-        with open_container(path) as container:
-            streams = [s for s in container.streams if s.type == "data"]
-            if not streams:
-                return []
-            video = container.streams.video[0] if container.streams.video else None
-            if any(stream.name == "klv" for stream in streams) and video is not None:
-                streams.append(video)  # KLV may be without times, and then lies beside its pictures
-            return _tracks(container, streams, _start_s(video), path)
-    except (av.FFmpegError, OSError) as error:
-        raise InputError(f"its data tracks cannot be read: {error.strerror}", path=path) from error
-    except IndexError as error:  # PyAV does not know streams that appear while a file is read
-        raise InputError(
-            "its data tracks cannot be read: a track appears in the middle of the file", path=path
-        ) from error
-
-
-def _start_s(video: Any) -> float:
-    if video is None or video.start_time is None or video.time_base is None:
-        return 0.0
-    return float(video.start_time * video.time_base)
+    with open_tracks(path, "its data tracks") as container:
+        streams = [s for s in container.streams if s.type == "data"]
+        if not streams:
+            return []
+        if any(stream.name == "klv" for stream in streams):
+            # KLV may be without times, and then lies beside its pictures.
+            streams += container.streams.video[:1]
+        return _tracks(container, streams, first_picture_s(container), path)
 
 
 def _tracks(container: Any, streams: list[Any], start_s: float, path: Path) -> list[DataTrack]:
@@ -98,19 +86,14 @@ def _tracks(container: Any, streams: list[Any], start_s: float, path: Path) -> l
     others: dict[int, int] = {}
     total_bytes = count = 0
     near_s = math.nan
-    for packet in container.demux(streams):
-        time_s = math.nan if packet.pts is None else float(packet.pts * packet.time_base) - start_s
+    for packet in packets(container, streams):
+        time_s = packet_time_s(packet) - start_s
         index = packet.stream.index
         if packet.stream.type == "video":
-            near_s = time_s if packet.pts is not None else near_s
+            near_s = time_s if math.isfinite(time_s) else near_s
             continue
         if packet.size == 0 or others.get(index, 0) > _MAX_OTHER_PACKETS:
             continue
-        if total_bytes + packet.size > _MAX_BYTES or count >= _MAX_PACKETS:
-            raise InputError(
-                f"its data tracks exceed {_MAX_BYTES / 1e6:.0f} MB or {_MAX_PACKETS:,} packets",
-                path=path,
-            )
         payload = bytes(packet)
         if index not in tracks:
             found = _format(packet.stream, payload)
@@ -119,13 +102,26 @@ def _tracks(container: Any, streams: list[Any], start_s: float, path: Path) -> l
                 continue
             tracks[index] = DataTrack(found)
         track = tracks[index]
-        if track.format is TrackFormat.DJI and track.packets:
+        if not _is_needed(track, payload):
             continue
         total_bytes += len(payload)
         count += 1
+        if len(payload) > _MAX_PACKET_BYTES or total_bytes > _MAX_BYTES or count > MAX_RECORDS:
+            raise InputError(
+                f"its data tracks exceed {_MAX_BYTES / 1e6:.0f} MB, {MAX_RECORDS:,} packets or "
+                f"{_MAX_PACKET_BYTES / 1e6:.0f} MB in a packet",
+                path=path,
+            )
         duration_s = float((packet.duration or 0) * packet.time_base) if packet.time_base else 0.0
         track.packets.append(DataPacket(time_s, duration_s, payload, near_s))
     return list(tracks.values())
+
+
+def _is_needed(track: DataTrack, payload: bytes) -> bool:
+    """Return whether a packet may hold a position; those of a djmd track are not read after the first."""
+    if track.format is TrackFormat.DJI:
+        return not track.packets
+    return track.format is not TrackFormat.CAMM or payload[2:4] in _CAMM_POSITIONS
 
 
 def _format(stream: Any, payload: bytes) -> TrackFormat | None:

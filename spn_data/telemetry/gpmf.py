@@ -6,7 +6,6 @@ not know the Karma. Its parser of values is used here, on pieces whose counts ar
 
 from __future__ import annotations
 
-import importlib
 import math
 import struct
 from collections.abc import Iterator, Sequence
@@ -18,11 +17,17 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
+from spn_data.media.extras import import_extra
 from spn_data.telemetry.accuracy import NAN_SIGMA, Sigma, sigma_from_dop
-from spn_data.telemetry.data_tracks import DataPacket
+from spn_data.telemetry.data_tracks import MAX_RECORDS, DataPacket
 from spn_data.telemetry.track import Telemetry, time_order
 
 _USED = (b"GPS9", b"GPS5", b"GPRI", b"GLPI", b"SYST")
+_HEADERS = (b"SCAL", b"TYPE", b"GPSF", b"GPSP", b"GPSU", b"GPSA")
+# Bounds of one payload, which holds a second: the parser takes microseconds for each value.
+_MAX_ITEMS = 1000
+_MAX_ROWS = 10_000
+_MAX_HEADER_BYTES = 256
 _STRUCT = dict(zip("bBsSlLjJfd", "bBhHiIqQfd", strict=True))
 _2000_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
 _SAME_HOME_M = 0.05  # two heights whose difference varies less have one zero each
@@ -35,7 +40,7 @@ _LAG_NOTE = (
 _Values = dict[bytes, list[Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Fix:
     time_s: float
     lat_deg: float
@@ -58,6 +63,11 @@ class _Found:
     stamp_zero_s: list[float] = field(default_factory=list)  # video time at stamp 0, by record
     no_fix: int = 0
     damaged: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of records so far."""
+        return sum(map(len, self.fixes.values())) + len(self.heights) + len(self.clock)
 
 
 def read_gpmf(packets: Sequence[DataPacket], source: str) -> Telemetry:
@@ -87,6 +97,10 @@ def read_gpmf(packets: Sequence[DataPacket], source: str) -> Telemetry:
         try:
             for body in _position_streams(packet.payload):
                 _add(found, parse(body), packet)
+                if found.count > MAX_RECORDS:
+                    raise InputError(
+                        f"its GoPro track has more than {MAX_RECORDS:,} records", path=source
+                    )
         except (ValueError, IndexError, KeyError, TypeError, OverflowError, struct.error):
             found.damaged += 1
     kinds = [kind for kind in (b"GPS9", b"GPS5", b"GPRI") if found.fixes.get(kind)]
@@ -102,15 +116,9 @@ def read_gpmf(packets: Sequence[DataPacket], source: str) -> Telemetry:
 
 def _parser(source: str) -> Any:
     """Return the function of mapillary-tools that parses the values of one GPMF stream."""
-    try:
-        module = importlib.import_module("mapillary_tools.gpmf.gpmf_parser")
-        construct = importlib.import_module("construct")
-    except ImportError as error:
-        raise InputError(
-            "reading its GoPro track (GPMF) needs another package: "
-            "pip install 'squeezeposenet-toolkit[gopro]'",
-            path=source,
-        ) from error
+    what = "its GoPro track (GPMF)"
+    module = import_extra("mapillary_tools.gpmf.gpmf_parser", "gopro", what, source)
+    construct = import_extra("construct", "gopro", what, source)
 
     def parse(body: bytes) -> _Values:
         try:
@@ -124,32 +132,47 @@ def _parser(source: str) -> Any:
 
 
 def _items(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
-    """Yield (key, type, size, count, body) of the items of one level; end at padding."""
-    position = 0
+    """Yield (key, type, size, count, whole item) of the items of one level; end at padding."""
+    position = items = 0
     while position + 8 <= len(data):
         key, kind, size, count = struct.unpack_from(">4scBH", data, position)
         if key == b"\0\0\0\0":
             return
-        end = position + 8 + size * count
-        if end > len(data):
-            raise ValueError("an item is longer than its payload")
-        yield key, kind, size, count, data[position + 8 : end]
+        start, end = position, position + 8 + size * count
+        items += 1
+        if end > len(data) or items > _MAX_ITEMS:
+            raise ValueError("an item is longer than its payload, or there are too many")
         position = position + 8 + -(-size * count // 4) * 4
+        yield key, kind, size, count, data[start:position]
 
 
 def _position_streams(payload: bytes) -> Iterator[bytes]:
-    """Yield the bodies of the streams that hold positions; their item counts are bounded by their bytes."""
+    """Yield the items with which positions are stated, stream by stream, within bounds."""
     for device, _, _, _, inside in _items(payload):
         if device != b"DEVC":
             continue
-        for key, _, _, _, body in _items(inside):
-            if key != b"STRM":
-                continue
-            items = [(name, kind, size, count) for name, kind, size, count, _ in _items(body)]
-            if any(kind == b"\0" or (size == 0 and count) for _, kind, size, count in items):
-                continue  # nested, or values without bytes, of which a header can claim any number
-            if any(name in _USED for name, *_ in items):
-                yield body
+        for key, _, _, _, body in _items(inside[8:]):
+            if key == b"STRM":
+                kept = _needed_items(body[8:])
+                if kept:
+                    yield kept
+
+
+def _needed_items(body: bytes) -> bytes:
+    """Return the items of a stream that are used, whose counts are bounded by their bytes; else nothing."""
+    kept = []
+    records = rows = 0
+    for key, kind, size, count, item in _items(body):
+        if key not in _USED and (key not in _HEADERS or len(item) > 8 + _MAX_HEADER_BYTES):
+            continue
+        if kind == b"\0" or (size == 0 and count):
+            return b""  # nested, or values without bytes, of which a header can claim any number
+        records += key in _USED
+        rows += count if key in _USED else 0
+        kept.append(item)
+    if rows > _MAX_ROWS:
+        raise ValueError("more records than a second has")
+    return b"".join(kept) if records else b""
 
 
 def _add(found: _Found, values: _Values, packet: DataPacket) -> None:
@@ -208,11 +231,11 @@ def _fix(
 
 def _add_gps9(found: _Found, values: _Values, packet: DataPacket) -> None:
     rows = _rows(values, b"GPS9", 9)
+    found.references.setdefault(b"GPS9", set()).add(_reference(values))
     fixes = found.fixes.setdefault(b"GPS9", [])
     for time_s, row in zip(_times(packet, len(rows)), rows, strict=True):
         utc_s = _2000_S + 86400 * row[5] + row[6]
         fixes.append(_fix(found, time_s, row[:3], row[8], sigma_from_dop(pdop=row[7]), utc_s))
-    found.references.setdefault(b"GPS9", set()).add(_reference(values))
 
 
 def _add_gps5(found: _Found, values: _Values, packet: DataPacket) -> None:
@@ -221,11 +244,11 @@ def _add_gps5(found: _Found, values: _Values, packet: DataPacket) -> None:
     lock = float(values[b"GPSF"][0][0]) if values.get(b"GPSF") else 3.0
     dop = float(values[b"GPSP"][0][0]) / 100 if values.get(b"GPSP") else math.nan
     start_utc_s = _utc_s(values[b"GPSU"][0]) if values.get(b"GPSU") else math.nan
+    found.references.setdefault(b"GPS5", set()).add(_reference(values))
     fixes = found.fixes.setdefault(b"GPS5", [])
     for time_s, row in zip(_times(packet, len(rows)), rows, strict=True):
         utc_s = start_utc_s + time_s - packet.time_s
         fixes.append(_fix(found, time_s, row[:3], lock, sigma_from_dop(pdop=dop), utc_s))
-    found.references.setdefault(b"GPS5", set()).add(_reference(values))
 
 
 def _add_karma(found: _Found, values: _Values, packet: DataPacket) -> None:

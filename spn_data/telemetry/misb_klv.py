@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.rotations import angles_from_rotations
-from spn_data.telemetry.data_tracks import DataPacket
+from spn_data.telemetry.data_tracks import MAX_RECORDS, DataPacket
 from spn_data.telemetry.track import Telemetry, time_order
 
 UNIVERSAL_KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -67,20 +68,23 @@ def read_misb(packets: Sequence[DataPacket], source: str) -> Telemetry:
     InputError
         If no set has a right checksum and a position.
     """
-    rows, stamps_s, times_s, near_s = [], [], [], []
+    rows = array("d")
+    stamps_s, times_s, near_s = array("d"), array("d"), array("d")
     damaged = 0
     for packet in packets:
         try:
             for items in _sets(packet.payload):
-                rows.append([_value(tag, items) for tag in _COLUMNS])
+                if len(stamps_s) >= MAX_RECORDS:
+                    raise InputError(
+                        f"its KLV track has more than {MAX_RECORDS:,} records", path=source
+                    )
+                rows.extend(_value(tag, items) for tag in _COLUMNS)
                 stamps_s.append(_stamp_s(items))
                 times_s.append(packet.time_s)
                 near_s.append(packet.near_s)
         except _DamagedSetError:
             damaged += 1
-    values = dict(
-        zip(_COLUMNS, np.array(rows, dtype=np.float64).reshape(-1, len(_COLUMNS)).T, strict=True)
-    )
+    values = dict(zip(_COLUMNS, np.array(rows).reshape(-1, len(_COLUMNS)).T, strict=True))
     lat_lon_deg = np.column_stack([values[13], values[14]])
     lat_lon_deg[(lat_lon_deg == 0).all(axis=1) | np.isnan(lat_lon_deg).any(axis=1)] = np.nan
     if not np.isfinite(lat_lon_deg).any():

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
-import av
-
 from spn_data.errors import InputError
-from spn_data.media.container import open_container
+from spn_data.media.container import first_picture_s, open_tracks, packet_time_s, packets
 from spn_data.telemetry.dji_srt import telemetry_from_records
 from spn_data.telemetry.textfile import MAX_TEXT_BYTES
 from spn_data.telemetry.track import Telemetry
@@ -37,20 +36,13 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
     InputError
         If the subtitles contain no telemetry, or the file is not a video.
     """
-    try:
-        with open_container(Path(path)) as container:
-            streams = [
-                s
-                for s in container.streams.subtitles
-                if s.codec_context is not None and s.codec_context.name in _TEXT_CODECS
-            ]
-            video = container.streams.video[0] if container.streams.video else None
-            start_s = 0.0
-            if video is not None and video.start_time is not None and video.time_base is not None:
-                start_s = float(video.start_time * video.time_base)
-            tracks = _tracks(container, streams, start_s, path)
-    except (av.FFmpegError, OSError) as error:
-        raise InputError(f"its subtitles cannot be read: {error.strerror}", path=path) from error
+    with open_tracks(Path(path), "its subtitles") as container:
+        streams = [
+            s
+            for s in container.streams.subtitles
+            if s.codec_context is not None and s.codec_context.name in _TEXT_CODECS
+        ]
+        tracks = _tracks(container, streams, first_picture_s(container), path)
     failure: InputError | None = None
     for records in tracks:
         try:
@@ -69,15 +61,16 @@ def _tracks(
     """Return (number from 1, time_s, text) of the subtitles of each stream."""
     tracks: dict[int, list[tuple[int, float, str]]] = {stream.index: [] for stream in streams}
     total_bytes = 0
-    for packet in container.demux(streams) if streams else ():
+    for packet in packets(container, streams) if streams else ():
         data = bytes(packet)
         total_bytes += len(data)
         if total_bytes > MAX_TEXT_BYTES:
             raise InputError(f"its subtitles exceed {MAX_TEXT_BYTES / 1e6:.0f} MB", path=path)
         text = _text(data, packet.stream.codec_context.name)
-        if packet.pts is not None and text.strip():
+        time_s = packet_time_s(packet) - start_s
+        if math.isfinite(time_s) and text.strip():
             records = tracks[packet.stream.index]
-            records.append((len(records) + 1, float(packet.pts * packet.time_base) - start_s, text))
+            records.append((len(records) + 1, time_s, text))
     return list(tracks.values())
 
 

@@ -12,14 +12,11 @@ import piexif
 import pytest
 from PIL import Image
 
-from spn_data.area import names
 from spn_data.capture.candidates import analyse
 from spn_data.capture.sources import discover
 from spn_data.errors import InputError
-from spn_data.inputs.evaluation_source import sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry, source_telemetry
 from spn_data.telemetry.read import read_telemetry
-from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
 from tests.worlds.log_files import (
     make_flight,
@@ -109,24 +106,6 @@ def test_a_flight_log_is_put_on_the_clock_of_its_video(tmp_path: Path, write: An
     at = track.at(np.array([0.0, 1.0, 5.0]))
     np.testing.assert_allclose(track.time_s[0], -3.0, atol=1e-3)
     np.testing.assert_allclose(at.lat_lon_deg[:, 1], flight.lon_deg[[15, 20, 40]], atol=2e-7)
-
-
-def test_an_evaluation_video_has_its_time_offset(tmp_path: Path) -> None:
-    """The offset given to register moves the telemetry of an evaluation video, also as it is stored."""
-    write_video(tmp_path / "flight.mp4", "2026-05-01T10:00:05Z")
-    (tmp_path / "flight.gpx").write_text(LOGS["flight.gpx"])
-    (source,) = discover(tmp_path).sources
-    (tmp_path / "out").mkdir()
-    sampled = sample_frames(
-        *(tmp_path / "out", source, None, lambda *_: None),
-        rate_hz=1.0,
-        fov_deg=60.0,
-        any_telemetry=False,
-        time_offset_s=2.5,
-    )
-    assert sampled.track is not None
-    assert sampled.track.time_s.tolist() == [0.5, 2.5, 4.5]
-    assert read_track(tmp_path / "out" / names.TRACK).time_s.tolist() == [0.5, 2.5, 4.5]
 
 
 def test_a_log_is_put_on_the_clock_of_its_photos(tmp_path: Path) -> None:

@@ -16,16 +16,19 @@ import pytest
 from spn_data.capture.candidates import analyse, build_frames
 from spn_data.capture.selection import SelectionOptions, choose_all
 from spn_data.capture.sources import discover
+from spn_data.capture.video import decode_gray
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.inputs.flight_telemetry import source_telemetry, unread_tracks
 from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.media.container import open_container
 from spn_data.telemetry.camm import read_camm
 from spn_data.telemetry.data_tracks import DataPacket, DataTrack, TrackFormat, read_data_tracks
 from spn_data.telemetry.embedded import read_embedded
 from spn_data.telemetry.gpmf import read_gpmf
 from spn_data.telemetry.misb_klv import read_misb
+from spn_data.telemetry.subtitles import read_subtitles
 from tests.worlds.data_track_videos import gpmf_item, gpmf_payload, misb_set, write_klv_video
 
 _UTC_S = datetime(2024, 5, 1, 12, tzinfo=UTC).timestamp()
@@ -353,24 +356,75 @@ def test_a_dji_track_and_all_round_videos_are_named_with_the_remedy(
             discover(tmp_path / name)
 
 
+def _has_late_tracks(path: Path) -> bool:
+    """Whether PyAV itself fails at a track that appears while the file is read."""
+    try:
+        with open_container(path) as container:
+            for _ in container.demux([s for s in container.streams if s.type != "audio"]):
+                pass
+    except IndexError:
+        return True
+    except (InputError, av.FFmpegError):
+        pass
+    return False
+
+
 def test_a_damaged_transport_stream_gives_fixes_or_one_line(tmp_path: Path) -> None:
-    """An MPEG-TS with changed bytes, even with late tracks, gives fixes, nothing or an InputError."""
+    """An MPEG-TS with changed bytes, even with late tracks, gives fixes, pictures, or an InputError."""
     whole = tmp_path / "whole.ts"
     write_klv_video(whole, [(i / 2, _klv(_flight_items(), i / 2)) for i in range(8)])
     data = whole.read_bytes()
     random.seed(3)
-    late = 0
+    late = read = 0
     for _ in range(250):
         changed = bytearray(data)
         for _ in range(60):
             changed[random.randrange(len(changed))] = random.randrange(256)
         path = tmp_path / "changed.ts"
         path.write_bytes(changed)
+        is_late = _has_late_tracks(path)
+        late += is_late
         try:
-            read_embedded(path)
-        except InputError as error:
-            late += "appears in the middle" in str(error)
+            track = read_embedded(path)
+            read += is_late and track is not None
+            read_subtitles(path)
+            list(decode_gray(path, threads=1) if is_late else ())
+        except InputError:
+            continue
     assert late > 0
+    assert read > 0
+
+
+def test_a_track_of_too_many_records_or_bytes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bounds hold for packets of a file, for records within a packet, and for items of a GoPro payload."""
+    monkeypatch.setattr("spn_data.telemetry.gpmf.MAX_RECORDS", 7)
+    assert len(read_gpmf([_gps5(3)], "a.mp4")) == 4
+    with pytest.raises(InputError, match="GoPro track has more than 7 records"):
+        read_gpmf([_gps5(3), _gps5(3, second=1.0)], "a.mp4")
+    monkeypatch.setattr("spn_data.telemetry.misb_klv.MAX_RECORDS", 2)
+    with pytest.raises(InputError, match="KLV track has more than 2 records"):
+        read_misb([_packet(b"".join(_klv(_flight_items(), s) for s in range(3)))], "a.ts")
+    path = tmp_path / "day.ts"
+    write_klv_video(path, [(i / 2, _klv(_flight_items(), i / 2)) for i in range(8)])
+    assert len(read_data_tracks(path)[0].packets) == 8
+    monkeypatch.setattr("spn_data.telemetry.data_tracks.MAX_RECORDS", 7)
+    with pytest.raises(InputError, match="its data tracks exceed"):
+        read_data_tracks(path)
+
+
+def test_a_height_reference_of_another_type_leaves_its_payload_out() -> None:
+    """GPSA with numbers instead of letters is damage, not a traceback."""
+    rows = struct.pack(">5l", 481_000_000, 115_000_000, 500_000, 1000, 100)
+    scales = struct.pack(">5l", 10_000_000, 10_000_000, 1000, 1000, 100)
+    payload = gpmf_payload(
+        gpmf_item(b"SCAL", b"l", 4, scales),
+        gpmf_item(b"GPSA", b"L", 4, b"MSLV"),
+        gpmf_item(b"GPS5", b"l", 20, rows),
+    )
+    with pytest.raises(InputError, match="1 of its 1 payloads are damaged"):
+        read_gpmf([_packet(payload)], "a.mp4")
 
 
 def test_damaged_payloads_give_fixes_or_one_line() -> None:
