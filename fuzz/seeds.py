@@ -24,6 +24,7 @@ from spn_model.export.bundle_export import export
 from spn_model.models import checkpoint
 from spn_model.training.recipe import SHIPPED
 from spn_model.training.training_state import Position, save_state
+from tests.worlds import data_track_videos as tracks
 from tests.worlds import log_files
 from tests.worlds.box_world import write_box
 from tests.worlds.bundle_world import LENS, learnt
@@ -69,6 +70,7 @@ def make_small(folder: Path, flight: Path) -> None:
     _telemetry(folder / "telemetry", flight)
     _pictures(folder / "photos")
     _videos(folder / "video")
+    _data_tracks(folder / "data-tracks")
     (folder / "complete").touch()
 
 
@@ -226,6 +228,22 @@ def _videos(folder: Path) -> None:
                 packet.pts = packet.dts = 500 * k
                 packet.duration = 100
                 container.mux(packet)
+
+
+def _data_tracks(folder: Path) -> None:
+    """Write videos with data tracks, and the payloads of these tracks."""
+    payloads = {
+        "gps5.gpmf": tracks.gps5_payload(3, reference=b"MSLV"),
+        "gps9.gpmf": tracks.gps9_payload(),
+        "karma.gpmf": tracks.karma_payload(),
+        "full.camm": tracks.camm_packet(3),
+        "misb.klv": tracks.misb_set(1_714_564_800_000_000, tracks.misb_items()),
+    }
+    (folder / "payloads").mkdir(parents=True)
+    for name, payload in payloads.items():
+        (folder / "payloads" / name).write_bytes(payload)
+        video = (folder / name).with_suffix(".ts" if name.endswith("klv") else ".mp4")
+        tracks.write_data_video(video, [(k / 2, payload) for k in range(4)], seconds=2.0)
 
 
 def _network(folder: Path) -> None:

@@ -39,7 +39,12 @@ from spn_data.pipeline.import_cambridge import ImportOptions, import_cambridge
 from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.split.split_file import read_split
 from spn_data.storage.stage_record import read_record
+from spn_data.telemetry.camm import read_camm
+from spn_data.telemetry.data_tracks import DataPacket
+from spn_data.telemetry.embedded import read_embedded
 from spn_data.telemetry.exif import read_photo, telemetry_from_photos
+from spn_data.telemetry.gpmf import read_gpmf
+from spn_data.telemetry.misb_klv import read_misb
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.table import read_track
@@ -100,6 +105,13 @@ def _video(path: Path) -> None:
     probe(path)
     for _, _frame in zip(range(_FRAMES), decode_gray(path, threads=1), strict=False):
         pass
+
+
+def _payload(path: Path) -> None:
+    """Read a file as the only packet of a data track, whose format is its suffix."""
+    readers = {".gpmf": read_gpmf, ".camm": read_camm, ".klv": read_misb}
+    packet = DataPacket(time_s=0.0, duration_s=1.0, payload=path.read_bytes(), near_s=0.0)
+    readers[path.suffix]([packet], path.name)
 
 
 def _onboard_frames(path: Path) -> None:
@@ -220,6 +232,8 @@ TARGETS = (
         read_telemetry,
     ),
     Target("subtitles", "subtitled/*", read_subtitles),
+    Target("data tracks", "data-tracks/*.ts data-tracks/*.mp4", read_embedded),
+    Target("payloads", "data-tracks/payloads/*", _payload),
     Target("photos", "photos/*", _photo),
     Target("real photos", "real-photos/*", _photo),
     Target("masks", "masks/*", _mask),

@@ -10,15 +10,13 @@ import numpy as np
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
 # Standard deviation (horizontal per axis, vertical) in metres of one fix if the source states none.
-# Consumer GNSS without corrections; heights in photos are often barometric, hence the larger values.
+# Consumer GNSS without corrections, chosen as typical and not measured; heights in photos are often barometric,
+# hence the larger values.
 DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
     "dji-srt": (1.0, 1.5),
     "gopro": (2.0, 4.0),
     "gpx": (2.0, 4.0),
     "exif": (1.0, 2.0),
-    "px4-ulog": (1.5, 2.5),
-    "ardupilot-bin": (1.5, 2.5),
-    "mavlink-tlog": (1.5, 2.5),
     "nmea": (2.0, 4.0),
     "fit": (3.0, 5.0),
 }

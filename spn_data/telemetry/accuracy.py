@@ -32,7 +32,7 @@ def sigma_from_dop(
 
 # Fix types of MAVLink, PX4 and ArduPilot.
 NO_FIX, FIX_2D, FIX_3D, FIX_DGNSS, FIX_RTK_FLOAT, FIX_RTK = 1, 2, 3, 4, 5, 6
-# Typical figures of a receiver that states only the kind of its solution.
+# Of a receiver that states only the kind of its solution: chosen as typical, not measured.
 _DGNSS_FACTOR = 0.5  # of the error without corrections
 _RTK_SIGMA_M: dict[int, Sigma] = {FIX_RTK_FLOAT: (0.3, 0.3, 0.5), FIX_RTK: (0.02, 0.02, 0.04)}
 

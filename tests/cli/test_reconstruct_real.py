@@ -10,7 +10,8 @@ from click.testing import CliRunner
 from spn_cli.data import main
 
 from spn_data.area.area import Area
-from spn_data.area.names import GEO, MODEL
+from spn_data.area.names import FRAMES, FRAMES_TABLE, GEO, MODEL
+from spn_data.capture.frames import read_frames
 
 
 def reconstruct(source: Path, area: Path) -> Area:
@@ -41,14 +42,24 @@ def test_photos_of_a_beach_become_one_georeferenced_model(
 
 
 @pytest.mark.slow
-def test_a_real_flight_video_without_readable_telemetry_becomes_one_model(
+def test_a_real_flight_video_with_its_own_fixes_becomes_one_model(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """A 13 s video straight along a coast, too weak a geometry for free intrinsics, gives one model."""
-    area = reconstruct(shared_data / "video" / "gopro-karma.mp4", tmp_path / "area")
+    """A 13 s video straight along a coast gives one model, whose tilt about the line stays unknown."""
+    pytest.importorskip("mapillary_tools")
+    source = shared_data / "video" / "gopro-karma.mp4"
+    result = CliRunner().invoke(
+        main, ["reconstruct", str(source), "--area", str(tmp_path / "area")]
+    )
+    assert result.exit_code == 1
+    assert "cannot be georegistered: the tilt about the line of azimuth" in str(result.exception)
+    area = Area(tmp_path / "area")
     counts = area.record(MODEL).counts
     assert counts["frames"] >= 25
     assert counts["registered"] >= 0.95 * counts["frames"]
     (camera,) = counts["cameras"].values()
     assert 40 < camera["fov_deg"] < 127
+    frames = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
+    chosen = frames.select(frames.chosen)
+    assert chosen.has_fix.all()
     assert not area.has(GEO)
