@@ -10,8 +10,8 @@ import numpy as np
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 
 # Standard deviation (horizontal per axis, vertical) in metres of one fix if the source states none.
-# Consumer GNSS without corrections, chosen as typical and not measured; heights in photos are often barometric,
-# hence the larger values.
+# Consumer GNSS without corrections, chosen as typical and not measured; heights in photos are often
+# barometric, hence the larger values.
 DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
     "dji-srt": (1.0, 1.5),
     "gopro": (2.0, 4.0),

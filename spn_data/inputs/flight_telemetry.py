@@ -129,8 +129,10 @@ def _video_telemetry(
                 track = _on_video_clock(track, clock, files[0].name)
             elif not accept:
                 _check_length(track, duration_s, files[0].name)
-            if _telemetry_names(info):
-                note = f"read from {files[0].name}; data tracks of the video are not used"
+            unused = [file.name for file in files[1:]]
+            unused += ["data tracks of the video"] if _telemetry_names(info) else []
+            if unused:
+                note = f"read from {files[0].name}; not used: {', '.join(unused)}"
                 track = replace(track, notes=(*track.notes, note))
         elif embedded:
             track = _own_telemetry(part, info, failures)

@@ -44,7 +44,7 @@ def read_camm(packets: Sequence[DataPacket], source: str) -> Telemetry:
     for packet in packets:
         if not (math.isfinite(packet.time_s) and len(packet.payload) in (28, 60)):
             continue
-        records_of_kind = by_type.get(packet.payload[2])  # little-endian, below 8
+        records_of_kind = by_type.get(int.from_bytes(packet.payload[2:4], "little"))
         if records_of_kind is None:
             continue
         try:

@@ -12,7 +12,14 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.telemetry.accuracy import FIX_2D, FIX_3D, sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
-from spn_data.telemetry.flight_log import LoggedFixes, Series, check_size, log_track, utc_from_gps
+from spn_data.telemetry.flight_log import (
+    LoggedFixes,
+    Series,
+    check_count,
+    check_size,
+    log_track,
+    utc_from_gps,
+)
 from spn_data.telemetry.track import Telemetry
 
 HEAD = b"\xa3\x95"
@@ -61,6 +68,7 @@ def read_dataflash(path: Path) -> Telemetry:
         notes.append(f"only the first {_MAX_MESSAGE_BYTES / 1e6:.0f} MB of its records are used")
     tables = log.tables()
     gps, gps_notes = _receiver(tables, path)
+    check_count(len(gps["TimeUS"]), path)
     camera = tables.get("CAM", {}).get("TimeUS", np.empty(0))
     if len(camera):
         first_s = (camera[0] - gps["TimeUS"][0]) * _US

@@ -14,7 +14,7 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.media.extras import import_extra
 from spn_data.telemetry.accuracy import FIX_3D, sigma_from_fix
-from spn_data.telemetry.flight_log import MAX_FIXES, LoggedFixes, check_size, log_track
+from spn_data.telemetry.flight_log import LoggedFixes, check_count, check_size, log_track
 from spn_data.telemetry.track import Telemetry
 
 _MAX_BYTES = 100_000_000  # a day of records each second has some megabytes
@@ -97,8 +97,7 @@ def _collect(
             time_s = _time(frame)
             utc_s += time_s % 1.0
             rows[number].append((time_s, lat, lon, height_m, _number(frame, "gps_accuracy"), utc_s))
-            if len(rows[number]) > MAX_FIXES:
-                raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
+            check_count(len(rows[number]), path)
 
 
 def _time(frame: Any) -> float:

@@ -113,8 +113,7 @@ def log_track(
     InputError
         If there are too many records, or none has a time.
     """
-    if len(fixes.time_s) > MAX_FIXES:
-        raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
+    check_count(len(fixes.time_s), path)
     found = [*notes]
     time_s = fixes.time_s
     near = np.isfinite(time_s)
@@ -259,6 +258,12 @@ def check_size(path: Path, max_bytes: int = MAX_LOG_BYTES) -> int:
             path=path,
         )
     return size
+
+
+def check_count(fixes: int, path: Path) -> None:
+    """Raise InputError if there are too many position records."""
+    if fixes > MAX_FIXES:
+        raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
 
 
 @contextlib.contextmanager

@@ -14,10 +14,10 @@ from spn_data.errors import InputError
 from spn_data.telemetry.accuracy import FIX_2D, FIX_3D, sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
 from spn_data.telemetry.flight_log import (
-    MAX_FIXES,
     LoggedFixes,
     Series,
     absolute_heights,
+    check_count,
     check_size,
     gimbal_angles,
     log_track,
@@ -35,6 +35,7 @@ _THIN_US = 90_000  # interval of messages other than positions
 # A time of the years 2000 to 2100 in microseconds since 1970, and the first byte of a MAVLink message.
 _START = re.compile(rb"\x00[\x03-\x0e].{6}[\xfd\xfe]", re.DOTALL)
 _BLOCK_BYTES = 4_000_000
+_MAX_MESSAGES = 2_000_000  # of all vehicles, some hours
 _REBOOT_S = 5.0  # by which the time since boot steps back if the autopilot was restarted
 _NO_AUTOPILOT = 8  # in heartbeats of ground stations, cameras and gimbals
 _NAN = float("nan")
@@ -113,7 +114,7 @@ class _Log:
     def __init__(self, mavlink: Any):
         self._mavlink = mavlink
         self._last_us: Counter[tuple[int, int, int]] = Counter()
-        self.damaged = 0
+        self.damaged = self.kept = 0
         self.vehicles: dict[int, _Vehicle] = {}
 
     def wants(self, received_us: int, system: int, component: int, number: int) -> bool:
@@ -136,6 +137,12 @@ class _Log:
 
     def add(self, received_us: int, message: Any, path: Path) -> None:
         """Keep the values of a message."""
+        self.kept += 1
+        if self.kept > _MAX_MESSAGES:
+            raise InputError(
+                f"contains more than {_MAX_MESSAGES:,} messages of positions and attitudes",
+                path=path,
+            )
         vehicle = self.vehicles.setdefault(message.get_srcSystem(), _Vehicle())
         number, received_s = message.get_msgId(), received_us * _US
         if number == _HEARTBEAT:
@@ -159,8 +166,7 @@ class _Log:
             vehicle.fixes.append(
                 (boot, time_s, (message.get_srcComponent(), *_gps_values(message)))
             )
-            if len(vehicle.fixes) > MAX_FIXES:
-                raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
+            check_count(len(vehicle.fixes), path)
         else:
             values = _values(number, message)
             if hasattr(message, "time_boot_ms"):

@@ -24,9 +24,9 @@ from spn_data.telemetry.accuracy import (
     sigma_from_fix,
 )
 from spn_data.telemetry.flight_log import (
-    MAX_FIXES,
     LoggedFixes,
     absolute_heights,
+    check_count,
     check_size,
     log_track,
 )
@@ -41,7 +41,7 @@ _NAN = math.nan
 _HALF_DAY_S, _DAY_S = 43_200.0, 86_400.0
 
 
-@dataclass
+@dataclass(slots=True)
 class _Epoch:
     """What the sentences of one time of day state."""
 
@@ -99,8 +99,7 @@ def read_nmea(path: Path) -> Telemetry:
     try:
         for line, sentence in _sentences(path):
             _add(log, pynmea2, line, sentence)
-            if len(log.epochs) > MAX_FIXES:
-                raise InputError(f"contains more than {MAX_FIXES:,} position records", path=path)
+            check_count(len(log.epochs), path)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
     positions = [epoch for epoch in log.epochs if epoch.from_gga or epoch.fix != NO_FIX]

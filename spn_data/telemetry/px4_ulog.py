@@ -18,6 +18,7 @@ from spn_data.telemetry.flight_log import (
     Series,
     absolute_heights,
     camera_angles,
+    check_count,
     check_size,
     gimbal_angles,
     log_track,
@@ -77,6 +78,7 @@ def read_ulog(path: Path) -> Telemetry:
         if "timestamp" in data.data
     }
     table, choice_notes = _positions(tables, path)
+    check_count(len(table["timestamp"]), path)
     return _track(path, table, tables, (*notes, *choice_notes))
 
 

@@ -108,6 +108,14 @@ def test_a_flight_log_is_put_on_the_clock_of_its_video(tmp_path: Path, write: An
     np.testing.assert_allclose(at.lat_lon_deg[:, 1], flight.lon_deg[[15, 20, 40]], atol=2e-7)
 
 
+def test_of_several_logs_those_not_used_are_named(tmp_path: Path) -> None:
+    """A video with two logs of its name says which one is used and which is not."""
+    write_video(tmp_path / "flight.mp4", "2026-05-01T10:00:05Z")
+    for name in ("flight.gpx", "flight.csv"):
+        (tmp_path / name).write_text(LOGS[name])
+    assert "read from flight.csv; not used: flight.gpx" in telemetry_in(tmp_path).notes
+
+
 def test_a_log_is_put_on_the_clock_of_its_photos(tmp_path: Path) -> None:
     """Times of a log in a folder of photos count from the time of the first photo."""
     for second in (4, 6):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from spn_data.capture.sources import discover
 from spn_data.inputs.flight_telemetry import unread_tracks
-from tests.worlds.data_track_videos import write_klv_video
+from tests.worlds.data_track_videos import write_data_video
 
 
 def test_a_gopro_video_whose_track_is_read_has_no_note(shared_data: Path) -> None:
@@ -17,7 +17,7 @@ def test_a_gopro_video_whose_track_is_read_has_no_note(shared_data: Path) -> Non
 
 def test_a_klv_track_without_positions_is_named(tmp_path: Path) -> None:
     """A note names a KLV track that holds no position."""
-    write_klv_video(tmp_path / "a.ts", [(0.0, b"not a MISB set")])
+    write_data_video(tmp_path / "a.ts", [(0.0, b"not a MISB set")])
     (source,) = discover(tmp_path / "a.ts").sources
     (note,) = unread_tracks(source)
     assert note.startswith("a: ")

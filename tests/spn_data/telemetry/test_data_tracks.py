@@ -167,6 +167,9 @@ def test_camm_positions_have_accuracy_lock_and_height_reference() -> None:
     short = read_camm([_packet(struct.pack("<HHddd", 0, 5, 48.1, 11.5, -1.0))], "a.mp4")
     assert np.isnan(short.abs_alt_m).all()
     assert short.abs_reference is HeightReference.UNKNOWN
+    other = camm_packet(3)[:3] + b"\1" + camm_packet(3)[4:]  # of type 262
+    with pytest.raises(InputError, match="CAMM track holds no positions"):
+        read_camm([_packet(other)], "a.mp4")
 
 
 def test_misb_items_have_the_values_of_the_standard() -> None:

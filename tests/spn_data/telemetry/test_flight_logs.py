@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spn_data.capture.sources import discover
+from spn_data.capture.sources import LOG_SUFFIXES, discover
 from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.rotations import rotations_from_angles
@@ -22,7 +22,7 @@ from spn_data.telemetry import ulog_messages
 from spn_data.telemetry.accuracy import sigma_from_fix
 from spn_data.telemetry.autopilot import pymavlink
 from spn_data.telemetry.flight_log import camera_angles, utc_from_gps
-from spn_data.telemetry.read import read_telemetry
+from spn_data.telemetry.read import LOG_READERS, read_telemetry
 from spn_data.telemetry.track import Telemetry
 from tests.worlds.log_files import (
     UTC_S,
@@ -255,6 +255,28 @@ def test_damage_in_the_middle_is_skipped_with_a_note(tmp_path, name):
     track = read_telemetry(tmp_path / name)
     assert len(track) >= 0.4 * len(whole)
     assert any("damaged" in note for note in track.notes)
+
+
+@pytest.mark.parametrize("name", list(WRITERS))
+def test_a_log_of_too_many_records_is_refused(tmp_path, monkeypatch, name):
+    """The bound on position records holds for each kind of log."""
+    WRITERS[name](tmp_path / name, make_flight(count=25))
+    monkeypatch.setattr("spn_data.telemetry.flight_log.MAX_FIXES", 3)
+    with pytest.raises(InputError, match="more than 3 position records"):
+        read_telemetry(tmp_path / name)
+
+
+def test_a_telemetry_log_of_too_many_messages_is_refused(tmp_path, monkeypatch):
+    """The bound on all messages that are kept holds before the file has been read."""
+    write_tlog(tmp_path / "a.tlog", make_flight(count=25))
+    monkeypatch.setattr("spn_data.telemetry.mavlink_tlog._MAX_MESSAGES", 20)
+    with pytest.raises(InputError, match="more than 20 messages"):
+        read_telemetry(tmp_path / "a.tlog")
+
+
+def test_logs_that_are_read_are_found_beside_videos():
+    """The suffixes of logs are the same for finding and for reading them."""
+    assert set(LOG_READERS) == LOG_SUFFIXES
 
 
 @pytest.mark.parametrize("name", list(WRITERS))
