@@ -158,7 +158,7 @@ def _own_telemetry(part: Path, info: VideoInfo, failures: list[str]) -> Telemetr
                 note += "; its data tracks are not used" if _telemetry_names(info) else ""
                 return replace(track, notes=(*track.notes, note))
     try:
-        track = read_embedded(part) if info.data_streams else None
+        track = read_embedded(part) if _telemetry_names(info) else None
     except InputError as error:
         failures.append(str(error))
         track = None

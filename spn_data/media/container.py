@@ -12,6 +12,7 @@ import av
 
 from spn_data.errors import InputError
 
+_DISCARD_ALL = 48  # AVDISCARD_ALL
 # Only self-contained formats: a playlist or script could refer to other files or hosts.
 _DEMUXERS = "mov,matroska,webm,mpegts,mpeg,avi,asf,flv,h264,hevc,mpegvideo,ogg,mxf"
 
@@ -51,9 +52,13 @@ def open_tracks(path: Path, what: str) -> Iterator[Any]:
 def packets(container: Any, streams: Sequence[Any]) -> Iterator[Any]:
     """Yield the packets of streams in the order of the file, and at its end an empty one for each.
 
-    Tracks that appear while the file is read are left out: PyAV does not know them, and fails at the end of
-    the file, after the packets of all others.
+    Other streams are skipped, where the format allows without reading them. Tracks that appear while the file
+    is read are left out: PyAV does not know them, and fails at the end of the file, after the packets of all
+    others.
     """
+    for stream in container.streams:
+        if stream not in streams and hasattr(stream, "discard"):  # since PyAV 18
+            stream.discard = _DISCARD_ALL
     demuxed = container.demux(streams)
     while True:
         try:

@@ -157,6 +157,20 @@ def test_the_karma_clip_gives_the_fixes_of_its_drone(shared_data: Path) -> None:
     )
 
 
+@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="only Linux counts what is read")
+def test_pictures_are_skipped_while_data_tracks_are_read(shared_data: Path) -> None:
+    """The track of a video, of a few percent of its bytes, is read without the rest."""
+
+    def bytes_read() -> int:
+        words = Path("/proc/self/io").read_text().split()
+        return int(words[words.index("rchar:") + 1])
+
+    path = shared_data / "video" / "gopro-karma.mp4"
+    before = bytes_read()
+    assert read_data_tracks(path)
+    assert bytes_read() - before < path.stat().st_size / 4
+
+
 def test_camm_positions_have_accuracy_lock_and_height_reference() -> None:
     """A CAMM packet with accuracy gives position and sigma; one without a lock has no position."""
     track = read_camm([_packet(camm_packet(3)), _packet(camm_packet(0), 1.0)], "a.mp4")
