@@ -41,12 +41,12 @@ def open_container(path: Path) -> Any:
 
 @contextmanager
 def open_tracks(path: Path, what: str) -> Iterator[Any]:
-    """Open a container for its tracks other than pictures; damage is an InputError that names `what`."""
+    """Open a container for its subtitles or data tracks; damage is an InputError that names `what`."""
     try:
         with open_container(path) as container:
             yield container
     except (av.error.FFmpegError, OSError) as error:
-        raise InputError(f"{what} cannot be read: {error.strerror}", path=path) from error
+        raise InputError(f"its {what} cannot be read: {error.strerror}", path=path) from error
 
 
 def packets(container: Any, streams: Sequence[Any]) -> Iterator[Any]:

@@ -71,7 +71,7 @@ def read_data_tracks(path: Path) -> list[DataTrack]:
     InputError
         If the file is not a video, or the tracks exceed the limits.
     """
-    with open_tracks(path, "its data tracks") as container:
+    with open_tracks(path, "data tracks") as container:
         streams = [s for s in container.streams if s.type == "data"]
         if not streams:
             return []

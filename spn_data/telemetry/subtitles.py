@@ -36,7 +36,7 @@ def read_subtitles(path: Path | str) -> Telemetry | None:
     InputError
         If the subtitles contain no telemetry, or the file is not a video.
     """
-    with open_tracks(Path(path), "its subtitles") as container:
+    with open_tracks(Path(path), "subtitles") as container:
         streams = [
             s
             for s in container.streams.subtitles
