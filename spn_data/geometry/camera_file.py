@@ -14,6 +14,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.json_values import numbers
 
 _MAX_BYTES = 100_000
+SHAPE_TOLERANCE = 0.01  # relative, between the aspect ratios of a given camera and of images
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -85,7 +86,9 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         ) from error
 
 
-def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
+def camera_at_size(
+    camera: Camera, width: int, height: int, where: Path | str | None = None
+) -> Camera:
     """Rescale a given camera to the size of the images it is used for.
 
     Parameters
@@ -94,7 +97,7 @@ def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -
         The camera that the user gave.
     width, height : int
         Size of the images.
-    where : Path or str
+    where : Path or str, optional
         File or sequence named in the error message.
 
     Raises
@@ -102,7 +105,7 @@ def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -
     InputError
         If the aspect ratios differ by more than 1 %.
     """
-    if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
+    if abs(camera.width * height / (camera.height * width) - 1) > SHAPE_TOLERANCE:
         raise InputError(
             f"the given camera is for {camera.width}x{camera.height} images, these are {width}x{height}",
             path=where,
