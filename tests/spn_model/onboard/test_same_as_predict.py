@@ -120,7 +120,7 @@ def test_a_mirrored_video_is_refused_on_board(tmp_path):
     """OpenCV would turn a mirrored video by 180 degrees instead."""
     path = write_clip(tmp_path / "a.mp4", mirrored=True)
     assert len(list(video.decode(path))) == 8
-    with pytest.raises(InputError, match="a.mp4: is a video whose display matrix mirrors it"):
+    with pytest.raises(InputError, match=r"a\.mp4: is a video whose display matrix mirrors it"):
         next(sources.frames(path))
 
 
