@@ -29,10 +29,11 @@ from spn_data.area.names import (
     STAGES,
     TRACKED,
 )
+from spn_data.area.stage_counts import check_counts
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError, InUseError, StageError
 from spn_data.storage.files import LOCK, locked, make_folder
-from spn_data.storage.json_files import VERSION, write_json
+from spn_data.storage.json_files import VERSION, reporting_damage, write_json
 from spn_data.storage.stage_record import (
     StageRecord,
     current_stage,
@@ -179,6 +180,8 @@ class Area:
         record = read_record(path)
         if current_stage(record.stage).partition("/")[0] != stage.partition("/")[0]:
             raise FormatError(f"{path}: is the record of another stage, {record.stage!r:.60}")
+        with reporting_damage(path, "a record of a stage"):
+            check_counts(stage, record.counts)
         return record
 
     def stale_because(self, stage: str) -> str | None:

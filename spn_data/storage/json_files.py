@@ -142,8 +142,12 @@ def finite_or_none(value: float | np.floating[Any]) -> float | None:
 
 
 def number_or(value: float | None, unknown: float = math.nan) -> float:
-    """Return a number read from JSON as a float, or `unknown` for null."""
-    return unknown if value is None else float(value)
+    """Return a number read from JSON as a float, or `unknown` for null; raise TypeError for anything else."""
+    if value is None:
+        return unknown
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{kind_of(value)} instead of a number")
+    return float(value)
 
 
 def finite(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -29,11 +30,6 @@ _PARTS: dict[str, type] = {
 _HELD: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("inputs", "upstream", "versions", "notes"), str),
     **dict.fromkeys(("seconds", "cpu_seconds"), (int, float)),
-}
-# Counts that are numbers in every stage that has them.
-_NUMBERS = {
-    *("chosen", "candidates", "with_fix", "unreadable"),
-    *("registered", "frames", "points", "mean_error_px"),
 }
 
 
@@ -103,10 +99,6 @@ def read_record(path: Path) -> StageRecord:
             wanted = _PARTS.get(name)
             if wanted is not None:
                 _check(name, value, wanted)
-        for name in _NUMBERS & set(table.get("counts", {})):
-            value = table["counts"][name]
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise TypeError(f"the count {name!r} is {kind_of(value)}")
         del table["version"]
         return StageRecord(
             **{
@@ -142,6 +134,8 @@ def _check(name: str, value: Any, wanted: type) -> None:
     for item in items:
         if not isinstance(item, held) or (isinstance(item, bool) and held is not object):
             raise TypeError(f"{name!r} holds {kind_of(item)}")
+        if isinstance(item, int | float) and held == (int, float) and not 0 <= item < math.inf:
+            raise ValueError(f"{name!r} holds {item!r:.40}")
 
 
 def current_stage(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Checks of what a worker answers, before it is stored: a worker of a cluster may be another machine's program."""
+"""Checks of what a worker answers, before it is stored: on a cluster, it may be a broken machine."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def check_rows(value: Any, what: str, dtype: type, columns: int, most: int) -> N
 
 
 def check_indices(value: Any, what: str, dtype: type, below: tuple[int, int], most: int) -> None:
-    """Check pairs of indices (N, 2), each column from 0 to below a bound; raise WrongAnswerError otherwise."""
+    """Check pairs of indices (N, 2), each column below its bound; raise WrongAnswerError otherwise."""
     check_rows(value, what, dtype, 2, most)
     if len(value) and (value.min() < 0 or (value.max(axis=0) >= below).any()):
         raise WrongAnswerError(f"{what} refer to rows that do not exist")
