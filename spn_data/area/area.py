@@ -251,7 +251,7 @@ class Area:
         )
         if self.has(stage):
             found = self.record(stage)
-            if found.made_of == record.made_of:
+            if found.is_made_as(record):
                 _logger.debug("%s: up to date", stage)
                 return found
             if not overwrite:
@@ -265,7 +265,7 @@ class Area:
         resumed = started.exists()
         if resumed:
             found = read_record(started)
-            if found.made_of != record.made_of:
+            if not found.is_made_as(record):
                 if not overwrite and _has_files(path):
                     raise StageError(
                         f"{path} contains unfinished work that {difference(found, record)}; "

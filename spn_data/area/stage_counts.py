@@ -9,8 +9,8 @@ from typing import Any
 from spn_data.area.names import EVALUATION, FRAMES, GEO, MODEL, SPLIT, TRACKED
 from spn_data.storage.json_files import kind_of
 
-# Kinds of single values. A list of one kind holds any number of it, a longer one exactly these; an object with
-# the name "*" holds any names, a name that ends with "?" may be missing, and other names are not read.
+# Kinds of single values. A list of one kind holds any number of it, a longer one exactly these; an object
+# with the name "*" holds any names, a name that ends with "?" may be missing, and others are not read.
 COUNT, KNOWN, NUMBER, TEXT, FLAG = (
     "a count",
     "a number",

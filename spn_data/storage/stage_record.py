@@ -70,16 +70,17 @@ class StageRecord:
     versions: dict[str, str] = field(default_factory=dict)
     finished: str = ""
 
-    @property
-    def made_of(self) -> dict[str, Any]:
-        """Options, inputs and upstream stages under current names; if equal, the result would be equal."""
-        upstream = {current_stage(name): value for name, value in self.upstream.items()}
-        made_of = {
-            "options": current_options(self.options),
-            "inputs": self.inputs,
-            "upstream": upstream,
-        }
-        return dict(json.loads(json.dumps(made_of)))
+    def is_made_as(self, other: StageRecord) -> bool:
+        """Whether options, inputs and upstream stages are the same under current names.
+
+        An option that is null is the same as one that the program did not know yet.
+        """
+        mine, theirs = (json.loads(json.dumps(current_options(r.options))) for r in (self, other))
+        return (
+            not any(_changed_options(mine, theirs))
+            and self.inputs == other.inputs
+            and _current_upstream(self) == _current_upstream(other)
+        )
 
     def fingerprint(self) -> str:
         """Return a hash that changes whenever the stage is redone from other options, inputs or stages."""
@@ -152,6 +153,10 @@ def current_options(options: Mapping[str, Any]) -> dict[str, Any]:
         else value
         for name, value in options.items()
     }
+
+
+def _current_upstream(record: StageRecord) -> dict[str, str]:
+    return {current_stage(name): value for name, value in record.upstream.items()}
 
 
 def versions() -> dict[str, str]:

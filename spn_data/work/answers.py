@@ -68,7 +68,7 @@ def check_complete(asked: set[Any]) -> None:
         )
 
 
-def check_kind(value: Any, kind: type, length: int | None = None) -> None:
+def check_kind(value: Any, kind: type[Any], length: int | None = None) -> None:
     """Check the type and the length of an answer; raise WrongAnswerError otherwise."""
     if type(value) is not kind:
         raise WrongAnswerError(f"{type(value).__name__} instead of {kind.__name__}")
