@@ -146,7 +146,9 @@ class GeoFit:
             return cls(
                 Similarity.from_json({**similarity, "translation": similarity["translation_m"]}),
                 GeoOrigin(
-                    *(float(numbers(origin[name])) for name in ("lat_deg", "lon_deg", "alt_m")),
+                    float(numbers(origin["lat_deg"])),
+                    float(numbers(origin["lon_deg"])),
+                    float(numbers(origin["alt_m"])),
                     HeightReference(origin["height_reference"]),
                 ),
                 {name: number_or(m) for name, m in value["vertical_offsets_m"].items()},
