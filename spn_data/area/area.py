@@ -29,10 +29,11 @@ from spn_data.area.names import (
     STAGES,
     TRACKED,
 )
+from spn_data.area.stage_counts import check_counts
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError, InUseError, StageError
 from spn_data.storage.files import LOCK, locked, make_folder
-from spn_data.storage.json_files import VERSION, write_json
+from spn_data.storage.json_files import VERSION, reporting_damage, write_json
 from spn_data.storage.stage_record import (
     StageRecord,
     current_stage,
@@ -179,6 +180,8 @@ class Area:
         record = read_record(path)
         if current_stage(record.stage).partition("/")[0] != stage.partition("/")[0]:
             raise FormatError(f"{path}: is the record of another stage, {record.stage!r:.60}")
+        with reporting_damage(path, "a record of a stage"):
+            check_counts(stage, record.counts)
         return record
 
     def stale_because(self, stage: str) -> str | None:
@@ -248,7 +251,7 @@ class Area:
         )
         if self.has(stage):
             found = self.record(stage)
-            if found.made_of == record.made_of:
+            if found.is_made_as(record):
                 _logger.debug("%s: up to date", stage)
                 return found
             if not overwrite:
@@ -262,7 +265,7 @@ class Area:
         resumed = started.exists()
         if resumed:
             found = read_record(started)
-            if found.made_of != record.made_of:
+            if not found.is_made_as(record):
                 if not overwrite and _has_files(path):
                     raise StageError(
                         f"{path} contains unfinished work that {difference(found, record)}; "

@@ -118,6 +118,15 @@ class DecodeReport:
     expected_frames: int = 0  # as stated by the container; 0 if it does not say
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def early_end(self) -> str:
+        """What is missing, if clearly fewer frames were decoded than the container states; else ""."""
+        missing = self.expected_frames - self.frames - self.out_of_order
+        # Edit lists often cut a frame or two at the ends.
+        if missing <= max(2, 0.01 * self.expected_frames):
+            return ""
+        return f"only {self.frames} of {self.expected_frames} frames can be decoded: damaged or truncated"
+
 
 def probe(path: Path) -> VideoInfo:
     """Read the properties of a video and decode its first frame.
@@ -218,10 +227,8 @@ def decode(
         if not is_wanted:
             yield item
             continue
-        # Untagged video of 720 lines or more is BT.709 by convention; swscale would assume BT.601.
-        tagged = int(frame.colorspace) != 2
-        source = None if tagged or frame.height < 720 else "ITU709"
-        image = frame.to_ndarray(format="bgr24", src_colorspace=source)
+        # Conversion and interpolation of chroma are those of OpenCV, which decodes on board.
+        image = frame.to_ndarray(format="bgr24", interpolation="BICUBIC")
         image = orientation.apply(image)
         if image.shape[:2] != (item.height, item.width):
             image = cv2.resize(image, (item.width, item.height), interpolation=cv2.INTER_CUBIC)
@@ -300,12 +307,8 @@ def _add_notes(report: DecodeReport) -> None:
         report.notes.append(
             f"{report.out_of_order} frames dropped because their timestamps did not increase"
         )
-    missing = report.expected_frames - report.frames - report.out_of_order
-    # Edit lists often cut a frame or two at the ends.
-    if missing > max(2, 0.01 * report.expected_frames):
-        report.notes.append(
-            f"only {report.frames} of {report.expected_frames} frames can be decoded: damaged or truncated"
-        )
+    if report.early_end:
+        report.notes.append(report.early_end)
 
 
 def _first_frame(container: Any, stream: Any, path: Path) -> Any:

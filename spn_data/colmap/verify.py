@@ -13,6 +13,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.matching.features import Features
 from spn_data.matching.guided import match_guided
 from spn_data.matching.putative import MatchOptions, PutativeMatcher
+from spn_data.work.answers import WrongAnswerError, check_indices, check_kind
 
 _logger = logging.getLogger(__name__)
 
@@ -75,6 +76,24 @@ def native_camera(camera: Camera, *, camera_id: int = 1, focal_is_known: bool) -
         params=camera.params,
         has_prior_focal_length=focal_is_known,
     )
+
+
+def check_pair(pair: VerifiedPair, sizes: dict[int, int]) -> None:
+    """Check a pair that a worker matched; raise WrongAnswerError if it cannot be.
+
+    sizes : number of features of each image, by its id.
+    """
+    below = (sizes[pair.image_ids[0]], sizes[pair.image_ids[1]])
+    for what in ("matches", "inliers"):
+        check_indices(getattr(pair, what), what, np.uint32, below, sum(below))
+    configs = [int(value) for value in pycolmap.TwoViewGeometryConfiguration.__members__.values()]
+    if type(pair.config) is not int or pair.config not in configs:
+        raise WrongAnswerError(f"a configuration {pair.config!r:.60}")
+    for matrix in (pair.e, pair.f, pair.h):
+        if matrix is not None:
+            check_kind(matrix, np.ndarray)
+            if matrix.shape != (3, 3) or matrix.dtype != np.float64:
+                raise WrongAnswerError(f"a matrix of shape {matrix.shape} and {matrix.dtype}")
 
 
 def match_pairs(

@@ -13,7 +13,7 @@ import numpy as np
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.storage.json_files import parse_json
+from spn_data.geometry.json_values import parse_json
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,10 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.json_values import numbers
+from spn_data.geometry.json_values import numbers, parse_file
 
 _MAX_BYTES = 100_000
+SHAPE_TOLERANCE = 0.01  # relative, between the aspect ratios of a given camera and of images
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -73,10 +73,8 @@ def read_camera(path: str | PathLike[str]) -> Camera:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError("is too large for a camera file", path=path)
-        return camera_from_json(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        return camera_from_json(parse_file(path, max_bytes=_MAX_BYTES))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)[:200]
         raise InputError(
             f"does not contain a camera ({why}); expected model, width, height and params "
@@ -85,7 +83,9 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         ) from error
 
 
-def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -> Camera:
+def camera_at_size(
+    camera: Camera, width: int, height: int, where: Path | str | None = None
+) -> Camera:
     """Rescale a given camera to the size of the images it is used for.
 
     Parameters
@@ -94,7 +94,7 @@ def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -
         The camera that the user gave.
     width, height : int
         Size of the images.
-    where : Path or str
+    where : Path or str, optional
         File or sequence named in the error message.
 
     Raises
@@ -102,7 +102,7 @@ def camera_at_size(camera: Camera, width: int, height: int, where: Path | str) -
     InputError
         If the aspect ratios differ by more than 1 %.
     """
-    if abs(camera.width * height / (camera.height * width) - 1) > 0.01:
+    if abs(camera.width * height / (camera.height * width) - 1) > SHAPE_TOLERANCE:
         raise InputError(
             f"the given camera is for {camera.width}x{camera.height} images, these are {width}x{height}",
             path=where,

@@ -10,10 +10,11 @@ import numpy as np
 
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.json_values import numbers
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
-from spn_data.storage.json_files import finite_or_none, number_or
+from spn_data.storage.json_files import DAMAGE, finite_or_none, kind_of, number_or
 
 VERSION = 1
 
@@ -145,14 +146,14 @@ class GeoFit:
             return cls(
                 Similarity.from_json({**similarity, "translation": similarity["translation_m"]}),
                 GeoOrigin(
-                    float(origin["lat_deg"]),
-                    float(origin["lon_deg"]),
-                    float(origin["alt_m"]),
+                    float(numbers(origin["lat_deg"])),
+                    float(numbers(origin["lon_deg"])),
+                    float(numbers(origin["alt_m"])),
                     HeightReference(origin["height_reference"]),
                 ),
                 {name: number_or(m) for name, m in value["vertical_offsets_m"].items()},
                 _array(value["residuals_m"], 3),
-                np.array(value["outlier"], dtype=bool),
+                _flags(value["outlier"]),
                 _array(value["gravity_deg"], 2),
                 {name: _triple(v) for name, v in value["gimbal_bias_deg"].items()},
                 {name: (number_or(v[0]), number_or(v[1])) for name, v in value["noise_m"].items()},
@@ -168,10 +169,10 @@ class GeoFit:
                 HeldOut(**_numbers(value["held_out_blocks"])),
                 HeldOut(**_numbers(value["held_out_flights"])),
                 FitSummary(**_numbers(value["summary"])),
-                tuple(str(o) for o in value["observations"]),
-                tuple(str(n) for n in value["notes"]),
+                _texts(value["observations"]),
+                _texts(value["notes"]),
             )
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        except DAMAGE as error:
             raise FormatError(f"damaged georegistration: {type(error).__name__} {error}") from error
 
 
@@ -196,10 +197,30 @@ def _triple(value: Any) -> tuple[float, float, float]:
 
 
 def _array(rows: Any, width: int, unknown: float = math.nan) -> np.ndarray:
-    flat = [[unknown if v is None else float(v) for v in row] for row in rows]
+    if not isinstance(rows, list):
+        raise TypeError(f"{kind_of(rows)} instead of a list")
+    flat = [[number_or(v, unknown) for v in row] for row in rows]
     return np.array(flat, dtype=np.float64).reshape(len(flat), width)
 
 
 def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
     counts = ("folds", "frames", "fixes", "outliers")
-    return {k: int(v) if k in counts else number_or(v) for k, v in fields.items()}
+    return {k: _count(v) if k in counts else number_or(v) for k, v in fields.items()}
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise TypeError(f"{value!r:.40} instead of a count")
+    return value
+
+
+def _flags(values: Any) -> np.ndarray:
+    if not isinstance(values, list) or not all(isinstance(v, bool) for v in values):
+        raise TypeError("not a list of true and false")
+    return np.array(values, dtype=bool)
+
+
+def _texts(values: Any) -> tuple[str, ...]:
+    if not isinstance(values, list) or not all(isinstance(v, str) for v in values):
+        raise TypeError("not a list of texts")
+    return tuple(values)

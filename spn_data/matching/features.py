@@ -9,6 +9,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera import colmap_pixels
+from spn_data.work.answers import WrongAnswerError, check_kind, check_rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +52,16 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+
+def check_features(features: object, options: FeatureOptions) -> None:
+    """Check features that a worker extracted; raise WrongAnswerError if they cannot be."""
+    check_kind(features, Features)
+    assert isinstance(features, Features)
+    check_rows(features.keypoints, "keypoints", np.float32, 4, options.max_features)
+    check_rows(features.descriptors, "descriptors", np.uint8, 128, options.max_features)
+    if len(features.keypoints) != len(features.descriptors):
+        raise WrongAnswerError("numbers of keypoints and descriptors differ")
 
 
 def extract_from_bytes(

@@ -227,12 +227,10 @@ def _check_map_unchanged(area: Area) -> AuditFinding:
         for name in area.sequences(group):
             path = area.folder(f"{group}/{name}") / REGISTRATION
             recorded = read_json(path)
-            try:
-                hashes[f"{group}/{name}"] = MapHashes(
-                    str(recorded["map_before"]), str(recorded["map_after"])
-                )
-            except KeyError as error:
-                raise FormatError(f"{path}: does not state {error}") from error
+            before, after = recorded.get("map_before"), recorded.get("map_after")
+            if not (isinstance(before, str) and isinstance(after, str)):
+                raise FormatError(f"{path}: does not state the hashes of the map")
+            hashes[f"{group}/{name}"] = MapHashes(before, after)
     return check_map_unchanged(map_hash(area.folder(MODEL)), hashes)
 
 

@@ -116,8 +116,6 @@ def register(
     source = find_source(area, video, name)
     given = None if options.camera_file is None else read_camera(Path(options.camera_file))
     made_with = {**asdict(options), "camera_file": None if given is None else camera_to_json(given)}
-    if options.time_offset_s is None:
-        del made_with["time_offset_s"]  # unknown to earlier versions, whose results are equal
     stage = f"{EVALUATION}/{source.sequence}"
     inputs = fingerprints((source,), {})
     work = area.begin(stage, made_with, inputs, overwrite=overwrite)

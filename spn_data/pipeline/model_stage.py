@@ -37,7 +37,7 @@ from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
-from spn_data.storage.stage_record import StageRecord
+from spn_data.storage.stage_record import StageRecord, current_options
 from spn_data.work.timing import Progress, Stopwatch
 
 
@@ -102,8 +102,8 @@ def build_model(
 
 def _reuse_features(extend: Area, work: StageWork) -> tuple[str, ...]:
     """Copy features and matches of an area; return a note if they were computed with other options."""
-    before = extend.record(MODEL).made_of["options"]
-    now = work.record.made_of["options"]
+    before = current_options(extend.record(MODEL).options)
+    now = current_options(work.record.options)
     for group in ("features", "matching"):
         for name, value in now[group].items():
             if before[group].get(name) != value:

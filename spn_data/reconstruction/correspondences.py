@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.database import MapDatabase
-from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
+from spn_data.colmap.verify import ImageForMatching, VerifiedPair, check_pair, match_pairs
 from spn_data.geometry.camera import Camera
-from spn_data.matching.features import FeatureOptions, Features, extract_from_bytes
+from spn_data.matching.features import FeatureOptions, Features, check_features, extract_from_bytes
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_data.matching.putative import MatchOptions
+from spn_data.work.answers import check_asked, check_complete, check_kind
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
 
@@ -80,13 +81,19 @@ def extract_missing(
             encoded_mask = None if mask is None else mask.read_bytes()
             yield name, (name, (frames.folder / name).read_bytes(), encoded_mask, options)
 
+    asked = {name for name, _ in missing}
+
     def store(result: tuple[str, Features]) -> None:
         nonlocal done
+        check_kind(result, tuple, 2)
+        check_asked(result[0], asked)
+        check_features(result[1], options)
         database.write_features(*result)
         done += 1
         progress("features", done, len(frames.names))
 
     dispatch(extract_from_bytes, batches(), store)
+    check_complete(asked)
 
 
 _VOCABULARY_FRAMES = 200  # whose descriptors the visual words are learnt from
@@ -136,6 +143,8 @@ def match_missing(
     done = len(pairs) - len(missing)
     cache: dict[int, Features] = {}
 
+    sizes: dict[int, int] = {}  # of each image id, the number of its features
+
     def image(i: int) -> ImageForMatching:
         camera, focal_is_known = frames.start_cameras[str(frames.cameras[i])]
         return ImageForMatching(cache[i], camera, focal_is_known)
@@ -148,15 +157,24 @@ def match_missing(
                 del cache[i]
             for i in needed - set(cache):
                 cache[i] = database.read_features(frames.names[i])
+                sizes[ids[i]] = len(cache[i])
             images = {ids[i]: image(i) for i in sorted(needed)}
             label = f"matching {frames.names[batch[0][0]]} and {len(batch)} others"
             yield label, (images, [(ids[i], ids[j]) for i, j in batch], options)
 
+    asked = {(ids[i], ids[j]) for i, j in missing}
+
     def store(result: list[VerifiedPair]) -> None:
         nonlocal done
+        check_kind(result, list)
+        for pair in result:
+            check_kind(pair, VerifiedPair)
+            check_asked(pair.image_ids, asked)
+            check_pair(pair, sizes)
         for pair in result:
             database.write_pair(pair)
         done += len(result)
         progress("matching", done, len(pairs))
 
     dispatch(match_pairs, batches(), store)
+    check_complete(asked)

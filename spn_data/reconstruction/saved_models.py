@@ -6,8 +6,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+from spn_data.geometry.json_values import parse_file
 from spn_data.storage.files import write_atomically
-from spn_data.storage.json_files import load_json, parse_file, reporting_damage
+from spn_data.storage.json_files import load_json, reporting_damage
 
 _MAX_BYTES = 1_000_000
 _MODELS, _SETTLED = "models.json", "settled.json"

@@ -12,6 +12,7 @@ from spn_data.matching.putative import MatchOptions, match_descriptors
 from spn_data.registration.frozen_map import FrozenMap, MapFrame
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.storage.files import atomic_writer
+from spn_data.work.answers import check_asked, check_complete, check_indices, check_kind
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
 
@@ -65,12 +66,15 @@ def match_missing_to_map(
     files = {name: folder / f"{name.replace('/', '-')}.npy" for name in names}
     missing = [name for name in names if not files[name].exists()]
     done = len(names) - len(missing)
+    sizes: dict[str, int] = {}  # number of features of each frame
+    asked = set(missing)
 
     def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
         for start in range(0, len(missing), _FRAMES_PER_BATCH):
             batch = []
             for name in missing[start : start + _FRAMES_PER_BATCH]:
                 descriptors = database.read_features(name).descriptors
+                sizes[name] = len(descriptors)
                 batch.append((name, descriptors, frozen.similar(descriptors, options.map_frames)))
             needed = sorted({n for _, _, similar in batch for n in similar})
             yield (
@@ -80,11 +84,19 @@ def match_missing_to_map(
 
     def store(result: list[tuple[str, np.ndarray]]) -> None:
         nonlocal done
-        for name, matches in result:
+        check_kind(result, list)
+        for answer in result:
+            check_kind(answer, tuple, 2)
+            name, matches = answer
+            check_asked(name, asked)
+            below = (sizes[name], len(frozen.points))
+            most = sizes[name] * options.map_frames
+            check_indices(matches, "matches", np.int64, below, most)
             with atomic_writer(files[name]) as file:
                 np.save(file, matches)
         done += len(result)
         progress("map matches", done, len(names))
 
     dispatch(_match_batch, batches(), store)
+    check_complete(asked)
     return {name: np.load(files[name], allow_pickle=False) for name in names}

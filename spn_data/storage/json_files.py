@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import FormatError
+from spn_data.geometry.json_values import parse_file
+from spn_data.geometry.json_values import parse_json as parse_json
 from spn_data.storage.files import write_atomically
 
 VERSION = 1  # of the area's layout and of stage.json
 MAX_BYTES = 500_000_000  # far beyond the files of an area of 100 000 frames
 # Raised when values of a damaged file are used.
 DAMAGE = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
-_MAX_DIGITS = 100  # the state of a random generator needs 39, a float holds 308
 _MAX_TOLD = 200
 _KINDS = {
     dict: "an object",
@@ -69,21 +70,6 @@ def load_json(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     return value
 
 
-def parse_file(path: Path, *, max_bytes: int) -> Any:
-    """Parse a JSON file of any kind of value; raise OSError or ValueError if that is impossible."""
-    if path.stat().st_size > max_bytes:
-        raise ValueError(f"larger than {max_bytes / 1e6:.0f} MB")
-    return parse_json(path.read_text(encoding="utf-8"))
-
-
-def parse_json(text: str) -> Any:
-    """Parse JSON; raise ValueError if it is damaged, nested too deeply, or has too large a number."""
-    try:
-        return json.loads(text, parse_int=_integer, parse_float=_float)
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
-
-
 @contextmanager
 def reporting_damage(path: Path, what: str = "") -> Iterator[None]:
     """Turn what a damaged file's values raise within the block into a FormatError that names the file.
@@ -112,19 +98,6 @@ def kind_of(value: Any) -> str:
     return _KINDS.get(type(value), "a number")
 
 
-def _integer(digits: str) -> int:
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a number of {len(digits)} digits")
-    return int(digits)
-
-
-def _float(digits: str) -> float:
-    value = float(digits)
-    if not math.isfinite(value):
-        raise ValueError(f"{digits[:40]} is too large a number")
-    return value
-
-
 def check_version(path: Path, found: Any) -> None:
     """Raise FormatError if a file's version is newer than this program's, TypeError if it is none."""
     if not isinstance(found, int) or isinstance(found, bool):
@@ -142,8 +115,12 @@ def finite_or_none(value: float | np.floating[Any]) -> float | None:
 
 
 def number_or(value: float | None, unknown: float = math.nan) -> float:
-    """Return a number read from JSON as a float, or `unknown` for null."""
-    return unknown if value is None else float(value)
+    """Return a number read from JSON as a float, or `unknown` for null; raise TypeError for anything else."""
+    if value is None:
+        return unknown
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{kind_of(value)} instead of a number")
+    return float(value)
 
 
 def finite(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -29,11 +30,6 @@ _PARTS: dict[str, type] = {
 _HELD: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("inputs", "upstream", "versions", "notes"), str),
     **dict.fromkeys(("seconds", "cpu_seconds"), (int, float)),
-}
-# Counts that are numbers in every stage that has them.
-_NUMBERS = {
-    *("chosen", "candidates", "with_fix", "unreadable"),
-    *("registered", "frames", "points", "mean_error_px"),
 }
 
 
@@ -74,16 +70,17 @@ class StageRecord:
     versions: dict[str, str] = field(default_factory=dict)
     finished: str = ""
 
-    @property
-    def made_of(self) -> dict[str, Any]:
-        """Options, inputs and upstream stages under current names; if equal, the result would be equal."""
-        upstream = {current_stage(name): value for name, value in self.upstream.items()}
-        made_of = {
-            "options": current_options(self.options),
-            "inputs": self.inputs,
-            "upstream": upstream,
-        }
-        return dict(json.loads(json.dumps(made_of)))
+    def is_made_as(self, other: StageRecord) -> bool:
+        """Whether options, inputs and upstream stages are the same under current names.
+
+        An option that is null is the same as one that the program did not know yet.
+        """
+        mine, theirs = (json.loads(json.dumps(current_options(r.options))) for r in (self, other))
+        return (
+            not any(_changed_options(mine, theirs))
+            and self.inputs == other.inputs
+            and _current_upstream(self) == _current_upstream(other)
+        )
 
     def fingerprint(self) -> str:
         """Return a hash that changes whenever the stage is redone from other options, inputs or stages."""
@@ -103,10 +100,6 @@ def read_record(path: Path) -> StageRecord:
             wanted = _PARTS.get(name)
             if wanted is not None:
                 _check(name, value, wanted)
-        for name in _NUMBERS & set(table.get("counts", {})):
-            value = table["counts"][name]
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise TypeError(f"the count {name!r} is {kind_of(value)}")
         del table["version"]
         return StageRecord(
             **{
@@ -142,6 +135,8 @@ def _check(name: str, value: Any, wanted: type) -> None:
     for item in items:
         if not isinstance(item, held) or (isinstance(item, bool) and held is not object):
             raise TypeError(f"{name!r} holds {kind_of(item)}")
+        if isinstance(item, int | float) and held == (int, float) and not 0 <= item < math.inf:
+            raise ValueError(f"{name!r} holds {item!r:.40}")
 
 
 def current_stage(name: str) -> str:
@@ -158,6 +153,10 @@ def current_options(options: Mapping[str, Any]) -> dict[str, Any]:
         else value
         for name, value in options.items()
     }
+
+
+def _current_upstream(record: StageRecord) -> dict[str, str]:
+    return {current_stage(name): value for name, value in record.upstream.items()}
 
 
 def versions() -> dict[str, str]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.errors import InputError
+from spn_data.work.answers import WrongAnswerError
 from spn_data.work.parallel import Batch, Dispatch, WorkerDiedError, WorkerPool
 
 _logger = logging.getLogger(__name__)
@@ -70,8 +71,8 @@ def run_on_cluster(
     WorkerDiedError
         If a batch killed four workers.
     InputError
-        If there is no such cluster, it has no workers, or a worker has other code or libraries, so that its
-        results could differ.
+        If there is no such cluster, it has no workers, a worker has other code or libraries, so that its
+        results could differ, or `on_result` raises WrongAnswerError.
     """
     with _client(address) as client:
         from distributed import KilledWorker, as_completed
@@ -96,7 +97,14 @@ def run_on_cluster(
             except KilledWorker:
                 raise WorkerDiedError(label) from None
             fill()
-            on_result(result)
+            try:
+                on_result(result)
+            except WrongAnswerError as error:
+                workers = next(iter(client.who_has([future]).values()), ())
+                raise InputError(
+                    f"worker {', '.join(workers) or 'unknown'} answered {label!r} with something else: "
+                    f"{error}; remove it, and use only a cluster that you trust"
+                ) from error
 
 
 def call(expected: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
+from spn_data.geometry.json_values import parse_json
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import parse_json, write_json
+from spn_data.storage.json_files import write_json
 from spn_data.storage.stage_record import versions
 from spn_data.work.timing import Progress
 from spn_model.evaluation.baselines import GEM, VLAD, Describe, Images, gem, most_similar, vlad

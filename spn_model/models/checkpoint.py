@@ -14,8 +14,9 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, nn
 
 from spn_data.errors import FormatError, InputError
+from spn_data.geometry.json_values import parse_json
 from spn_data.storage.files import atomic_writer
-from spn_data.storage.json_files import finite, parse_json
+from spn_data.storage.json_files import finite
 from spn_model.models.pose_model import PoseModel
 from spn_model.models.registry import make
 from spn_model.onboard.view import View

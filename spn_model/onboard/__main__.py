@@ -73,14 +73,20 @@ def _localize_all(given: argparse.Namespace) -> None:
         number = 0
         try:
             for number, time_s, image in frames(source):
-                covered = localizer.renderer(camera, image.shape[1], image.shape[0]).valid.mean()
+                try:
+                    height, width = image.shape[:2]
+                    covered = localizer.renderer(camera, width, height).valid.mean()
+                    located = localizer.localize(image, camera)
+                except InputError as error:
+                    if not number:
+                        raise
+                    located = Located.failed(str(error))  # the size changed within the video
                 if covered < 1 and not noted:
                     sys.stderr.write(
                         f"Note: the camera covers {100 * covered:.0f} % of the view that the network was "
                         "trained on; the rest is black.\n"
                     )
                     noted = True
-                located = localizer.localize(image, camera)
                 sys.stdout.write(line(str(source), number, time_s, located, origin) + "\n")
                 sys.stdout.flush()
                 used, number = used + 1, number + 1

@@ -6,7 +6,6 @@ docs/export.md specifies the format, also for programs in other languages.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -18,6 +17,7 @@ import numpy as np
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
+from spn_data.geometry.json_values import parse_file
 from spn_model.onboard.decoding import DecodingOptions
 from spn_model.onboard.graph_check import check_self_contained
 from spn_model.onboard.view import View
@@ -185,13 +185,11 @@ def read_bundle(folder: Path) -> Bundle:
     if not path.is_file():
         raise InputError(f"is not a bundle: it has no {DOCUMENT}", path=folder)
     try:
-        if path.stat().st_size > _MAX_DOCUMENT_BYTES:
-            raise ValueError(f"it is larger than {_MAX_DOCUMENT_BYTES // 1_000_000} MB")
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = parse_file(path, max_bytes=_MAX_DOCUMENT_BYTES)
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         version = int(document["version"])
-    except (*_DAMAGE, OSError, RecursionError) as error:
+    except (*_DAMAGE, OSError) as error:
         raise FormatError(f"{path}: is not a valid bundle description ({error})") from error
     if version != VERSION:
         raise FormatError(

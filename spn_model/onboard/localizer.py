@@ -12,6 +12,7 @@ import onnxruntime
 
 from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import SHAPE_TOLERANCE
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
@@ -31,7 +32,6 @@ from spn_model.onboard.decoding import decode
 # Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
 # Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
 SAMPLE_STEP_PX = 1.5
-_SHAPE_TOLERANCE = 0.005  # relative, between the aspect ratios of camera file and images
 _FATAL = 4  # log level: errors are raised, and onnxruntime need not print them as well
 
 
@@ -232,7 +232,7 @@ class Localizer:
         """
         key = (camera.model, camera.width, camera.height, camera.params.tobytes(), width, height)
         if key not in self._renderers:
-            if abs(width * camera.height / (height * camera.width) - 1) > _SHAPE_TOLERANCE:
+            if abs(width * camera.height / (height * camera.width) - 1) > SHAPE_TOLERANCE:
                 raise InputError(
                     f"the image is {width}x{height}, but the camera is {camera.width}x{camera.height}; "
                     "give the camera of these images"

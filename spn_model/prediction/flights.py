@@ -229,7 +229,8 @@ def _video_frames(
         assert camera is not None
         chosen = _FrameSelector(choice, count, begin_s)
         times = [0.0, 0.04]
-        for frame in video.decode(part, wanted=chosen.wants):
+        report = video.DecodeReport()
+        for frame in video.decode(part, wanted=chosen.wants, report=report):
             times = [times[-1], frame.time_s] if frame.index else times
             if frame.index in chosen.latest:
                 index = count + frame.index
@@ -247,9 +248,20 @@ def _video_frames(
                     camera,
                     views,
                 )
+        if report.early_end:
+            yield FlightFrame(
+                f"{flight.source.sequence}/{count + report.frames:06d}-rest.jpg",
+                flight.source.sequence,
+                printable_name(part),
+                count + report.frames,
+                np.nan,
+                None,
+                np.full((3, 3), np.nan),
+                report.early_end,
+            )
         # The next part begins one frame after the last frame of this part.
         begin_s = round(begin_s + times[-1] + max(times[-1] - times[-2], 1e-3), 6)
-        count += frame.index + 1
+        count += report.frames
 
 
 class _FrameSelector:
@@ -300,10 +312,12 @@ def _photo_frames(flight: Flight, views: ViewRenderers) -> Iterator[FlightFrame]
 def _render(frame: FlightFrame, camera: Camera, views: ViewRenderers) -> FlightFrame:
     if frame.problem or frame.image is None:
         return replace(frame, image=None)
-    if frame.image.shape[:2] != (camera.height, camera.width):
-        height, width = frame.image.shape[:2]
-        problem = f"is {width}x{height}, expected {camera.width}x{camera.height}"
-        return replace(frame, image=None, problem=problem)
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):  # the size may change within a video
+        try:
+            camera = camera_at_size(camera, width, height)
+        except InputError as error:
+            return replace(frame, image=None, problem=str(error))
     problem = missing_texture(frame.image)
     if problem:
         return replace(frame, image=None, problem=problem, readable=True)

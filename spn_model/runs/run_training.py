@@ -204,7 +204,7 @@ def _existing_config(
         found = StageRecord(
             stage=record.stage, options=config["options"], inputs=config["inputs"], upstream={}
         )
-        is_same = found.made_of == record.made_of
+        is_same = found.is_made_as(record)
         facts = config["facts"]
         if not isinstance(facts, dict | None):
             raise TypeError(f"facts is {facts!r:.40}")

@@ -183,3 +183,15 @@ def test_a_fingerprint_sees_a_change_in_the_middle_of_a_long_file(tmp_path: Path
     data[2_500_000] = 1
     path.write_bytes(data)
     assert content_fingerprint(path) != before
+
+
+def test_an_option_that_was_unknown_is_the_same_as_none(tmp_path: Path) -> None:
+    """A stage of an earlier version is up to date if a later option is null, and not if it has a value."""
+    area = Area(tmp_path)
+    work = area.begin(FRAMES, {"n": 1, "group": {"a": 2}}, {}, overwrite=False)
+    assert isinstance(work, StageWork)
+    work.finish(counts={}, seconds={}, cpu_seconds={})
+    same = {"n": 1, "later": None, "group": {"a": 2, "b": None}}
+    assert isinstance(area.begin(FRAMES, same, {}, overwrite=False), StageRecord)
+    with pytest.raises(StageError, match="was made with later = None, now 3"):
+        area.begin(FRAMES, {**same, "later": 3}, {}, overwrite=False)

@@ -37,7 +37,7 @@ def area(tmp_path: Path) -> Area:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *(("counts", value) for value in (None, [], 5, {"chosen": "x"}, {"frames": False})),
+        *(("counts", value) for value in (None, [], 5, {"chosen": "x"}, {"candidates": False})),
         *(("finished", value) for value in (5, None)),
         *(("stage", value) for value in ("x", "2-model", 7)),
         *(("upstream", value) for value in ([], None, {"1-frames": 5})),

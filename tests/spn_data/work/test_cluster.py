@@ -25,6 +25,7 @@ from spn_data.errors import InputError
 from spn_data.labels.labels import read_labels
 from spn_data.matching.features import FeatureOptions, extract_from_bytes
 from spn_data.work import cluster
+from spn_data.work.answers import check_kind
 from spn_data.work.cluster import fingerprint, run_on_cluster
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
@@ -130,6 +131,19 @@ def test_the_error_of_a_call_is_raised_here(started: Cluster) -> None:
     batch = ("a.jpg", ("a.jpg", b"no image", None, FeatureOptions()))
     with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded as an image"):
         run_on_cluster(started.address, extract_from_bytes, [batch], print)
+
+
+def test_a_wrong_answer_names_worker_and_task(started: Cluster) -> None:
+    """An answer that the caller refuses becomes one line with the worker's address and the task."""
+    started.add_worker()
+
+    def store(result: object) -> None:
+        check_kind(result, bytes)
+
+    with pytest.raises(
+        InputError, match=r"worker tcp://127\.0\.0\.1:\d+ answered 'a\.jpg'.*: str instead"
+    ):
+        run_on_cluster(started.address, str.format, [("a.jpg", ("a",))], store)
 
 
 def test_a_worker_with_other_code_is_refused(started: Cluster, tmp_path: Path) -> None:

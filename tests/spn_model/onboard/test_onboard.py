@@ -273,31 +273,6 @@ def test_a_damaged_image_has_a_row_and_the_next_follows(bundle, flown, camera_fi
     assert f"Note: {tmp_path / 'cut.jpg'}: cannot be read" in done.stderr
 
 
-def test_a_video_that_ends_early_says_so(tmp_path, monkeypatch):
-    """If fewer frames can be decoded than the container announces, an error follows the last frame."""
-
-    class Cut:
-        def __init__(self, *_: object):
-            self.left = 3
-
-        def read(self) -> tuple[bool, np.ndarray]:
-            self.left -= 1
-            return self.left >= 0, np.zeros((4, 4, 3), np.uint8)
-
-        def get(self, what: int) -> float:
-            return 40.0 if what == cv2.CAP_PROP_FRAME_COUNT else 0.0
-
-        def release(self) -> None:
-            pass
-
-    (tmp_path / "a.mp4").write_bytes(b"x")
-    monkeypatch.setattr("spn_model.onboard.sources.cv2.VideoCapture", Cut)
-    found = frames(tmp_path / "a.mp4")
-    assert [next(found)[0] for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(InputError, match="only 3 of about 40 frames can be decoded"):
-        next(found)
-
-
 @pytest.mark.parametrize("tail", [b"", b"\0" * 40, b"\xff\xda\x00"])
 def test_a_whole_jpeg_is_not_taken_for_a_cut_one(flown, tmp_path, tail):
     """Complete JPEG files are read: progressive, with a thumbnail, or with trailing bytes."""
