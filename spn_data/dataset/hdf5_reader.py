@@ -16,6 +16,7 @@ import numpy as np
 from spn_data.dataset.hdf5_schema import (
     COLUMNS,
     FORMAT,
+    OFFSET_VERSION,
     OFFSETS,
     POINTS,
     UNIT_TOLERANCE,
@@ -102,7 +103,7 @@ class Dataset:
         if attributes.get("format") != FORMAT:
             raise FormatError(f"{self.path}: is not a data set of this program")
         version = _guarded(self.path, "its version", lambda: int(attributes["version"]))
-        if version != VERSION:
+        if version not in (VERSION, OFFSET_VERSION):
             raise FormatError(
                 f"{self.path}: has format version {version}, this program reads {VERSION}; "
                 "create it again, or update the program"
@@ -227,7 +228,7 @@ class DatasetGroup:
 
     @cached_property
     def poses(self) -> Poses:
-        """Poses of the N frames in the world; all finite, quaternions unit to 1e-5."""
+        """Poses of the N frames, relative to the file's `info.offset`; finite, quaternions unit to 1e-5."""
         centers, quats = self._column("centers"), self._column("quats_wxyz")
         length = np.linalg.norm(quats, axis=1)
         if not (np.isfinite(centers).all() and np.all(np.abs(length - 1) <= UNIT_TOLERANCE * 1.01)):

@@ -17,6 +17,8 @@ from spn_data.storage.json_files import parse_json
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1
+OFFSET_VERSION = 2  # of a file with an offset, which earlier programs must refuse
+OFFSET = ("offset_x", "offset_y", "offset_z")  # attributes of a file with an offset
 CONVENTIONS = (
     "World: East, North, Up in metres about the origin where units is 'm' and has_origin is 1. "
     "centers: camera centre in the world. quats_wxyz: unit, scalar first, w >= 0, turns world axes into "
@@ -105,6 +107,8 @@ class DatasetInfo:
         Fingerprints of the inputs, by name.
     notes : tuple of str
         Sentences for the user.
+    offset : tuple of float
+        World position of the file's zero: centres and points of the file plus this are world positions.
     """
 
     units: str
@@ -116,10 +120,13 @@ class DatasetInfo:
     split: Mapping[str, Any] = field(default_factory=dict)
     fingerprints: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.units not in ("m", "model"):
             raise ValueError(f"units must be 'm' or 'model', got {self.units!r}")
+        if not np.isfinite(self.offset).all() or len(self.offset) != 3:
+            raise ValueError(f"the offset {self.offset} is not a position")
 
     def to_attributes(self) -> dict[str, Any]:
         """Return the attributes of the root group."""
@@ -132,7 +139,7 @@ class DatasetInfo:
         }
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": OFFSET_VERSION if any(self.offset) else VERSION,
             "conventions": CONVENTIONS,
             "units": self.units,
             "has_origin": int(origin is not None),
@@ -146,6 +153,7 @@ class DatasetInfo:
             "has_images": int(self.has_images),
             "optimistic": int(self.optimistic),
             **{name: json.dumps(value, sort_keys=True) for name, value in documents.items()},
+            **(dict(zip(OFFSET, map(float, self.offset), strict=True)) if any(self.offset) else {}),
         }
 
     @classmethod
@@ -168,6 +176,7 @@ class DatasetInfo:
             split=split,
             fingerprints={str(k): str(v) for k, v in prints.items()},
             notes=tuple(str(note) for note in notes),
+            offset=_offset(attributes),
         )
 
 
@@ -236,6 +245,13 @@ def flag(value: Any) -> bool:
 
 def _json(value: Any) -> Any:
     return parse_json(_text(value))
+
+
+def _offset(attributes: Mapping[str, Any]) -> tuple[float, float, float]:
+    if int(attributes["version"]) != OFFSET_VERSION:
+        return 0.0, 0.0, 0.0
+    x, y, z = (float(attributes[name]) for name in OFFSET)
+    return x, y, z
 
 
 def _origin(attributes: Mapping[str, Any]) -> GeoOrigin:

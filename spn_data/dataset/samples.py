@@ -42,8 +42,8 @@ class Samples:
     Notes
     -----
     Keys of a sample: ``image`` uint8 (H, W, 3) RGB, absent from a data set without images; ``position``
-    float64 (3,), the camera centre in the world; ``quaternion`` float64 (4,), unit, scalar first, world to
-    camera; ``intrinsics`` float64 (3, 3), NaN if unknown, in COLMAP's pixel convention; ``covariance``
+    float64 (3,), the camera centre in the world, offset included; ``quaternion`` float64 (4,), unit,
+    scalar first, world to camera; ``intrinsics`` float64 (3, 3), NaN if unknown, in COLMAP's pixel convention; ``covariance``
     float64 (6, 6), NaN if unknown; ``name`` str; ``index`` int.
 
     Examples
@@ -66,7 +66,7 @@ class Samples:
         frames = self._open()
         row = range(len(frames))[index]
         sample: dict[str, Any] = {
-            "position": frames.poses.centers[row],
+            "position": frames.poses.centers[row] + np.array(self._offset()),
             "quaternion": frames.poses.quats_wxyz[row],
             "intrinsics": frames.intrinsics[row],
             "covariance": frames.covariance[row],
@@ -91,6 +91,10 @@ class Samples:
         if self._opened is not None and self._opened[0] == os.getpid():
             self._opened[1].close()
         self._opened = None
+
+    def _offset(self) -> tuple[float, float, float]:
+        assert self._opened is not None
+        return self._opened[1].info.offset
 
     def _open(self) -> DatasetGroup:
         """Return the group, opened by this very process: HDF5 files do not survive a fork."""

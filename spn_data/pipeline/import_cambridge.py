@@ -17,7 +17,7 @@ from spn_data.dataset.image_copies import ImageChecks
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
-from spn_data.inputs.cambridge_frames import LISTS, first_name, read_listed_frames
+from spn_data.inputs.cambridge_frames import LISTS, far_offset, first_name, read_listed_frames
 from spn_data.inputs.cambridge_model import OpenedFrames, check_sizes, read_model
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
@@ -116,6 +116,13 @@ def import_cambridge(
     if any(options.subtract):
         offset = " ".join(f"{value:.12g}" for value in options.subtract)
         notes.append(f"{offset} was subtracted from all positions: add it to every position")
+    offset_xyz = far_offset(frames.poses.centers[frames.roles == Role.TRAIN])
+    if any(offset_xyz):
+        chosen = " ".join(f"{value:.12g}" for value in offset_xyz)
+        notes.append(
+            f"the positions are far from zero: the file stores them relative to the offset {chosen}, which "
+            "is added again to all poses that a network estimates"
+        )
     model, model_notes = read_model(folder, frames, options.subtract)
     opened, size_notes = check_sizes(folder, frames, model, options.width_px)
     notes += model_notes + size_notes
@@ -133,6 +140,7 @@ def import_cambridge(
             if (folder / name).is_file()
         },
         notes=tuple(notes),
+        offset=offset_xyz,
     )
     groups = {role.value: role for role in LISTS if (folder / LISTS[role]).is_file()}
     counts = dict.fromkeys(groups, 0)
@@ -140,7 +148,7 @@ def import_cambridge(
     with DatasetWriter(target, info, groups) as writer:
         for k in range(len(frames.names)):
             progress("images" if has_images else "poses", k, len(frames.names))
-            frame = _frame(opened, k, options, checks)
+            frame = _relative(_frame(opened, k, options, checks), offset_xyz)
             writer.append(str(frames.roles[k]), frame)
             counts[str(frames.roles[k])] += 1
             with_focal += bool(np.isfinite(frame.intrinsics).all())
@@ -215,6 +223,15 @@ def _frame(
         point_ids=ids[is_seen],
         point_pixels=moved[is_seen],
         point_xyz=xyz[is_seen],
+    )
+
+
+def _relative(frame: DatasetFrame, offset: tuple[float, float, float]) -> DatasetFrame:
+    """Return a frame whose centre and points are relative to the offset of the file."""
+    if not any(offset):
+        return frame
+    return replace(
+        frame, center=frame.center - np.array(offset), point_xyz=frame.point_xyz - np.array(offset)
     )
 
 

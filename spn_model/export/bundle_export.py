@@ -40,6 +40,7 @@ from spn_model.onboard.bundle import (
     FORMAT,
     GRAPHS,
     INT8,
+    OFFSET_VERSION,
     VERSION,
     read_bundle,
     sha256_of,
@@ -118,7 +119,7 @@ def export(
             _write_graphs(partial, deployed, data, options, progress)
             document = {
                 "format": FORMAT,
-                "version": VERSION,
+                "version": OFFSET_VERSION if any(view.offset) else VERSION,
                 "conventions": CONVENTIONS,
                 "kind": checkpoint.model.kind,
                 "view": view.to_json(),

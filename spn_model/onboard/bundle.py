@@ -24,6 +24,7 @@ from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-bundle"
 VERSION = 1
+OFFSET_VERSION = 2  # of a bundle with an offset, which earlier programs must refuse
 DOCUMENT, CARD = "bundle.json", "MODEL_CARD.md"
 FLOAT32, INT8 = "float32", "int8"
 GRAPHS = {FLOAT32: "model.onnx", INT8: "model-int8.onnx"}
@@ -193,7 +194,7 @@ def read_bundle(folder: Path) -> Bundle:
         version = int(document["version"])
     except (*_DAMAGE, OSError, RecursionError) as error:
         raise FormatError(f"{path}: is not a valid bundle description ({error})") from error
-    if version != VERSION:
+    if version not in (VERSION, OFFSET_VERSION):
         raise FormatError(
             f"{path}: has format {version}, but this program reads {VERSION}; export the run again, or "
             "update the program"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -138,7 +138,13 @@ class Localizer:
         """
         seen = self.view(image, camera, rgb=rgb)
         reason = missing_texture(image)
-        return Located.failed(reason) if reason else self.decode(self.run(seen))
+        if reason:
+            return Located.failed(reason)
+        found, offset = self.decode(self.run(seen)), self.bundle.view.offset
+        if not any(offset):
+            return found
+        poses = Poses(found.poses.centers + np.array(offset), found.poses.quats_wxyz)
+        return replace(found, poses=poses)
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.
@@ -180,7 +186,7 @@ class Localizer:
         return found
 
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
-        """Convert outputs of the network to a pose.
+        """Convert outputs of the network to a pose, relative to the offset of the bundle's view.
 
         Parameters
         ----------

@@ -32,6 +32,8 @@ class View:
         Fingerprint of the data set.
     made_from : mapping of str to str
         Fingerprints of what the data set was made from, by name.
+    offset : tuple of float
+        World position of the network's zero, to be added to its positions in float64.
     """
 
     camera: Camera | None
@@ -41,6 +43,7 @@ class View:
     up_is_known: bool
     dataset: str
     made_from: Mapping[str, str] = field(default_factory=dict)
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON; unknown ones are null."""
@@ -52,6 +55,7 @@ class View:
             "up_is_known": self.up_is_known,
             "dataset": self.dataset,
             "made_from": dict(self.made_from),
+            **({"offset": list(self.offset)} if any(self.offset) else {}),
         }
 
     @classmethod
@@ -63,7 +67,11 @@ class View:
             raise ValueError(f"units {units!r}, up_is_known {up!r}")
         if not (0 < width <= 65_536 and 0 < height <= 65_536):
             raise ValueError(f"image size {width}x{height}")
+        x, y, z = (float(part) for part in value.get("offset", (0.0, 0.0, 0.0)))
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError(f"offset {x}, {y}, {z}")
         return cls(
+            offset=(x, y, z),
             camera=None if camera is None else camera_from_json(camera),
             size=(width, height),
             units=units,

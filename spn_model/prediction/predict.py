@@ -255,6 +255,8 @@ def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[
         estimates = network.model.estimate(images, matrices)
         seconds += time.perf_counter() - started
         rows.set_estimates(chosen, estimates)
+        if any(network.view.offset):
+            rows.poses.centers[chosen] += np.array(network.view.offset)
     return rows, seconds
 
 

@@ -23,6 +23,7 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.nvm import build_nvm_model, read_nvm, read_nvm_models, write_nvm
 from spn_data.dataset.nvm_frames import camera_from_visualsfm, match_names
 from spn_data.dataset.pose_agreement import name_disagreement
+from spn_data.dataset.samples import open_samples
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity
@@ -561,14 +562,22 @@ def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
         assert dataset.info.notes == done.notes
 
 
-def test_coordinates_far_from_zero_are_refused_until_an_offset_is_subtracted(scene, tmp_path):
-    """UTM coordinates, too coarse in float32, are refused with the offset to subtract."""
+def test_coordinates_far_from_zero_are_stored_relative_to_an_offset(scene, tmp_path):
+    """UTM coordinates, too coarse in float32, get an offset in the file; --subtract replaces it."""
     offset = np.array([563247.0, 5934791.0, 323.0])
     run(scene, tmp_path / "near.h5", width_px=80)
     relist(scene, lambda c: [c[0], *map(repr, (np.array(c[1:4], float) + offset).tolist()), *c[4:]])
     shift_model(scene, offset)
-    with pytest.raises(InputError, match=r"would round them to 0.5; subtract .* --subtract 56"):
-        run(scene, tmp_path / "far.h5", width_px=80)
+    done = run(scene, tmp_path / "utm.h5", width_px=80)
+    assert any("far from zero: the file stores them relative to" in note for note in done.notes)
+    with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "utm.h5") as two:
+        near, far, moved = one.groups["train"], two.groups["train"], np.array(two.info.offset)
+        assert one.info.offset == (0, 0, 0)
+        assert np.abs(far.poses.centers).max() < 1000
+        assert np.allclose(far.poses.centers + moved - offset, near.poses.centers, atol=1e-8)
+        assert np.allclose(far.points(0).xyz + moved - offset, near.points(0).xyz, atol=1e-8)
+        sample = open_samples(tmp_path / "utm.h5", "train")[0]
+        assert np.allclose(sample["position"] - offset, near.poses.centers[0], atol=1e-8)
     done = run(scene, tmp_path / "far.h5", width_px=80, subtract=tuple(offset.tolist()))
     assert any("was subtracted from all positions" in note for note in done.notes)
     with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "far.h5") as two:
@@ -643,7 +652,7 @@ def test_bmp_and_webp_are_read(scene, tmp_path, suffix):
         ("01-nvm-of-other-image-size", "made of images of another size"),
         ("04-nvm-mixed-scale", "made of smaller images"),
         ("05-exif-turned-against-poses", "read as stored"),
-        ("07-utm-labels", "--subtract 563238 5934792 324"),
+        ("07-utm-labels", "relative to the offset 563238 5934792 324"),
         ("09-sixteen-bit-of-twelve", "uses only values 336 to 3904 of 16 bits"),
         (
             "10-failed-frames-at-origin",
