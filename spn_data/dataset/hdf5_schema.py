@@ -17,8 +17,8 @@ from spn_data.storage.json_files import parse_json
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1
-OFFSET_VERSION = 2  # of a file with an offset, which earlier programs must refuse
-OFFSET = ("offset_x", "offset_y", "offset_z")  # attributes of a file with an offset
+OFFSET_VERSION = 2  # of a file with an offset, so that programs that know none refuse it
+OFFSET = ("offset_x", "offset_y", "offset_z")  # attributes of such a file
 CONVENTIONS = (
     "World: East, North, Up in metres about the origin where units is 'm' and has_origin is 1. "
     "centers: camera centre in the world. quats_wxyz: unit, scalar first, w >= 0, turns world axes into "
@@ -26,6 +26,10 @@ CONVENTIONS = (
     "rotation vector v in the camera frame, radians), R_true = exp(v) R, relative to the map. Pixels: x "
     "right, y down, the centre of the upper-left pixel is (0.5, 0.5); so in intrinsics and points. Images "
     "are RGB, without distortion. NaN is unknown."
+)
+_OFFSET_CONVENTION = (
+    " Centers and points/xyz are relative to offset_x, offset_y, offset_z: add these in float64 to obtain "
+    "positions in the world."
 )
 # Texts have a fixed length, padded with zeros. HDF5 reads variable-length texts through a heap, and crashes
 # if that is damaged.
@@ -108,7 +112,8 @@ class DatasetInfo:
     notes : tuple of str
         Sentences for the user.
     offset : tuple of float
-        World position of the file's zero: centres and points of the file plus this are world positions.
+        World position of the zero of the file's arrays `centers` and `points/xyz`; zero unless the world's
+        coordinates are too large for float32.
     """
 
     units: str
@@ -125,7 +130,7 @@ class DatasetInfo:
     def __post_init__(self) -> None:
         if self.units not in ("m", "model"):
             raise ValueError(f"units must be 'm' or 'model', got {self.units!r}")
-        if not np.isfinite(self.offset).all() or len(self.offset) != 3:
+        if len(self.offset) != 3 or not np.isfinite(self.offset).all():
             raise ValueError(f"the offset {self.offset} is not a position")
 
     def to_attributes(self) -> dict[str, Any]:
@@ -140,7 +145,7 @@ class DatasetInfo:
         return {
             "format": FORMAT,
             "version": OFFSET_VERSION if any(self.offset) else VERSION,
-            "conventions": CONVENTIONS,
+            "conventions": CONVENTIONS + (_OFFSET_CONVENTION if any(self.offset) else ""),
             "units": self.units,
             "has_origin": int(origin is not None),
             "origin_lat_deg": np.nan if origin is None else origin.lat_deg,
@@ -248,10 +253,12 @@ def _json(value: Any) -> Any:
 
 
 def _offset(attributes: Mapping[str, Any]) -> tuple[float, float, float]:
-    if int(attributes["version"]) != OFFSET_VERSION:
+    offset = tuple(float(attributes[name]) for name in OFFSET if name in attributes)
+    if int(attributes["version"]) == VERSION and not offset:
         return 0.0, 0.0, 0.0
-    x, y, z = (float(attributes[name]) for name in OFFSET)
-    return x, y, z
+    if int(attributes["version"]) != OFFSET_VERSION or len(offset) != 3 or not any(offset):
+        raise ValueError("its version and its offset contradict each other")
+    return offset
 
 
 def _origin(attributes: Mapping[str, Any]) -> GeoOrigin:

@@ -42,9 +42,12 @@ class Samples:
     Notes
     -----
     Keys of a sample: ``image`` uint8 (H, W, 3) RGB, absent from a data set without images; ``position``
-    float64 (3,), the camera centre in the world, offset included; ``quaternion`` float64 (4,), unit,
-    scalar first, world to camera; ``intrinsics`` float64 (3, 3), NaN if unknown, in COLMAP's pixel convention; ``covariance``
+    float64 (3,), the camera centre in the world; ``quaternion`` float64 (4,), unit, scalar first, world to
+    camera; ``intrinsics`` float64 (3, 3), NaN if unknown, in COLMAP's pixel convention; ``covariance``
     float64 (6, 6), NaN if unknown; ``name`` str; ``index`` int.
+
+    Subtract `offset` from positions before they become float32, and add it to estimates in float64: it is
+    zero unless the world's coordinates are too large for float32, as UTM northings are.
 
     Examples
     --------
@@ -59,6 +62,11 @@ class Samples:
         self._opened: tuple[int, Dataset] | None = None
         self._open()
 
+    @property
+    def offset(self) -> np.ndarray:
+        """World position (3,) about which the frames are; zero if float32 resolves their coordinates."""
+        return np.array(self._open().offset)
+
     def __len__(self) -> int:
         return len(self._open())
 
@@ -66,7 +74,7 @@ class Samples:
         frames = self._open()
         row = range(len(frames))[index]
         sample: dict[str, Any] = {
-            "position": frames.poses.centers[row] + np.array(self._offset()),
+            "position": frames.poses.centers[row],
             "quaternion": frames.poses.quats_wxyz[row],
             "intrinsics": frames.intrinsics[row],
             "covariance": frames.covariance[row],
@@ -91,10 +99,6 @@ class Samples:
         if self._opened is not None and self._opened[0] == os.getpid():
             self._opened[1].close()
         self._opened = None
-
-    def _offset(self) -> tuple[float, float, float]:
-        assert self._opened is not None
-        return self._opened[1].info.offset
 
     def _open(self) -> DatasetGroup:
         """Return the group, opened by this very process: HDF5 files do not survive a fork."""

@@ -6,7 +6,7 @@ Up once a model is georeferenced; camera axes are x right, y down, z forward.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,6 +100,12 @@ class Poses:
     def unknown(cls, n: int) -> Poses:
         """Return n poses that are NaN."""
         return cls(np.full((n, 3), np.nan), np.full((n, 4), np.nan))
+
+    def moved_by(self, offset: Sequence[float]) -> Poses:
+        """Return the poses with an offset (3,) added to their centres; unchanged if it is zero."""
+        if not any(offset):
+            return self
+        return Poses(self.centers + np.asarray(offset, dtype=np.float64), self.quats_wxyz)
 
     @classmethod
     def concatenate(cls, parts: Iterable[Poses]) -> Poses:

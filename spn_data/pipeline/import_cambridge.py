@@ -114,14 +114,14 @@ def import_cambridge(
     )
     notes.insert(0, _NOT_GEOREFERENCED)
     if any(options.subtract):
-        offset = " ".join(f"{value:.12g}" for value in options.subtract)
-        notes.append(f"{offset} was subtracted from all positions: add it to every position")
-    offset_xyz = far_offset(frames.poses.centers[frames.roles == Role.TRAIN])
-    if any(offset_xyz):
-        chosen = " ".join(f"{value:.12g}" for value in offset_xyz)
         notes.append(
-            f"the positions are far from zero: the file stores them relative to the offset {chosen}, which "
-            "is added again to all poses that a network estimates"
+            f"{_words(options.subtract)} was subtracted from all positions: add it to every position"
+        )
+    offset = far_offset(frames.poses.centers[frames.roles == Role.TRAIN])
+    if any(offset):
+        notes.append(
+            "the positions are far from zero: the file stores them relative to the offset "
+            f"{_words(offset)}, and poses that a network estimates include the offset again"
         )
     model, model_notes = read_model(folder, frames, options.subtract)
     opened, size_notes = check_sizes(folder, frames, model, options.width_px)
@@ -140,7 +140,7 @@ def import_cambridge(
             if (folder / name).is_file()
         },
         notes=tuple(notes),
-        offset=offset_xyz,
+        offset=offset,
     )
     groups = {role.value: role for role in LISTS if (folder / LISTS[role]).is_file()}
     counts = dict.fromkeys(groups, 0)
@@ -148,7 +148,7 @@ def import_cambridge(
     with DatasetWriter(target, info, groups) as writer:
         for k in range(len(frames.names)):
             progress("images" if has_images else "poses", k, len(frames.names))
-            frame = _relative(_frame(opened, k, options, checks), offset_xyz)
+            frame = _frame(opened, k, options, checks)
             writer.append(str(frames.roles[k]), frame)
             counts[str(frames.roles[k])] += 1
             with_focal += bool(np.isfinite(frame.intrinsics).all())
@@ -156,6 +156,10 @@ def import_cambridge(
         writer.add_notes(image_notes)
         progress("images" if has_images else "poses", len(frames.names), len(frames.names))
     return Imported(counts, has_images, with_focal, (*notes, *image_notes))
+
+
+def _words(offset: tuple[float, float, float]) -> str:
+    return " ".join(f"{value:.12g}" for value in offset)
 
 
 def _image_notes(checks: ImageChecks) -> list[str]:
@@ -223,15 +227,6 @@ def _frame(
         point_ids=ids[is_seen],
         point_pixels=moved[is_seen],
         point_xyz=xyz[is_seen],
-    )
-
-
-def _relative(frame: DatasetFrame, offset: tuple[float, float, float]) -> DatasetFrame:
-    """Return a frame whose centre and points are relative to the offset of the file."""
-    if not any(offset):
-        return frame
-    return replace(
-        frame, center=frame.center - np.array(offset), point_xyz=frame.point_xyz - np.array(offset)
     )
 
 

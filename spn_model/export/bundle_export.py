@@ -40,6 +40,7 @@ from spn_model.onboard.bundle import (
     FORMAT,
     GRAPHS,
     INT8,
+    OFFSET_CONVENTION,
     OFFSET_VERSION,
     VERSION,
     read_bundle,
@@ -120,7 +121,7 @@ def export(
             document = {
                 "format": FORMAT,
                 "version": OFFSET_VERSION if any(view.offset) else VERSION,
-                "conventions": CONVENTIONS,
+                "conventions": CONVENTIONS + (OFFSET_CONVENTION if any(view.offset) else ""),
                 "kind": checkpoint.model.kind,
                 "view": view.to_json(),
                 "input": camera_to_json(camera),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -138,13 +138,7 @@ class Localizer:
         """
         seen = self.view(image, camera, rgb=rgb)
         reason = missing_texture(image)
-        if reason:
-            return Located.failed(reason)
-        found, offset = self.decode(self.run(seen)), self.bundle.view.offset
-        if not any(offset):
-            return found
-        poses = Poses(found.poses.centers + np.array(offset), found.poses.quats_wxyz)
-        return replace(found, poses=poses)
+        return Located.failed(reason) if reason else self.decode(self.run(seen))
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.
@@ -186,7 +180,7 @@ class Localizer:
         return found
 
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
-        """Convert outputs of the network to a pose, relative to the offset of the bundle's view.
+        """Convert outputs of the network to a pose in the world.
 
         Parameters
         ----------
@@ -199,12 +193,13 @@ class Localizer:
         -------
         Located
         """
-        if isinstance(self.bundle.decoding, PoseDecoding):
-            return _decode_regression(self.bundle.decoding, *outputs)
-        by = self.bundle.decoding
+        by, offset = self.bundle.decoding, self.bundle.view.offset
+        if isinstance(by, PoseDecoding):
+            found = _decode_regression(by, *outputs)
+            return Located(found.poses.moved_by(offset), found.covariance, found.reason)
         coordinates, log_scale = outputs
         try:
-            found = decode(
+            estimate = decode(
                 coordinates[0],
                 log_scale[0, 0],
                 self.camera.matrix if matrix is None else matrix,
@@ -214,7 +209,7 @@ class Localizer:
             )
         except GeometryError as error:
             return Located.failed(str(error))
-        return Located(found.poses, found.covariance)
+        return Located(estimate.poses.moved_by(offset), estimate.covariance)
 
     def renderer(self, camera: Camera, width: int, height: int) -> PinholeRenderer:
         """Return the cached renderer from images of one size into the network's camera.

@@ -252,11 +252,9 @@ def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[
         images = np.stack([frame.image for frame in (batch[k] for k in chosen)])
         matrices = np.stack([batch[k].matrix for k in chosen])
         started = time.perf_counter()
-        estimates = network.model.estimate(images, matrices)
+        estimates = network.model.estimate(images, matrices).moved_by(network.view.offset)
         seconds += time.perf_counter() - started
         rows.set_estimates(chosen, estimates)
-        if any(network.view.offset):
-            rows.poses.centers[chosen] += np.array(network.view.offset)
     return rows, seconds
 
 

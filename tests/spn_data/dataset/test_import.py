@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import piexif
 import pytest
@@ -34,6 +35,7 @@ from spn_data.geometry.rotations import (
 )
 from spn_data.inputs.cambridge_frames import LISTS
 from spn_data.pipeline.import_cambridge import Imported, ImportOptions, import_cambridge
+from spn_model.examples.training_set import TrainingSet
 
 OUTLIER = "seq5/frame00297.png"
 LENS = Camera("SIMPLE_PINHOLE", 160, 90, np.array([120.0, 80.0, 45.0]))
@@ -562,22 +564,42 @@ def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
         assert dataset.info.notes == done.notes
 
 
-def test_coordinates_far_from_zero_are_stored_relative_to_an_offset(scene, tmp_path):
-    """UTM coordinates, too coarse in float32, get an offset in the file; --subtract replaces it."""
-    offset = np.array([563247.0, 5934791.0, 323.0])
+@pytest.mark.parametrize(
+    "offset",
+    [(563247.0, 5934791.0, 323.0), (3771793.25, 140253.5, 5124304.125)],
+    ids=["UTM", "Earth-centred"],
+)
+def test_coordinates_far_from_zero_are_stored_relative_to_an_offset(scene, tmp_path, offset):
+    """Coordinates too coarse in float32 are small in the file, and read as given; --subtract removes them."""
+    offset = np.array(offset)
     run(scene, tmp_path / "near.h5", width_px=80)
     relist(scene, lambda c: [c[0], *map(repr, (np.array(c[1:4], float) + offset).tolist()), *c[4:]])
     shift_model(scene, offset)
     done = run(scene, tmp_path / "utm.h5", width_px=80)
     assert any("far from zero: the file stores them relative to" in note for note in done.notes)
+    listed = read_cambridge(scene / LISTS[Role.TRAIN]).poses.centers
     with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "utm.h5") as two:
-        near, far, moved = one.groups["train"], two.groups["train"], np.array(two.info.offset)
+        near, far = one.groups["train"], two.groups["train"]
         assert one.info.offset == (0, 0, 0)
-        assert np.abs(far.poses.centers).max() < 1000
-        assert np.allclose(far.poses.centers + moved - offset, near.poses.centers, atol=1e-8)
-        assert np.allclose(far.points(0).xyz + moved - offset, near.points(0).xyz, atol=1e-8)
-        sample = open_samples(tmp_path / "utm.h5", "train")[0]
-        assert np.allclose(sample["position"] - offset, near.poses.centers[0], atol=1e-8)
+        assert np.abs(two.info.offset - offset).max() < 10
+        assert (far.poses.centers == listed).all()
+        assert np.allclose(far.points(0).xyz - offset, near.points(0).xyz, rtol=0, atol=1e-8)
+        samples = open_samples(tmp_path / "utm.h5", "train")
+        assert (samples[0]["position"] == listed[0]).all()
+        assert (samples.offset == two.info.offset).all()
+        moved = np.array(two.info.offset) - offset
+        (a, b), (c, d) = (
+            (of.poses.centers, of.points(0).xyz) for of in map(TrainingSet, (near, far))
+        )
+        assert np.allclose(c + moved, a, rtol=0, atol=1e-8)
+        assert np.allclose(d + moved, b, rtol=0, atol=1e-8)
+    with h5py.File(tmp_path / "near.h5") as one, h5py.File(tmp_path / "utm.h5") as two:
+        assert one.attrs["version"] == 1 and "offset_x" not in one.attrs
+        assert two.attrs["version"] == 2 and b"relative to offset_x" in two.attrs["conventions"]
+        stored = [two["train/centers"], two["train/points/xyz"]]
+        assert all(np.abs(values[:]).max() < 100 for values in stored)
+        assert all(b"offset of the file" in values.attrs["description"] for values in stored)
+        assert b"offset" not in one["train/centers"].attrs["description"]
     done = run(scene, tmp_path / "far.h5", width_px=80, subtract=tuple(offset.tolist()))
     assert any("was subtracted from all positions" in note for note in done.notes)
     with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "far.h5") as two:
