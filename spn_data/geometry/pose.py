@@ -44,6 +44,11 @@ def to_camera(points: np.ndarray, centers: np.ndarray, rotations: np.ndarray) ->
     return np.einsum("mij,mj->mi", rotations, offsets)
 
 
+def position_text(position: Sequence[float]) -> str:
+    """Return the coordinates of a position, separated by spaces, as short as float64 allows for metres."""
+    return " ".join(f"{value:.12g}" for value in position)
+
+
 @dataclass(frozen=True, eq=False)
 class Poses:
     """Camera poses of N frames, in the Cambridge convention.

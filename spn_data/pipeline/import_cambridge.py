@@ -16,6 +16,7 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.dataset.image_copies import ImageChecks
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import position_text
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
 from spn_data.inputs.cambridge_frames import LISTS, far_offset, first_name, read_listed_frames
 from spn_data.inputs.cambridge_model import OpenedFrames, check_sizes, read_model
@@ -115,13 +116,13 @@ def import_cambridge(
     notes.insert(0, _NOT_GEOREFERENCED)
     if any(options.subtract):
         notes.append(
-            f"{_words(options.subtract)} was subtracted from all positions: add it to every position"
+            f"{position_text(options.subtract)} was subtracted from all positions: add it to every position"
         )
     offset = far_offset(frames.poses.centers[frames.roles == Role.TRAIN])
     if any(offset):
         notes.append(
             "the positions are far from zero: the file stores them relative to the offset "
-            f"{_words(offset)}, and poses that a network estimates include the offset again"
+            f"{position_text(offset)}, and poses that a network estimates include the offset again"
         )
     model, model_notes = read_model(folder, frames, options.subtract)
     opened, size_notes = check_sizes(folder, frames, model, options.width_px)
@@ -156,10 +157,6 @@ def import_cambridge(
         writer.add_notes(image_notes)
         progress("images" if has_images else "poses", len(frames.names), len(frames.names))
     return Imported(counts, has_images, with_focal, (*notes, *image_notes))
-
-
-def _words(offset: tuple[float, float, float]) -> str:
-    return " ".join(f"{value:.12g}" for value in offset)
 
 
 def _image_notes(checks: ImageChecks) -> list[str]:
