@@ -155,7 +155,7 @@ def _figures(
         across = -across
     anchor = "middle" if abs(across[0]) < 0.5 else "start" if across[0] > 0 else "end"
     # Labels of UTM or Earth-centred coordinates would overlap, so they count from a round number.
-    zero = np.floor(values[0] / 1000) * 1000 if abs(values[0]) >= _LARGE else 0.0
+    zero = round(float(values.mean()), -3) if abs(values[0]) >= _LARGE else 0.0
     axis = f"{axis} - {zero:.0f}" if zero else axis
     words = [f"{value - zero:g}" for value in values]
     # Skip labels that would overlap on a short axis.
