@@ -106,8 +106,7 @@ class Dataset:
         if version not in (VERSION, OFFSET_VERSION):
             raise FormatError(
                 f"{self.path}: has format version {version}, this program reads {VERSION} and "
-                f"{OFFSET_VERSION}; "
-                "create it again, or update the program"
+                f"{OFFSET_VERSION}; create it again, or update the program"
             )
         return _guarded(
             self.path, "its attributes", lambda: DatasetInfo.from_attributes(attributes)

@@ -350,11 +350,12 @@ def _check_offset(area: Dataset, last: Path) -> None:
     The network would learn poses relative to the former, but its checkpoint states the latter.
     """
     with Dataset(last) as dataset:
-        there, here = (position_text(of.info.offset) for of in (dataset, area))
+        there, here = dataset.info.offset, area.info.offset
     if there != here:
         raise InputError(
-            f"its positions have the offset {there}, those of {area.path} have {here}, but the last stage "
-            "needs the same: train it on the latter, or import both with the same --subtract",
+            f"its positions have the offset {position_text(there)}, those of {area.path} have "
+            f"{position_text(here)}, but the last stage needs the same: train it on the latter, or import "
+            "both with the same --subtract",
             path=last,
         )
 
