@@ -43,7 +43,7 @@ from spn_cli import console, options
     nargs=3,
     type=options.Finite(-1e15, 1e15),
     default=(0.0, 0.0, 0.0),
-    help="Offset X Y Z to subtract from all positions, such as those of UTM.  [default: none]",
+    help="X Y Z to subtract from all positions for good; UTM coordinates do not need it.  [default: none]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
 def import_(

@@ -16,6 +16,7 @@ import numpy as np
 from spn_data.dataset.hdf5_schema import (
     COLUMNS,
     FORMAT,
+    OFFSET_VERSION,
     OFFSETS,
     POINTS,
     UNIT_TOLERANCE,
@@ -102,10 +103,10 @@ class Dataset:
         if attributes.get("format") != FORMAT:
             raise FormatError(f"{self.path}: is not a data set of this program")
         version = _guarded(self.path, "its version", lambda: int(attributes["version"]))
-        if version != VERSION:
+        if version not in (VERSION, OFFSET_VERSION):
             raise FormatError(
-                f"{self.path}: has format version {version}, this program reads {VERSION}; "
-                "create it again, or update the program"
+                f"{self.path}: has format version {version}, this program reads {VERSION} and "
+                f"{OFFSET_VERSION}; create it again, or update the program"
             )
         return _guarded(
             self.path, "its attributes", lambda: DatasetInfo.from_attributes(attributes)
@@ -169,10 +170,12 @@ class DatasetGroup:
         Whether all pixels of all frames are valid.
     points_for_training : bool
         Whether the group's points may be used for training.
+    offset : tuple of float
+        `DatasetInfo.offset`: subtract it from world positions before they become float32.
     """
 
     def __init__(self, path: Path, name: str, group: h5py.Group, info: DatasetInfo):
-        self._path, self.name = path, name
+        self._path, self.name, self.offset = path, name, info.offset
         attributes = _attributes(group)
         self.role = Role(attributes["role"])
         self.all_valid = flag(attributes["all_valid"])
@@ -232,7 +235,7 @@ class DatasetGroup:
         length = np.linalg.norm(quats, axis=1)
         if not (np.isfinite(centers).all() and np.all(np.abs(length - 1) <= UNIT_TOLERANCE * 1.01)):
             raise FormatError(f"{self._path}: group {self.name} contains an invalid pose")
-        return Poses(centers, quats)
+        return Poses(centers, quats).moved_by(self.offset)
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -302,7 +305,8 @@ class DatasetGroup:
         row = range(len(self))[row]
         part = slice(int(self._ends[row]), int(self._ends[row + 1]))
         read = self._read("points", lambda: {n: d[part] for n, d in self._points.items()})
-        return FramePoints(read["ids"], read["pixels"], read["xyz"])
+        xyz = read["xyz"] + self.offset if any(self.offset) else read["xyz"]
+        return FramePoints(read["ids"], read["pixels"], xyz)
 
     def point_ids(self) -> list[np.ndarray]:
         """Return the ids (K,) of the map points seen by each frame, with a single read."""

@@ -17,6 +17,8 @@ from spn_data.geometry.json_values import parse_json
 
 FORMAT = "squeezeposenet-dataset"
 VERSION = 1
+OFFSET_VERSION = 2  # of a file with an offset, so that programs that know none refuse it
+OFFSET = ("offset_x", "offset_y", "offset_z")  # attributes of such a file
 CONVENTIONS = (
     "World: East, North, Up in metres about the origin where units is 'm' and has_origin is 1. "
     "centers: camera centre in the world. quats_wxyz: unit, scalar first, w >= 0, turns world axes into "
@@ -24,6 +26,10 @@ CONVENTIONS = (
     "rotation vector v in the camera frame, radians), R_true = exp(v) R, relative to the map. Pixels: x "
     "right, y down, the centre of the upper-left pixel is (0.5, 0.5); so in intrinsics and points. Images "
     "are RGB, without distortion. NaN is unknown."
+)
+_OFFSET_CONVENTION = (
+    " Centers and points/xyz are relative to offset_x, offset_y, offset_z: add these in float64 to obtain "
+    "positions in the world."
 )
 # Texts have a fixed length, padded with zeros. HDF5 reads variable-length texts through a heap, and crashes
 # if that is damaged.
@@ -105,6 +111,9 @@ class DatasetInfo:
         Fingerprints of the inputs, by name.
     notes : tuple of str
         Sentences for the user.
+    offset : tuple of float
+        World position of the zero of the file's arrays `centers` and `points/xyz`; zero unless the world's
+        coordinates are too large for float32.
     """
 
     units: str
@@ -116,10 +125,13 @@ class DatasetInfo:
     split: Mapping[str, Any] = field(default_factory=dict)
     fingerprints: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.units not in ("m", "model"):
             raise ValueError(f"units must be 'm' or 'model', got {self.units!r}")
+        if len(self.offset) != 3 or not np.isfinite(self.offset).all():
+            raise ValueError(f"the offset {self.offset} is not a position")
 
     def to_attributes(self) -> dict[str, Any]:
         """Return the attributes of the root group."""
@@ -132,8 +144,8 @@ class DatasetInfo:
         }
         return {
             "format": FORMAT,
-            "version": VERSION,
-            "conventions": CONVENTIONS,
+            "version": OFFSET_VERSION if any(self.offset) else VERSION,
+            "conventions": CONVENTIONS + (_OFFSET_CONVENTION if any(self.offset) else ""),
             "units": self.units,
             "has_origin": int(origin is not None),
             "origin_lat_deg": np.nan if origin is None else origin.lat_deg,
@@ -146,6 +158,7 @@ class DatasetInfo:
             "has_images": int(self.has_images),
             "optimistic": int(self.optimistic),
             **{name: json.dumps(value, sort_keys=True) for name, value in documents.items()},
+            **(dict(zip(OFFSET, map(float, self.offset), strict=True)) if any(self.offset) else {}),
         }
 
     @classmethod
@@ -168,6 +181,7 @@ class DatasetInfo:
             split=split,
             fingerprints={str(k): str(v) for k, v in prints.items()},
             notes=tuple(str(note) for note in notes),
+            offset=_offset(attributes),
         )
 
 
@@ -236,6 +250,15 @@ def flag(value: Any) -> bool:
 
 def _json(value: Any) -> Any:
     return parse_json(_text(value))
+
+
+def _offset(attributes: Mapping[str, Any]) -> tuple[float, float, float]:
+    offset = tuple(float(attributes[name]) for name in OFFSET if name in attributes)
+    if int(attributes["version"]) == VERSION and not offset:
+        return 0.0, 0.0, 0.0
+    if int(attributes["version"]) != OFFSET_VERSION or len(offset) != 3 or not any(offset):
+        raise ValueError("its version and its offset contradict each other")
+    return offset
 
 
 def _origin(attributes: Mapping[str, Any]) -> GeoOrigin:

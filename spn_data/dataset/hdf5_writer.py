@@ -82,7 +82,7 @@ class DatasetWriter:
             for key, value in info.to_attributes().items():
                 _set_attribute(self._file, key, value)
             self._groups = {
-                name: _Group(self._file.create_group(name), Role(role))
+                name: _Group(self._file.create_group(name), Role(role), info.offset)
                 for name, role in groups.items()
             }
         except BaseException:
@@ -159,20 +159,22 @@ class _SizeMismatch(Exception):
 class _Group:
     """Group being written: images immediately, everything else in blocks of frames."""
 
-    def __init__(self, group: h5py.Group, role: Role):
-        self._group = group
+    def __init__(self, group: h5py.Group, role: Role, offset: tuple[float, float, float]):
+        self._group, self._offset = group, offset
         self._frames: list[DatasetFrame] = []
         self._mask_idx: list[int] = []
         self._masks: dict[bytes, int] = {}
         self._images: h5py.Dataset | None = None
         self._count = 0
         _set_attribute(group, "role", role.value)
+        relative = ", relative to the offset of the file" if any(offset) else ""
         for name, column in COLUMNS.items():
-            _create(group, name, column, _FRAMES_A_BLOCK)
+            note = relative if name == "centers" else ""
+            _create(group, name, column, _FRAMES_A_BLOCK, note)
         points = group.create_group("points")
         points.attrs["for_training"] = int(role is Role.TRAIN)
         for name, column in POINTS.items():
-            _create(points, name, column, _POINTS_A_CHUNK)
+            _create(points, name, column, _POINTS_A_CHUNK, relative if name == "xyz" else "")
         offsets = _create(points, "offsets", OFFSETS, _FRAMES_A_BLOCK)
         _extend(offsets, np.zeros(1, np.int64))
 
@@ -185,6 +187,7 @@ class _Group:
                 raise _SizeMismatch(self._images.shape[1:], frame.image.shape)
             self._images.resize(self._count + 1, axis=0)
             self._images[self._count] = frame.image
+        frame = _relative(frame, self._offset)
         self._mask_idx.append(self._mask_row(frame.valid))
         self._frames.append(replace(frame, image=None, valid=None))  # keeps the buffer small
         self._count += 1
@@ -235,6 +238,15 @@ class _Group:
         self._group.attrs["all_valid"] = int(not self._masks)
 
 
+def _relative(frame: DatasetFrame, offset: tuple[float, float, float]) -> DatasetFrame:
+    """Return a frame whose centre and points are relative to the offset of the file."""
+    if not any(offset):
+        return frame
+    return replace(
+        frame, center=frame.center - np.array(offset), point_xyz=frame.point_xyz - np.array(offset)
+    )
+
+
 def _check(frame: DatasetFrame, *, has_image: bool) -> None:
     """Raise ValueError if a frame violates the format, which is an error of the caller, not the user."""
     numbers = np.concatenate([frame.center, frame.quat_wxyz])
@@ -265,7 +277,9 @@ def _check(frame: DatasetFrame, *, has_image: bool) -> None:
         raise ValueError(f"{frame.name}: a point is outside the image")
 
 
-def _create(group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: int) -> h5py.Dataset:
+def _create(
+    group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: int, note: str = ""
+) -> h5py.Dataset:
     dataset = group.create_dataset(
         name,
         shape=(0, *column.tail),
@@ -274,7 +288,7 @@ def _create(group: h5py.Group, name: str, column: SchemaColumn, rows_a_chunk: in
         dtype=_type_of(column.dtype),
         compression="gzip" if column.dtype.startswith("S") else None,
     )
-    _set_attribute(dataset, "description", column.description)
+    _set_attribute(dataset, "description", column.description + note)
     return dataset
 
 

@@ -46,6 +46,9 @@ class Samples:
     camera; ``intrinsics`` float64 (3, 3), NaN if unknown, in COLMAP's pixel convention; ``covariance``
     float64 (6, 6), NaN if unknown; ``name`` str; ``index`` int.
 
+    Subtract `offset` from positions before they become float32, and add it to estimates in float64: it is
+    zero unless the world's coordinates are too large for float32, as UTM northings are.
+
     Examples
     --------
     >>> from torch.utils.data import DataLoader
@@ -58,6 +61,11 @@ class Samples:
         self.path, self.group = Path(path), group
         self._opened: tuple[int, Dataset] | None = None
         self._open()
+
+    @property
+    def offset(self) -> np.ndarray:
+        """World position (3,) about which the frames are; zero if float32 resolves their coordinates."""
+        return np.array(self._open().offset)
 
     def __len__(self) -> int:
         return len(self._open())

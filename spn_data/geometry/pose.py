@@ -6,7 +6,7 @@ Up once a model is georeferenced; camera axes are x right, y down, z forward.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,11 @@ def to_camera(points: np.ndarray, centers: np.ndarray, rotations: np.ndarray) ->
     if rotations.ndim == 2:
         return np.asarray(offsets @ rotations.T)
     return np.einsum("mij,mj->mi", rotations, offsets)
+
+
+def position_text(position: Sequence[float]) -> str:
+    """Return the coordinates of a position, separated by spaces, as short as float64 allows for metres."""
+    return " ".join(f"{value:.12g}" for value in position)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,12 @@ class Poses:
     def unknown(cls, n: int) -> Poses:
         """Return n poses that are NaN."""
         return cls(np.full((n, 3), np.nan), np.full((n, 4), np.nan))
+
+    def moved_by(self, offset: Sequence[float]) -> Poses:
+        """Return the poses with an offset (3,) added to their centres; unchanged if it is zero."""
+        if not any(offset):
+            return self
+        return Poses(self.centers + np.asarray(offset, dtype=np.float64), self.quats_wxyz)
 
     @classmethod
     def concatenate(cls, parts: Iterable[Poses]) -> Poses:

@@ -90,8 +90,7 @@ def read_listed_frames(
     Raises
     ------
     InputError
-        If a list is missing or damaged, an image is in two lists, there is no training frame, or positions
-        are too far from zero for networks.
+        If a list is missing or damaged, an image is in two lists, or there is no training frame.
     """
     if not folder.is_dir():
         raise InputError("is not a folder", path=folder)
@@ -125,7 +124,6 @@ def read_listed_frames(
     trained = frames.roles == Role.TRAIN
     if not trained.any():
         raise InputError("contains no training frame", path=folder / LISTS[Role.TRAIN])
-    _check_resolution(frames.poses.centers[trained], folder / LISTS[Role.TRAIN])
     notes += _same_place(frames.poses[np.flatnonzero(trained)])
     return _without_missing_images(frames, notes), notes
 
@@ -181,21 +179,16 @@ def _is_far(center: np.ndarray, others: np.ndarray) -> bool:
     return bool(np.linalg.norm(others - center, axis=1).min() > _FAR_TIMES * usual)
 
 
-def _check_resolution(centers: np.ndarray, path: Path) -> None:
-    """Refuse positions that float32 resolves too coarsely, such as UTM or Earth-centred coordinates."""
+def far_offset(centers: np.ndarray) -> tuple[float, float, float]:
+    """Return an offset for positions that float32 resolves too coarsely (UTM, Earth-centred); else zeros."""
     middle = np.median(centers, axis=0)
     spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     step = float(np.spacing(np.float32(np.abs(middle).max())))
     if step > _COARSE_SHARE * max(spread, 1.0):
         digits = -int(np.floor(np.log10(max(spread, 1.0))))
-        offset = " ".join(f"{value:.0f}" for value in np.round(middle, digits))
-        raise InputError(
-            f"the positions are far from zero (about {', '.join(f'{v:.0f}' for v in middle)}, as in UTM or "
-            "Earth-centred coordinates), so "
-            f"networks, which compute in float32, would round them to {step:.2g}; subtract an offset with "
-            f"--subtract {offset}",
-            path=path,
-        )
+        x, y, z = np.round(middle, digits).tolist()
+        return x, y, z
+    return 0.0, 0.0, 0.0
 
 
 def _same_place(poses: Poses) -> list[str]:

@@ -16,8 +16,9 @@ from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.dataset.image_copies import ImageChecks
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.pose import position_text
 from spn_data.geometry.rendering import PinholeRenderer, RenderingOptions, canonical_camera
-from spn_data.inputs.cambridge_frames import LISTS, first_name, read_listed_frames
+from spn_data.inputs.cambridge_frames import LISTS, far_offset, first_name, read_listed_frames
 from spn_data.inputs.cambridge_model import OpenedFrames, check_sizes, read_model
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.work.timing import Progress
@@ -114,8 +115,15 @@ def import_cambridge(
     )
     notes.insert(0, _NOT_GEOREFERENCED)
     if any(options.subtract):
-        offset = " ".join(f"{value:.12g}" for value in options.subtract)
-        notes.append(f"{offset} was subtracted from all positions: add it to every position")
+        notes.append(
+            f"{position_text(options.subtract)} was subtracted from all positions: add it to every position"
+        )
+    offset = far_offset(frames.poses.centers[frames.roles == Role.TRAIN])
+    if any(offset):
+        notes.append(
+            "the positions are far from zero: the file stores them relative to the offset "
+            f"{position_text(offset)}, and poses that a network estimates include the offset again"
+        )
     model, model_notes = read_model(folder, frames, options.subtract)
     opened, size_notes = check_sizes(folder, frames, model, options.width_px)
     notes += model_notes + size_notes
@@ -133,6 +141,7 @@ def import_cambridge(
             if (folder / name).is_file()
         },
         notes=tuple(notes),
+        offset=offset,
     )
     groups = {role.value: role for role in LISTS if (folder / LISTS[role]).is_file()}
     counts = dict.fromkeys(groups, 0)

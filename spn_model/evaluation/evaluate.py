@@ -37,7 +37,7 @@ from spn_model.evaluation.metrics import (
 from spn_model.evaluation.retrieval import most_similar_images
 from spn_model.evaluation.validation import spread_rows
 from spn_model.models.checkpoint import Checkpoint
-from spn_model.models.pose_model import PoseEstimates, PoseModel
+from spn_model.models.pose_model import PoseEstimates
 from spn_model.onboard.view import View
 
 _logger = logging.getLogger(__name__)
@@ -212,7 +212,7 @@ def compare(
                     "and the baselines did not use those images."
                 )
             _logger.debug("%s: poses of %d groups", name, len(chosen))
-            parts, costs[name] = _estimate_poses(network.model, chosen, progress, name, options)
+            parts, costs[name] = _estimate_poses(network, chosen, progress, name, options)
             for estimates, part in zip(found, parts, strict=True):
                 estimates.append(Estimates(name, part.poses, part.covariance))
             if options.dropout_samples:
@@ -221,7 +221,7 @@ def compare(
                     continue
                 method = f"{name}, {options.dropout_samples} dropout samples"
                 parts, costs[method] = _estimate_poses(
-                    network.model, chosen, progress, method, options, options.dropout_samples
+                    network, chosen, progress, method, options, options.dropout_samples
                 )
                 for estimates, part in zip(found, parts, strict=True):
                     estimates.append(Estimates(method, part.poses, part.covariance))
@@ -355,7 +355,7 @@ def _groups(data: Dataset) -> tuple[DatasetGroup, list[DatasetGroup], list[str]]
 
 
 def _estimate_poses(
-    model: PoseModel,
+    network: Checkpoint,
     chosen: Sequence[tuple[DatasetGroup, np.ndarray]],
     progress: Progress,
     name: str,
@@ -363,6 +363,7 @@ def _estimate_poses(
     samples: int = 0,
 ) -> tuple[list[PoseEstimates], NetworkCost]:
     """Return a network's estimates of the chosen rows of each group, and its cost without image reading."""
+    model = network.model
     total, done, seconds, cpu = sum(len(rows) for _, rows in chosen), 0, 0.0, 0.0
     group, rows = chosen[0]
     # Warm-up: the first image sets up caches, threads and kernels, which must not be timed.
@@ -385,6 +386,6 @@ def _estimate_poses(
             batches.append(batch)
             done += len(of)
             progress(name, done, total)
-        parts.append(PoseEstimates.concatenate(batches))
+        parts.append(PoseEstimates.concatenate(batches).moved_by(network.view.offset))
     device = next(model.network.parameters()).device.type
     return parts, NetworkCost(total, seconds, cpu, options.batch, torch.get_num_threads(), device)

@@ -13,6 +13,7 @@ from spn_model.evaluation.svg import COLOURS, GRID, INK, SOFT
 
 _MARGIN = 0.25  # of the area's extent: estimates farther outside are not drawn
 MOST_DRAWN = 1500  # cameras, and estimates of one method; more are thinned evenly
+_LARGE = 1e5  # a coordinate of more digits
 _GAP = 8.0  # times the median step: a longer step interrupts the trajectory
 
 
@@ -153,7 +154,10 @@ def _figures(
     if np.dot(across, places.mean(axis=0) - middle) < 0:
         across = -across
     anchor = "middle" if abs(across[0]) < 0.5 else "start" if across[0] > 0 else "end"
-    words = [f"{value:g}" for value in values]
+    # Labels of UTM or Earth-centred coordinates would overlap, so they count from a round number.
+    zero = round(float(values.mean()), -3) if abs(values[0]) >= _LARGE else 0.0
+    axis = f"{axis} - {zero:.0f}" if zero else axis
+    words = [f"{value - zero:g}" for value in values]
     # Skip labels that would overlap on a short axis.
     every = max(1, int(np.ceil(26 / max(float(np.hypot(*along)) / max(len(values) - 1, 1), 1e-9))))
     parts = [

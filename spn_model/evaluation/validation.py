@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -92,6 +92,8 @@ def validate(
     frames: ValidationImages,
     rows: np.ndarray,
     check: Callable[[], None] = lambda: None,
+    *,
+    offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[ValidationErrors, PoseEstimates]:
     """Estimate the poses of some rows and compare them with the true poses.
 
@@ -105,6 +107,8 @@ def validate(
         Rows of `frames` to use.
     check : callable
         Called before each batch; may raise an exception to stop.
+    offset : sequence of float
+        Position of the model's zero in the world of the true poses.
 
     Returns
     -------
@@ -121,7 +125,7 @@ def validate(
         part = rows[first : first + _BATCH]
         images = np.stack([frames.image(int(row)) for row in part])
         found.append(model.estimate(images, intrinsics[part]))
-    estimates = PoseEstimates.concatenate(found)
+    estimates = PoseEstimates.concatenate(found).moved_by(offset)
     errors = frame_errors(Estimates("network", estimates.poses), frames.poses[rows])
     position, rotation = (
         np.where(np.isnan(values), np.inf, values) for values in (errors.error_m, errors.error_deg)

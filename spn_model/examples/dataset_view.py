@@ -26,4 +26,5 @@ def view_of(dataset: Dataset) -> View:
         up_is_known=info.up_is_known,
         dataset=content_fingerprint(dataset.path),
         made_from=dict(info.fingerprints),
+        offset=info.offset,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,8 @@ class TrainingSet:
     """Training frames of one or more groups, concatenated: images of one size, exact poses and map points.
 
     Groups have the role "train", or "validation" if these frames are trained on too. Images are kept in
-    memory up to `memory_bytes` and read from the file beyond it.
+    memory up to `memory_bytes` and read from the file beyond it. Networks compute in float32, so poses and
+    points are relative to the offset of the data set.
 
     Parameters
     ----------
@@ -33,8 +35,10 @@ class TrainingSet:
 
     Attributes
     ----------
+    offset : tuple of float
+        World position of the zero of poses and points.
     poses : Poses
-        N poses.
+        N poses, relative to the offset.
     intrinsics : ndarray, shape (N, 3, 3)
         Intrinsic matrices K.
     size : tuple of int
@@ -72,7 +76,9 @@ class TrainingSet:
         self._rows = [(group, k) for group in groups for k in range(len(group))]
         self.up_is_known = up_is_known
         self.size: tuple[int, int] = groups[0].image_size or (0, 0)
-        self.poses: Poses = Poses.concatenate([group.poses for group in groups])
+        self.offset = groups[0].offset
+        to_zero = [-part for part in self.offset]
+        self.poses: Poses = Poses.concatenate(group.poses for group in groups).moved_by(to_zero)
         self.intrinsics: np.ndarray = np.concatenate([group.intrinsics for group in groups])
         kept = min(len(self._rows), memory_bytes // (self.size[0] * self.size[1] * 3))
         self._images = []
@@ -83,7 +89,9 @@ class TrainingSet:
         self._valid = None if every_pixel else [group.valid(k) for group, k in self._rows]
         self.has_points = groups[0].points_for_training
         self._points = (
-            [_points_to_train_on(group, k) for group, k in self._rows] if self.has_points else []
+            [_points_to_train_on(group, k, to_zero) for group, k in self._rows]
+            if self.has_points
+            else []
         )
 
     def __len__(self) -> int:
@@ -101,12 +109,16 @@ class TrainingSet:
         return None if self._valid is None else self._valid[row]
 
     def points(self, row: int) -> FramePoints:
-        """Return the map points that an image sees. Raises InputError if there are none for training."""
+        """Return the map points that an image sees, relative to the offset.
+
+        Raises InputError if there are none for training.
+        """
         if not self.has_points:
             raise InputError("the data set has no map points for training")
         return self._points[row]
 
 
-def _points_to_train_on(group: DatasetGroup, row: int) -> FramePoints:
+def _points_to_train_on(group: DatasetGroup, row: int, moved_by: list[float]) -> FramePoints:
     """Return the points to train on: all points of a validation frame, whose images are used too."""
-    return group.points(row) if group.role is Role.VALIDATION else group.training_points(row)
+    found = group.points(row) if group.role is Role.VALIDATION else group.training_points(row)
+    return replace(found, xyz=found.xyz + moved_by) if any(moved_by) else found

@@ -120,6 +120,7 @@ def compare_with_pytorch(
             output = max(output, float(np.abs(found - wanted).max()) / size)
         # The network decodes its own outputs, independently of the bundle's decoder.
         torch_pose = checkpoint.model.estimate(image[None], matrix[None])
+        torch_pose = torch_pose.moved_by(checkpoint.view.offset)
         located = localizer.decode(outputs, _scaled(matrix, deployed, image))
         disagree += bool(located.reason) != bool(torch_pose.reasons[0])
         if not located.reason and not torch_pose.reasons[0]:

@@ -40,6 +40,8 @@ from spn_model.onboard.bundle import (
     FORMAT,
     GRAPHS,
     INT8,
+    OFFSET_CONVENTION,
+    OFFSET_VERSION,
     VERSION,
     read_bundle,
     sha256_of,
@@ -118,8 +120,8 @@ def export(
             _write_graphs(partial, deployed, data, options, progress)
             document = {
                 "format": FORMAT,
-                "version": VERSION,
-                "conventions": CONVENTIONS,
+                "version": OFFSET_VERSION if any(view.offset) else VERSION,
+                "conventions": CONVENTIONS + (OFFSET_CONVENTION if any(view.offset) else ""),
                 "kind": checkpoint.model.kind,
                 "view": view.to_json(),
                 "input": camera_to_json(camera),

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spn_data.errors import InputError
+from spn_data.geometry.pose import position_text
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
 from spn_model.pretrained.weights import by_name
@@ -49,6 +50,14 @@ def model_card(
                 if place is None
                 else f"East, North, Up about latitude {place.lat_deg:.7f}, longitude {place.lon_deg:.7f}, "
                 f"height {place.alt_m:.2f} m ({place.height_reference.value})."
+            ),
+            *(
+                [
+                    f"Offset: {position_text(view.offset)}, which the onboard program adds to the positions "
+                    "that the network computes in float32."
+                ]
+                if any(view.offset)
+                else []
             ),
             f"Data set: {view.dataset} (fingerprint).",
             *(

@@ -23,6 +23,7 @@ from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-checkpoint"
 VERSION = 1
+OFFSET_VERSION = 2  # of a view with an offset, so that programs that know none refuse it
 _MAX_BYTES = 8 * 10**9
 _MAX_DOCUMENT = 2_000_000  # largest length of the JSON document, in characters
 
@@ -54,7 +55,8 @@ def save(path: Path, model: PoseModel, view: View, facts: Mapping[str, Any]) -> 
         "view": view.to_json(),
         "facts": dict(facts),
     }
-    write_tensors(path, FORMAT, model.network.state_dict(), document)
+    version = OFFSET_VERSION if any(view.offset) else VERSION
+    write_tensors(path, FORMAT, model.network.state_dict(), document, version)
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
@@ -79,10 +81,10 @@ def load(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
         If it is not a checkpoint, is of another version, is damaged, or its tensors do not match its
         network.
     """
-    tensors, document = read_tensors(path, FORMAT)
+    tensors, document, version = read_tensors(path, FORMAT)
     try:
         kind, options, facts = document["kind"], document["options"], document["facts"]
-        view = View.from_json(document["view"])
+        view = View.from_json(document["view"], has_offset=version == OFFSET_VERSION)
         if not (isinstance(kind, str) and isinstance(options, dict) and isinstance(facts, dict)):
             raise TypeError("kind, options or facts have a wrong type")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -130,7 +132,11 @@ def set_state(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> 
 
 
 def write_tensors(
-    path: Path, form: str, tensors: Mapping[str, Tensor], document: Mapping[str, Any]
+    path: Path,
+    form: str,
+    tensors: Mapping[str, Tensor],
+    document: Mapping[str, Any],
+    version: int = VERSION,
 ) -> None:
     """Write a safetensors file atomically, with a JSON document in its header.
 
@@ -144,6 +150,8 @@ def write_tensors(
         Tensors by name.
     document : mapping
         Plain values; numbers that are not finite are written as null.
+    version : int
+        Version of the format.
 
     Raises
     ------
@@ -152,14 +160,14 @@ def write_tensors(
     """
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     text = json.dumps(finite(document), sort_keys=True, allow_nan=False)
-    content = safetensors_bytes(plain, {"format": form, "version": str(VERSION), "document": text})
+    content = safetensors_bytes(plain, {"format": form, "version": str(version), "document": text})
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(path) as file:
         file.write(content)
 
 
-def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read tensors and document from a file that `write_tensors` wrote.
+def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, Any], int]:
+    """Read tensors, document and version from a file that `write_tensors` wrote.
 
     Parameters
     ----------
@@ -172,6 +180,7 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, An
     -------
     tensors : dict of str to Tensor
     document : dict
+    version : int
 
     Raises
     ------
@@ -189,10 +198,11 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, An
             header = file.metadata() or {}
             if header.get("format") != form:
                 raise FormatError(f"{path}: is not a {form.rpartition('-')[2]} of this program")
-            if header.get("version") != str(VERSION):
+            version = header.get("version", "")
+            if version not in map(str, (VERSION, OFFSET_VERSION)):
                 raise FormatError(
-                    f"{path}: has format version {header.get('version')}, this program reads {VERSION}; "
-                    "train again, or update the program"
+                    f"{path}: has format version {version}, this program reads {VERSION} and "
+                    f"{OFFSET_VERSION}; train again, or update the program"
                 )
             text = header.get("document", "")
             if len(text) > _MAX_DOCUMENT:
@@ -206,7 +216,7 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, Tensor], dict[str, An
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise FormatError(f"{path}: {name!r} has values that are not finite; train again")
-    return tensors, document
+    return tensors, document, int(version)
 
 
 def _shape_and_type(tensor: Tensor) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,6 +36,10 @@ class PoseEstimates:
     poses: Poses
     covariance: np.ndarray
     reasons: np.ndarray
+
+    def moved_by(self, offset: Sequence[float]) -> PoseEstimates:
+        """Return the estimates with an offset (3,) added to all centres."""
+        return replace(self, poses=self.poses.moved_by(offset))
 
     @classmethod
     def concatenate(cls, parts: Sequence[PoseEstimates]) -> PoseEstimates:

@@ -24,6 +24,7 @@ from spn_model.onboard.view import View
 
 FORMAT = "squeezeposenet-bundle"
 VERSION = 1
+OFFSET_VERSION = 2  # of a view with an offset, so that programs that know none refuse it
 DOCUMENT, CARD = "bundle.json", "MODEL_CARD.md"
 FLOAT32, INT8 = "float32", "int8"
 GRAPHS = {FLOAT32: "model.onnx", INT8: "model-int8.onnx"}
@@ -36,6 +37,7 @@ CONVENTIONS = (
     "Pixels: x right, y down, the centre of the upper-left pixel is (0.5, 0.5); camera "
     "parameters in COLMAP's order."
 )
+OFFSET_CONVENTION = " Add the view's offset, in float64, to the centre that the decoding gives."
 _MAX_DOCUMENT_BYTES = 1_000_000
 # Raised when values of a damaged bundle.json are used.
 _DAMAGE = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
@@ -50,7 +52,7 @@ _SIZES = (0, 1e9)
 class CellDecoding:
     """Decoding of scene coordinates by PnP, see `decoding.decode`.
 
-    The outputs are `coordinates` (1, 3, h, w) in the world and `log_scale` (1, 1, h, w).
+    The outputs are `coordinates` (1, 3, h, w), relative to the view's offset, and `log_scale` (1, 1, h, w).
 
     Attributes
     ----------
@@ -98,7 +100,7 @@ class PoseDecoding:
     Attributes
     ----------
     center : ndarray, shape (3,)
-        Point in the world that offsets refer to.
+        Point that these offsets refer to, itself relative to the view's offset.
     """
 
     kind = "regression"
@@ -191,10 +193,10 @@ def read_bundle(folder: Path) -> Bundle:
         version = int(document["version"])
     except (*_DAMAGE, OSError) as error:
         raise FormatError(f"{path}: is not a valid bundle description ({error})") from error
-    if version != VERSION:
+    if version not in (VERSION, OFFSET_VERSION):
         raise FormatError(
-            f"{path}: has format {version}, but this program reads {VERSION}; export the run again, or "
-            "update the program"
+            f"{path}: has format {version}, but this program reads {VERSION} and {OFFSET_VERSION}; "
+            "export the run again, or update the program"
         )
     try:
         camera = camera_from_json(document["input"])
@@ -202,7 +204,7 @@ def read_bundle(folder: Path) -> Bundle:
             raise ValueError("its input is not a pinhole, or too large")
         return Bundle(
             folder=folder,
-            view=View.from_json(document["view"]),
+            view=View.from_json(document["view"], has_offset=version == OFFSET_VERSION),
             camera=camera,
             decoding=_decoding(document["decoding"]),
             graphs={p: _graph(folder, p, entry) for p, entry in dict(document["graphs"]).items()},

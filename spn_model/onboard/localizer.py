@@ -180,7 +180,7 @@ class Localizer:
         return found
 
     def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
-        """Convert outputs of the network to a pose.
+        """Convert outputs of the network to a pose in the world.
 
         Parameters
         ----------
@@ -193,12 +193,13 @@ class Localizer:
         -------
         Located
         """
-        if isinstance(self.bundle.decoding, PoseDecoding):
-            return _decode_regression(self.bundle.decoding, *outputs)
-        by = self.bundle.decoding
+        by, offset = self.bundle.decoding, self.bundle.view.offset
+        if isinstance(by, PoseDecoding):
+            found = _decode_regression(by, *outputs)
+            return Located(found.poses.moved_by(offset), found.covariance, found.reason)
         coordinates, log_scale = outputs
         try:
-            found = decode(
+            estimate = decode(
                 coordinates[0],
                 log_scale[0, 0],
                 self.camera.matrix if matrix is None else matrix,
@@ -208,7 +209,7 @@ class Localizer:
             )
         except GeometryError as error:
             return Located.failed(str(error))
-        return Located(found.poses, found.covariance)
+        return Located(estimate.poses.moved_by(offset), estimate.covariance)
 
     def renderer(self, camera: Camera, width: int, height: int) -> PinholeRenderer:
         """Return the cached renderer from images of one size into the network's camera.

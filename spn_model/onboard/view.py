@@ -10,6 +10,7 @@ from typing import Any
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.json_values import numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,6 +33,8 @@ class View:
         Fingerprint of the data set.
     made_from : mapping of str to str
         Fingerprints of what the data set was made from, by name.
+    offset : tuple of float
+        World position of the network's zero: add it to the network's positions in float64.
     """
 
     camera: Camera | None
@@ -41,6 +44,7 @@ class View:
     up_is_known: bool
     dataset: str
     made_from: Mapping[str, str] = field(default_factory=dict)
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON; unknown ones are null."""
@@ -52,17 +56,24 @@ class View:
             "up_is_known": self.up_is_known,
             "dataset": self.dataset,
             "made_from": dict(self.made_from),
+            **({"offset": list(self.offset)} if any(self.offset) else {}),
         }
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> View:
-        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid."""
+    def from_json(cls, value: Mapping[str, Any], *, has_offset: bool = False) -> View:
+        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid.
+
+        has_offset : whether there has to be an offset, as the version of the file says.
+        """
         camera, units, up = value["camera"], value["units"], value["up_is_known"]
         width, height = (int(side) for side in value["size"])
         if units not in ("m", "model") or not isinstance(up, bool):
             raise ValueError(f"units {units!r}, up_is_known {up!r}")
         if not (0 < width <= 65_536 and 0 < height <= 65_536):
             raise ValueError(f"image size {width}x{height}")
+        x, y, z = numbers(value.get("offset", [0, 0, 0]), 3).tolist()
+        if any((x, y, z)) is not has_offset:
+            raise ValueError("its version and its offset contradict each other")
         return cls(
             camera=None if camera is None else camera_from_json(camera),
             size=(width, height),
@@ -71,6 +82,7 @@ class View:
             up_is_known=up,
             dataset=str(value["dataset"]),
             made_from={str(k): str(v) for k, v in dict(value["made_from"]).items()},
+            offset=(x, y, z),
         )
 
 

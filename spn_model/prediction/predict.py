@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.errors import StageError
+from spn_data.geometry.pose import position_text
 from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
@@ -178,7 +179,7 @@ def predict(
                 "formats": list(options.formats),
                 "every": options.choice.every,
                 "fps": options.choice.fps,
-                **{name: view[name] for name in ("units", "origin", "up_is_known")},
+                **{k: view[k] for k in ("units", "origin", "up_is_known", "offset") if k in view},
                 "flights": [
                     {"sequence": flight.source.sequence, "camera": flight.camera_source}
                     for flight in flights
@@ -252,7 +253,7 @@ def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[
         images = np.stack([frame.image for frame in (batch[k] for k in chosen)])
         matrices = np.stack([batch[k].matrix for k in chosen])
         started = time.perf_counter()
-        estimates = network.model.estimate(images, matrices)
+        estimates = network.model.estimate(images, matrices).moved_by(network.view.offset)
         seconds += time.perf_counter() - started
         rows.set_estimates(chosen, estimates)
     return rows, seconds
@@ -262,8 +263,12 @@ def _describe_world(network: Checkpoint) -> str:
     """Describe the world frame in one line."""
     o = network.view.origin
     if o is None:
-        unit = "m" if network.view.units == "m" else "model (not metres)"
-        return f"units: {unit}; axes and origin of the map"
+        unit, offset = (
+            "m" if network.view.units == "m" else "model (not metres)",
+            network.view.offset,
+        )
+        added = f", including the network's offset {position_text(offset)}" if any(offset) else ""
+        return f"units: {unit}; axes and origin of the map{added}"
     return (
         f"units: m; axes: east north up; origin: latitude {o.lat_deg:.10f} longitude {o.lon_deg:.10f} "
         f"height {o.alt_m:.4f} above {o.height_reference.value}"

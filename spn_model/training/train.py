@@ -22,6 +22,7 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, StageError
+from spn_data.geometry.pose import position_text
 from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.pose_model import Batch, PoseModel
@@ -142,6 +143,7 @@ def train(
             published = recipe.weights == "published"
             model.load_pretrained(model.weights_name if published else recipe.weights)
         area = stack.enter_context(Dataset(data.area))
+        _check_offset(area, data.of(recipe.stages[-1]))
         # Several processes can only stop together, in a step.
         check = partial(raise_if_stopping, watch) if ranks.world == 1 else lambda: None
         record = None
@@ -340,6 +342,22 @@ def _training_group(dataset: Dataset) -> DatasetGroup:
     if filled[0].image_size is None:
         raise InputError("has no training images: there is nothing to train on", path=dataset.path)
     return filled[0]
+
+
+def _check_offset(area: Dataset, last: Path) -> None:
+    """Raise InputError if the data set of the last stage has another offset than the area's.
+
+    The network would learn poses relative to the former, but its checkpoint states the latter.
+    """
+    with Dataset(last) as dataset:
+        there, here = dataset.info.offset, area.info.offset
+    if there != here:
+        raise InputError(
+            f"its positions have the offset {position_text(there)}, those of {area.path} have "
+            f"{position_text(here)}, but the last stage needs the same: train it on the latter, or import "
+            "both with the same --subtract",
+            path=last,
+        )
 
 
 def _groups_of(dataset: Dataset, frames: str) -> list[DatasetGroup]:

@@ -94,18 +94,22 @@ def raise_if_stopping(watch: Watch) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ValidationFrames:
-    """Frames on which a model is evaluated during training: rows of a named group, or views without one."""
+    """Frames on which a model is evaluated during training: rows of a named group, or views without one.
+
+    offset : position of the model's zero in the world of the frames' poses.
+    """
 
     event: str
     frames: ValidationImages
     rows: np.ndarray
     group: str = ""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def errors(
         self, model: PoseModel, *, scales: bool, check: Callable[[], None]
     ) -> ValidationErrors:
         """Return the errors of the model's estimates; if `scales`, also rescale its covariances by them."""
-        errors, estimates = validate(model, self.frames, self.rows, check)
+        errors, estimates = validate(model, self.frames, self.rows, check, offset=self.offset)
         if scales:
             try:
                 factor = fit_covariance_scale(estimates, self.frames.poses[self.rows])
@@ -119,16 +123,13 @@ def select_validation_frames(
     dataset: Dataset, training: DatasetGroup, frames: int, sample: int
 ) -> list[ValidationFrames]:
     """Return validation frames, if there are any, and a sample of the training frames."""
-    judged = []
+    judged, offset = [], dataset.info.offset
     for group in [g for g in dataset.of_role(Role.VALIDATION) if len(g) and g.image_size][:1]:
         rows = _shown_to_training(group, training)
-        judged.append(
-            ValidationFrames("validation", group, rows[spread_rows(len(rows), frames)], group.name)
-        )
-    return [
-        *judged,
-        ValidationFrames("training", training, spread_rows(len(training), sample), training.name),
-    ]
+        rows = rows[spread_rows(len(rows), frames)]
+        judged.append(ValidationFrames("validation", group, rows, group.name, offset))
+    rows = spread_rows(len(training), sample)
+    return [*judged, ValidationFrames("training", training, rows, training.name, offset)]
 
 
 def _shown_to_training(group: DatasetGroup, training: DatasetGroup) -> np.ndarray:

@@ -127,7 +127,7 @@ def read_state(path: Path) -> TrainingState | None:
     """Read a state; return None if there is none. Raises FormatError if it is damaged."""
     if not path.exists():
         return None
-    tensors, document = read_tensors(path, FORMAT)
+    tensors, document, _ = read_tensors(path, FORMAT)
     try:
         values = dict(document["position"])
         position = Position(**values)

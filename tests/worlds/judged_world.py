@@ -13,7 +13,7 @@ from spn_model.examples.dataset_view import view_of
 from spn_model.examples.training_set import TrainingSet
 from spn_model.models.checkpoint import Checkpoint, load, save
 from spn_model.models.registry import make
-from tests.worlds.training_world import INFO, frame
+from tests.worlds.training_world import INFO, frame, moved
 
 ROLES = {
     "train": Role.TRAIN,
@@ -23,7 +23,13 @@ ROLES = {
 }
 
 
-def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: Any) -> Path:
+def write_judged(
+    path: Path,
+    counts: dict[str, int] | None = None,
+    *,
+    moved_by: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **changes: Any,
+) -> Path:
     """Write a dataset with two evaluation flights, one with two strata; `changes` are DatasetInfo fields."""
     info: DatasetInfo = replace(INFO, **changes)
     wanted = counts or {"train": 12, "validation": 3, "medium": 7, "low": 4}
@@ -32,7 +38,7 @@ def write_judged(path: Path, counts: dict[str, int] | None = None, **changes: An
         for group, count in wanted.items():
             for k in range(count):
                 stratum = "" if group == "train" else "medium" if k % 2 else "low"
-                writer.append(group, replace(frame(group, k), stratum=stratum))
+                writer.append(group, replace(moved(frame(group, k), moved_by), stratum=stratum))
     return path
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -97,14 +98,27 @@ def frame(group: str, k: int) -> DatasetFrame:
     )
 
 
-def write_field(path: Path, train: int = 24, validation: int = 6) -> Path:
-    """Write a dataset of the field to a path, which is returned."""
+def write_field(
+    path: Path,
+    train: int = 24,
+    validation: int = 6,
+    *,
+    moved_by: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Path:
+    """Write a dataset of the field, moved in the world, to a path, which is returned."""
+    info = replace(INFO, origin=None, up_is_known=False, offset=offset) if any(moved_by) else INFO
     roles = {"train": Role.TRAIN, "validation": Role.VALIDATION}
-    with DatasetWriter(path, INFO, roles) as writer:
+    with DatasetWriter(path, info, roles) as writer:
         for group, count in (("train", train), ("validation", validation)):
             for k in range(count):
-                writer.append(group, frame(group, k))
+                writer.append(group, moved(frame(group, k), moved_by))
     return path
+
+
+def moved(one: DatasetFrame, by: tuple[float, float, float]) -> DatasetFrame:
+    """Return a frame elsewhere in the world."""
+    return replace(one, center=one.center + by, point_xyz=one.point_xyz + by)
 
 
 class TinyNet(nn.Module):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from spn_data.dataset.hdf5_reader import Dataset
-from spn_data.dataset.hdf5_schema import COLUMNS, POINTS, DatasetFrame, DatasetInfo, Role
+from spn_data.dataset.hdf5_schema import COLUMNS, OFFSET, POINTS, DatasetFrame, DatasetInfo, Role
 from spn_data.dataset.hdf5_writer import DatasetWriter
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
@@ -335,7 +335,11 @@ def damage(path: Path, change: str) -> None:
     with h5py.File(path, "r+") as file:
         train = file["train"]
         if change == "version":
+            file.attrs["version"] = 3
+        elif change == "version without offset":
             file.attrs["version"] = 2
+        elif change == "offset without version":
+            file.attrs["offset_x"] = 500_000.0
         elif change == "format":
             file.attrs["format"] = np.bytes_("something else")
         elif change == "no units":
@@ -391,7 +395,9 @@ def damage(path: Path, change: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("version", "has format version 2, this program reads 1"),
+        ("version", "has format version 3, this program reads 1 and 2"),
+        ("version without offset", "its version and its offset contradict each other"),
+        ("offset without version", "its version and its offset contradict each other"),
         ("format", "is not a data set of this program"),
         ("no units", "its attributes cannot be read"),
         ("camera", "its attributes cannot be read"),
@@ -500,7 +506,7 @@ def test_the_documented_schema_is_the_one_written(written):
     }
     with h5py.File(written) as file:
         wanted = set(file.attrs) | set(COLUMNS) | {f"points/{n}" for n in (*POINTS, "offsets")}
-        wanted |= {"role", "all_valid", "for_training", "images", "masks"}
+        wanted |= {*OFFSET, "role", "all_valid", "for_training", "images", "masks"}
         assert set(file["low"]) == set(COLUMNS) | {"images", "masks", "points"}
         assert set(file["low/points"]) == {*POINTS, "offsets"}
         assert all(file["low"][name].attrs["description"] for name in (*COLUMNS, "images", "masks"))

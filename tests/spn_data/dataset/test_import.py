@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import piexif
 import pytest
@@ -23,6 +24,7 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.dataset.nvm import build_nvm_model, read_nvm, read_nvm_models, write_nvm
 from spn_data.dataset.nvm_frames import camera_from_visualsfm, match_names
 from spn_data.dataset.pose_agreement import name_disagreement
+from spn_data.dataset.samples import open_samples
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity
@@ -33,6 +35,7 @@ from spn_data.geometry.rotations import (
 )
 from spn_data.inputs.cambridge_frames import LISTS
 from spn_data.pipeline.import_cambridge import Imported, ImportOptions, import_cambridge
+from spn_model.examples.training_set import TrainingSet
 
 OUTLIER = "seq5/frame00297.png"
 LENS = Camera("SIMPLE_PINHOLE", 160, 90, np.array([120.0, 80.0, 45.0]))
@@ -561,14 +564,43 @@ def test_dark_images_are_noted_in_the_file_too(scene, tmp_path):
         assert dataset.info.notes == done.notes
 
 
-def test_coordinates_far_from_zero_are_refused_until_an_offset_is_subtracted(scene, tmp_path):
-    """UTM coordinates, too coarse in float32, are refused with the offset to subtract."""
-    offset = np.array([563247.0, 5934791.0, 323.0])
+@pytest.mark.parametrize(
+    "offset",
+    [(563247.0, 5934791.0, 323.0), (3771793.25, 140253.5, 5124304.125)],
+    ids=["UTM", "Earth-centred"],
+)
+def test_coordinates_far_from_zero_are_stored_relative_to_an_offset(scene, tmp_path, offset):
+    """Coordinates too coarse in float32 are small in the file, and read as given; --subtract removes them."""
+    offset = np.array(offset)
     run(scene, tmp_path / "near.h5", width_px=80)
     relist(scene, lambda c: [c[0], *map(repr, (np.array(c[1:4], float) + offset).tolist()), *c[4:]])
     shift_model(scene, offset)
-    with pytest.raises(InputError, match=r"would round them to 0.5; subtract .* --subtract 56"):
-        run(scene, tmp_path / "far.h5", width_px=80)
+    done = run(scene, tmp_path / "utm.h5", width_px=80)
+    assert any("far from zero: the file stores them relative to" in note for note in done.notes)
+    listed = read_cambridge(scene / LISTS[Role.TRAIN]).poses.centers
+    with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "utm.h5") as two:
+        near, far = one.groups["train"], two.groups["train"]
+        assert one.info.offset == (0, 0, 0)
+        assert np.abs(two.info.offset - offset).max() < 10
+        assert (far.poses.centers == listed).all()
+        assert np.allclose(far.points(0).xyz - offset, near.points(0).xyz, rtol=0, atol=1e-8)
+        samples = open_samples(tmp_path / "utm.h5", "train")
+        assert (samples[0]["position"] == listed[0]).all()
+        assert (samples.offset == two.info.offset).all()
+        moved = np.array(two.info.offset) - offset
+        (a, b), (c, d) = (
+            (of.poses.centers, of.points(0).xyz) for of in map(TrainingSet, (near, far))
+        )
+        assert np.allclose(c + moved, a, rtol=0, atol=1e-8)
+        assert np.allclose(d + moved, b, rtol=0, atol=1e-8)
+    with h5py.File(tmp_path / "near.h5") as one, h5py.File(tmp_path / "utm.h5") as two:
+        assert (one.attrs["version"], two.attrs["version"]) == (1, 2)
+        assert "offset_x" not in one.attrs
+        assert b"relative to offset_x" in two.attrs["conventions"]
+        stored = [two["train/centers"], two["train/points/xyz"]]
+        assert all(np.abs(values[:]).max() < 100 for values in stored)
+        assert all(b"offset of the file" in values.attrs["description"] for values in stored)
+        assert b"offset" not in one["train/centers"].attrs["description"]
     done = run(scene, tmp_path / "far.h5", width_px=80, subtract=tuple(offset.tolist()))
     assert any("was subtracted from all positions" in note for note in done.notes)
     with Dataset(tmp_path / "near.h5") as one, Dataset(tmp_path / "far.h5") as two:
@@ -643,7 +675,7 @@ def test_bmp_and_webp_are_read(scene, tmp_path, suffix):
         ("01-nvm-of-other-image-size", "made of images of another size"),
         ("04-nvm-mixed-scale", "made of smaller images"),
         ("05-exif-turned-against-poses", "read as stored"),
-        ("07-utm-labels", "--subtract 563238 5934792 324"),
+        ("07-utm-labels", "relative to the offset 563238 5934792 324"),
         ("09-sixteen-bit-of-twelve", "uses only values 336 to 3904 of 16 bits"),
         (
             "10-failed-frames-at-origin",

@@ -84,6 +84,19 @@ def test_estimates_are_drawn_to_scale():
     np.testing.assert_allclose((above - other)[:, 1], 2 * per_m, atol=0.2)
 
 
+def test_long_coordinates_are_counted_from_a_round_number():
+    """Far from zero, the drawing is the same, and axes say what has to be added to their labels."""
+    by = (500_000.0, 5_400_000.0, 300.0)
+    there = replace(frames(), poses=TRUE.moved_by(by), axes=("x", "y", "z"))
+    one = replace(shifted([0, 4, 0]), poses=shifted([0, 4, 0]).poses.moved_by(by))
+    far = parsed(figures.trajectories(TRAINING.moved_by(by), there, [one]))
+    near = parsed(figures.trajectories(TRAINING, frames(), [shifted([0, 4, 0])]))
+    np.testing.assert_allclose(*(circles(tree, svg.COLOURS[0]) for tree in (far, near)), atol=0.11)
+    assert {"x - 500000 (m)", "y - 5400000 (m)", "z (m)"} <= set(texts(far))
+    assert {"0", "10", "300"} <= set(texts(far))
+    assert not any("e+" in text for text in texts(far))
+
+
 def test_what_is_not_drawn_is_counted():
     """The legend counts estimates outside the plot and frames without a pose."""
     found = shifted([0, 0, 0])

@@ -408,7 +408,11 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "large": (lambda f: (f / "bundle.json").write_text(" " * 1_000_001), "larger than 1 MB"),
     "a list": (lambda f: (f / "bundle.json").write_text("[]"), "its format is not"),
-    "newer": (edited(lambda d: d.update(version=2)), "has format 2, but this program reads 1"),
+    "newer": (
+        edited(lambda d: d.update(version=3)),
+        "has format 3, but this program reads 1 and 2",
+    ),
+    "version without offset": (edited(lambda d: d.update(version=2)), "contradict each other"),
     "no version": (
         edited(lambda d: d.update(version=float("inf"))),
         "not a valid bundle description",
