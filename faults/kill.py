@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib
 import json
 import multiprocessing
 import os
+import pkgutil
 import shutil
 import signal
 import subprocess
@@ -66,8 +68,11 @@ def counter(work: Path) -> Path:
 def prepare() -> None:
     """Import what the commands need, so that a forked process starts at once."""
     import cv2
+    import spn_cli
     import torch
 
+    import spn_data
+    import spn_model
     from spn_data.work.parallel import WorkerPool
     from tests.worlds.training_world import register_tiny
 
@@ -75,11 +80,15 @@ def prepare() -> None:
         for _label, arguments in batches:
             on_result(function(*arguments))
 
+    for package in (spn_cli, spn_data, spn_model):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith((".__main__", ".cluster")):
+                importlib.import_module(module.name)
     WorkerPool.run = run_here  # type: ignore[method-assign]
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     register_tiny()
-    _adopt()
+    adopt_orphans()
 
 
 def run(command: Command, work: Path, at: int = -1, output: Path | None = None) -> int:
@@ -186,17 +195,15 @@ def kill_once(command: Command, whole: Undisturbed, folder: Path, at: int) -> Ki
         return None
     if code != -signal.SIGKILL:
         return Kill(command.name, at, (), (f"exit code {code} instead of a kill",))
-    lost = _lost(command, whole.before, work)
+    gone = lost(command, whole.before, work)
     code = run(command, work, output=own / "again")
-    lost += _lost(command, whole.before, work)
-    different = [f"exit code {code}"] if code else []
-    if not code:
-        different = _different(command, whole, work)
-    output = (own / "again").read_text()[-600:] if lost or different else ""
-    return Kill(command.name, at, tuple(dict.fromkeys(lost)), tuple(different), output)
+    gone += lost(command, whole.before, work)
+    changed = [f"exit code {code}"] if code else different(command, whole, work)
+    output = (own / "again").read_text()[-600:] if gone or changed else ""
+    return Kill(command.name, at, tuple(dict.fromkeys(gone)), tuple(changed), output)
 
 
-def _lost(command: Command, before: dict[str, str], work: Path) -> list[str]:
+def lost(command: Command, before: dict[str, str], work: Path) -> list[str]:
     """Return what was changed or removed outside what the command may write."""
     from spn_data.area.area import Area
 
@@ -224,7 +231,7 @@ def _is_stage(name: str) -> bool:
     )
 
 
-def _different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
+def different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
     """Return in what the result differs from that of an undisturbed run."""
     found = differences(whole.after, contents(work))
     if not command.is_mapped or not found:
@@ -255,13 +262,13 @@ def campaign(names: list[str], folder: Path, kills: int, jobs: int) -> list[Kill
         whole = undisturbed(command, folder)
         ks = evenly(whole.changes, kills)
         context = multiprocessing.get_context("fork")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_adopt) as pool:
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=adopt_orphans) as pool:
             tried = list(pool.map(partial(kill_once, command, whole, folder), ks))
         done = [kill for kill in tried if kill is not None]
-        lost, different = totals(done)
+        gone, changed = totals(done)
         took = time.monotonic() - began
         print(
-            f"{name:<28}{whole.changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}",
+            f"{name:<28}{whole.changes:>8}{len(done):>7}{gone:>6}{changed:>11}{took:>7.0f}",
             flush=True,
         )
         found += done
@@ -277,7 +284,8 @@ def totals(kills: list[Kill]) -> tuple[int, int]:
     return sum(bool(kill.lost) for kill in kills), sum(bool(kill.different) for kill in kills)
 
 
-def _adopt() -> None:
+def adopt_orphans() -> None:
+    """Become the parent of orphaned descendants, so that they can be waited for."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
@@ -298,11 +306,11 @@ def main() -> None:
         environment = {**os.environ, "LD_PRELOAD": library, "OMP_NUM_THREADS": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "faults.kill", *sys.argv[1:]], environment)
     kills = campaign(given.only, folder, given.kills, given.jobs)
-    lost, different = totals(kills)
-    print(f"{len(kills)} kills: {lost} lost, {different} different")
+    gone, changed = totals(kills)
+    print(f"{len(kills)} kills: {gone} lost, {changed} different")
     if given.json is not None:
         given.json.write_text(json.dumps([asdict(kill) for kill in kills], indent=1) + "\n")
-    sys.exit(bool(lost or different))
+    sys.exit(bool(gone or changed))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
-"""Console entry points; they report a missing extra in one line instead of a traceback."""
+"""Console entry points: a missing extra, and a signal while libraries are loaded, give one line."""
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from importlib import import_module
 from typing import NoReturn
 
 DISTRIBUTION = "squeezeposenet-toolkit"
+STOPPED = "Stopped. Completed work is kept: run the same command to resume."
 # Packages by the extra that installs them.
 _EXTRAS = {
     "data": ("av", "click", "defusedxml", "h5py", "PIL", "pycolmap", "rich", "scipy", "tomli_w"),
@@ -26,10 +29,19 @@ def model() -> None:
 
 
 def _run(program: str, module: str) -> None:
+    # Until the command begins and after it has ended; in between, see `spn_cli.console`.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _stop)
     try:
         import_module(f"spn_cli.{module}").main(prog_name=program)
     except ModuleNotFoundError as error:
         _report_missing(program, module, error)
+
+
+def _stop(number: int, _frame: object) -> NoReturn:
+    """Exit at once: libraries that are being loaded turn an exception into one of their own."""
+    os.write(2, f"\n{STOPPED}\n".encode())
+    os._exit(128 + number)
 
 
 def _report_missing(program: str, own_extra: str, error: ModuleNotFoundError) -> NoReturn:
