@@ -1,15 +1,23 @@
-"""Console entry points: a missing extra, and a signal while libraries are loaded, give one line."""
+"""Console entry points: one line for a missing extra, too little memory, and a signal while modules load."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from importlib import import_module
 from typing import NoReturn
 
 DISTRIBUTION = "squeezeposenet-toolkit"
-STOPPED = "Stopped. Completed work is kept: run the same command to resume."
+_KEPT = "Completed work is kept: run the same command to resume."
+STOPPED = f"Stopped. {_KEPT}"
+# What libraries say instead of raising MemoryError.
+_NO_MEMORY = re.compile(
+    r"failed to map segment|allocate memory|bad[ _]alloc|Insufficient memory|start new thread",
+    re.IGNORECASE,
+)
+_MOST_TOLD = 120
 # Packages by the extra that installs them.
 _EXTRAS = {
     "data": ("av", "click", "defusedxml", "h5py", "PIL", "pycolmap", "rich", "scipy", "tomli_w"),
@@ -36,6 +44,13 @@ def _run(program: str, module: str) -> None:
         import_module(f"spn_cli.{module}").main(prog_name=program)
     except ModuleNotFoundError as error:
         _report_missing(program, module, error)
+    except Exception as error:
+        if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
+            raise
+        sys.exit(
+            "Error: there is not enough memory for this, or a limit such as ulimit -v is too low "
+            f"({' '.join(str(error).split())[:_MOST_TOLD] or type(error).__name__}). {_KEPT}"
+        )
 
 
 def _stop(number: int, _frame: object) -> NoReturn:
