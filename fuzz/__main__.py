@@ -44,8 +44,7 @@ def main() -> int:
         if number < -count or not count:
             parser.exit(
                 1,
-                f"Error: {given.replay}: is an input of {target} number {number}, of which there are {count} seeds "
-                "on this machine\n",
+                f"Error: {given.replay}: cannot be made again: {target} has {count} seeds on this machine\n",
             )
         verdict, text = campaign.serve(target, number)
         print(verdict, text, sep="\n")
