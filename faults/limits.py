@@ -1,4 +1,4 @@
-"""Run each command under limits of the machine and under signals, rerun it, and print a table of what happened.
+"""Run each command under limits of the machine and under signals, rerun it, and print a table.
 
     python -m faults.limits [--only NAME ...] [--limit NAME ...] [--jobs 2] [--work build/kill]
 
@@ -11,9 +11,9 @@ as a process of its own, in a copy of the state in which it starts:
 - tmp full, tmp read-only: TMPDIR, /tmp and /var/tmp are a full or a read-only file system;
 - SIGTERM at 10 and 60 %, Ctrl-C for all its processes at 40 and 85 % of the time of an undisturbed run.
 
-In the table: "as usual" if it ended with 0 and the files of an undisturbed run; its exit code if it ended with
-one line, lost nothing, left no process, and the rerun made the files of an undisturbed run; "!" otherwise, with
-a line below the table that says what was wrong.
+In the table: "as usual" if it ended with 0 and the files of an undisturbed run; its exit code if it ended
+with one line, lost nothing, left no process, and the rerun made the files of an undisturbed run; "!"
+otherwise, with a line below the table that says what was wrong.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ from faults.kill import Undisturbed, adopt_orphans, counter, different, lost, pr
 
 _ROOT = Path(__file__).resolve().parents[1]
 _PAGE = 4096
-_STOP_S = 5.0  # time to end after a signal
+_STOP_S = 5.0  # time to end after a signal, on a machine with as many tasks as cores
 _LIMIT_S = 300.0
 _STOPPED = "Stopped. Completed work is kept: run the same command to resume."
+_BY_TORCH = "+torchinductor_root"  # torch makes it where temporary files go: here, if nowhere else
 _NATIVE = re.compile(
     r"Traceback|Fatal Python error|terminate called|\*\*\* |Aborted|Segmentation|core dumped"
     r"|Exception ignored|Warning: |^  File \"",
@@ -120,7 +121,7 @@ LIMITS = (
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended under a limit. line : what it said last; wrong : what was wrong, empty if nothing."""
+    """How a command ended under a limit. line : what it said last; wrong : empty if nothing was."""
 
     command: str
     limit: str
@@ -164,7 +165,7 @@ def _started(command: Command, limit: Limit, own: Path, start: Path, size: int) 
 
 
 def _end_of(process: subprocess.Popen, limit: Limit, usual_s: float) -> tuple[int, float, int]:
-    """Wait for a process, after its signal; return exit code, seconds to the end, and processes left behind."""
+    """Wait for a process, after its signal; return exit code, seconds to the end, and processes left."""
     began = time.monotonic()
     stop_s = 0.0
     if limit.sent is not None:
@@ -239,7 +240,8 @@ def tried(
     output = (own / "output").read_text(errors="replace")
     lines = [line for line in output.splitlines() if line.strip()]
     wrong = [*_wrong_output(output, lines, code, limit), *lost(command, whole.before, work)]
-    if code and limit.sent is not None and stop_s > _STOP_S:
+    load = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    if code and limit.sent is not None and stop_s > _STOP_S * load:
         wrong.append(f"ended {stop_s:.0f} s after the signal")
     if orphans:
         wrong.append("a process went on")
@@ -247,7 +249,7 @@ def tried(
         shutil.rmtree(own / "work")
         work = work.rename(own / "work")
     if not wrong and code == 0:
-        wrong += different(command, whole, work)
+        wrong += [found for found in different(command, whole, work) if found != _BY_TORCH]
     elif code:
         again = run(command, work, output=own / "again")
         wrong += [f"rerun: {found}" for found in lost(command, whole.before, work)]
