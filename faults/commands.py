@@ -27,6 +27,7 @@ SECOND = "second/flight2.mp4"
 NAMED = ("--name", "medium", "--rate", "1", "--any-telemetry")
 REDONE = ("--seed", "3", "--gap", "0.5", "--overwrite")
 SHORT = ("--length-factor", "0.02", "--area-factor", "0.3")
+CAMERA = ("--camera", "area/4-eval/medium/camera.json")
 RUN = (*AREA, *ONE, "--device", "cpu", "--run", "real")
 
 
@@ -160,9 +161,9 @@ _MODEL: tuple[Command, ...] = (
     ),
     Command(
         "predict",
-        ("spn-model", "predict", SECOND, *RUN, "--format", "wgs84"),
+        ("spn-model", "predict", SECOND, *RUN, *CAMERA, "--format", "wgs84", "--to", "poses"),
         "trained",
-        ("area/runs", "area/report.html"),
+        ("poses",),
     ),
     Command(
         "benchmark",

@@ -292,7 +292,7 @@ def table(found: list[Ended]) -> str:
 
 def campaign(names: list[str], limits: list[Limit], folder: Path, jobs: int) -> list[Ended]:
     """Run the named commands under limits; print each result when it is known."""
-    prepare()
+    prepare({"spn-data", "spn-model"})
     found: list[Ended] = []
     context = multiprocessing.get_context("fork")
     for name in names:
