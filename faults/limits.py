@@ -43,6 +43,8 @@ _STOP_S = 5.0  # time to end after a signal, on a machine with as many tasks as 
 _LIMIT_S = 300.0
 _STOPPED = "Stopped. Completed work is kept: run the same command to resume."
 _BY_TORCH = "+torchinductor_root"  # torch makes it where temporary files go: here, if nowhere else
+# The page is only noted to be missing: the results of the command are complete.
+_REPORT, _NO_REPORT = "~area/report.html", "Note: report.html could not be written"
 _NATIVE = re.compile(
     r"Traceback|Fatal Python error|terminate called|\*\*\* |Aborted|Segmentation|core dumped"
     r"|Exception ignored|Warning: |^  File \"",
@@ -249,7 +251,8 @@ def tried(
         shutil.rmtree(own / "work")
         work = work.rename(own / "work")
     if not wrong and code == 0:
-        wrong += [found for found in different(command, whole, work) if found != _BY_TORCH]
+        accepted = [_BY_TORCH, *([_REPORT] if _NO_REPORT in output else [])]
+        wrong += [found for found in different(command, whole, work) if found not in accepted]
     elif code:
         again = run(command, work, output=own / "again")
         wrong += [f"rerun: {found}" for found in lost(command, whole.before, work)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import signal
 import sys
 from importlib import import_module
@@ -40,6 +41,7 @@ def _run(program: str, module: str) -> None:
     # Until the command begins and after it has ended; in between, see `spn_cli.console`.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _stop)
+    _fit_blas_into_memory()
     try:
         import_module(f"spn_cli.{module}").main(prog_name=program)
     except ModuleNotFoundError as error:
@@ -51,6 +53,13 @@ def _run(program: str, module: str) -> None:
             "Error: there is not enough memory for this, or a limit such as ulimit -v is too low "
             f"({' '.join(str(error).split())[:_MOST_TOLD] or type(error).__name__}). {_KEPT}"
         )
+
+
+def _fit_blas_into_memory() -> None:
+    """Let OpenBLAS use one thread if memory is limited: it sends SIGINT if it cannot start more."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < 2e9 + 1e8 * (os.cpu_count() or 1):
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _stop(number: int, _frame: object) -> NoReturn:

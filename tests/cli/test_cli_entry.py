@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -42,6 +43,19 @@ def test_too_little_memory_gives_one_line(monkeypatch, error):
     assert "\n" not in str(stopped.value)
     with pytest.raises(RuntimeError, match="something else"):
         entry.model()
+
+
+def test_blas_has_one_thread_where_memory_is_limited():
+    """OpenBLAS interrupts a process in which it cannot start threads, as if Ctrl-C had been pressed."""
+    script = (
+        "import os, resource; from spn_cli import entry\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (10**9, 10**9))\n"
+        "entry.import_module = lambda name: os._exit(6 + int(os.environ['OPENBLAS_NUM_THREADS']))\n"
+        "entry.data()"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, timeout=60, check=False)
+    assert done.returncode == 7
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
