@@ -135,7 +135,7 @@ class Ended:
     @property
     def cell(self) -> str:
         """Text of the table."""
-        return "!" if self.wrong else "as usual" if self.code == 0 else str(self.code)
+        return "!" if self.wrong else "as usual" if self.code <= 0 else str(self.code)
 
 
 def _started(command: Command, limit: Limit, own: Path, start: Path, size: int) -> subprocess.Popen:
@@ -250,7 +250,7 @@ def tried(
     if limit.room is not None:
         shutil.rmtree(own / "work")
         work = work.rename(own / "work")
-    if not wrong and code == 0:
+    if not wrong and code <= 0:
         accepted = [_BY_TORCH, *([_REPORT] if _NO_REPORT in output else [])]
         wrong += [found for found in different(command, whole, work) if found not in accepted]
     elif code:
@@ -268,12 +268,13 @@ def tried(
 def _wrong_output(output: str, lines: list[str], code: int, limit: Limit) -> list[str]:
     """Return what is wrong with exit code and output."""
     wrong = []
-    if code not in (0, limit.code):
+    # After its last line a process can only end by the signal itself.
+    if code not in (0, limit.code, -(limit.sent or 0)):
         wrong.append(f"exit code {code}")
     if _NATIVE.search(output):
         wrong.append("a stack trace")
     said = [line for line in lines if line.startswith("Error") or line == _STOPPED]
-    if code and (len(said) != 1 or lines[-1] != said[0]):
+    if code > 0 and (len(said) != 1 or lines[-1] != said[0]):
         wrong.append(f"{len(said)} lines that say why, the last is {lines[-1:]}")
     return wrong
 
