@@ -40,7 +40,7 @@ from faults.kill import Undisturbed, adopt_orphans, counter, different, lost, pr
 _ROOT = Path(__file__).resolve().parents[1]
 _PAGE = 4096
 _STOP_S = 5.0  # time to end after a signal, on a machine with as many tasks as cores
-_LIMIT_S = 300.0
+_LIMIT_S = 1800.0
 _STOPPED = "Stopped. Completed work is kept: run the same command to resume."
 _BY_TORCH = "+torchinductor_root"  # torch makes it where temporary files go: here, if nowhere else
 # The page is only noted to be missing: the results of the command are complete.
