@@ -50,6 +50,7 @@ _NATIVE = re.compile(
     r"|Exception ignored|Warning: |^  File \"",
     re.MULTILINE,
 )
+# "trained" is spn-model train with a network that can be exported.
 ROWS = (
     *(
         "reconstruct",

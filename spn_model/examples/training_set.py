@@ -44,6 +44,8 @@ class TrainingSet:
         Whether z points up in the world.
     has_points : bool
         Whether map points are available for training.
+    check : callable
+        As given; long work on the set calls it too.
 
     Raises
     ------
