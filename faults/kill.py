@@ -39,7 +39,7 @@ from faults.contents import contents, differences
 
 _HERE = Path(__file__).resolve().parent
 _PR_SET_CHILD_SUBREAPER = 36
-_LIMIT_S = 1800  # of a command, also on a busy machine
+LIMIT_S = 1800  # of a command, also on a busy machine
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def run(command: Command, work: Path, at: int = -1, output: Path | None = None) 
 
 def _reaped(pid: int) -> int:
     """Wait for a process and all its descendants; return the exit code of the first."""
-    found, deadline = None, time.monotonic() + _LIMIT_S
+    found, deadline = None, time.monotonic() + LIMIT_S
     while True:
         try:
             ended, status = os.waitpid(-1, os.WNOHANG)

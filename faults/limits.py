@@ -33,15 +33,15 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from spn_cli.entry import STOPPED
+
 from faults.commands import ALL, COMMANDS, Command, state
 from faults.contents import contents
-from faults.kill import Undisturbed, adopt_orphans, counter, different, lost, prepare, run
+from faults.kill import LIMIT_S, Undisturbed, adopt_orphans, counter, different, lost, prepare, run
 
 _ROOT = Path(__file__).resolve().parents[1]
 _PAGE = 4096
 _STOP_S = 5.0  # time to end after a signal, on a machine with as many tasks as cores
-_LIMIT_S = 1800.0
-_STOPPED = "Stopped. Completed work is kept: run the same command to resume."
 _BY_TORCH = "+torchinductor_root"  # torch makes it where temporary files go: here, if nowhere else
 # The page is only noted to be missing: the results of the command are complete.
 _REPORT, _NO_REPORT = "~area/report.html", "Note: report.html could not be written"
@@ -181,7 +181,7 @@ def _end_of(process: subprocess.Popen, limit: Limit, usual_s: float) -> tuple[in
             else:
                 process.send_signal(limit.sent)
     try:
-        code = process.wait(_LIMIT_S)
+        code = process.wait(LIMIT_S)
         stop_s = time.monotonic() - began
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
@@ -199,7 +199,7 @@ def _orphans(seconds: float) -> int:
             return int(time.monotonic() - began > seconds)
         if not ended:
             time.sleep(0.02)
-        if time.monotonic() - began > _LIMIT_S:
+        if time.monotonic() - began > LIMIT_S:
             raise SystemExit("a process that a command left behind does not end")
 
 
@@ -274,7 +274,7 @@ def _wrong_output(output: str, lines: list[str], code: int, limit: Limit) -> lis
         wrong.append(f"exit code {code}")
     if _NATIVE.search(output):
         wrong.append("a stack trace")
-    said = [line for line in lines if line.startswith("Error") or line == _STOPPED]
+    said = [line for line in lines if line.startswith("Error") or line == STOPPED]
     if code > 0 and (len(said) != 1 or lines[-1] != said[0]):
         wrong.append(f"{len(said)} lines that say why, the last is {lines[-1:]}")
     return wrong
