@@ -35,7 +35,7 @@ from pathlib import Path
 
 from spn_cli.entry import STOPPED
 
-from faults.commands import ALL, COMMANDS, Command, state
+from faults.commands import ALL, Command, state
 from faults.contents import contents
 from faults.kill import LIMIT_S, Undisturbed, adopt_orphans, counter, different, lost, prepare, run
 
@@ -318,7 +318,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     known = list(dict.fromkeys(limit.name for limit in LIMITS))
-    parser.add_argument("--only", nargs="*", choices=[*COMMANDS, *ROWS], default=[*ROWS])
+    parser.add_argument("--only", nargs="*", choices=[*ALL], default=[*ROWS])
     parser.add_argument("--limit", nargs="*", choices=known, default=known)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--work", type=Path, default=_ROOT / "build" / "kill")
