@@ -45,6 +45,8 @@ _STOP_S = 5.0  # time to end after a signal, on a machine with as many tasks as 
 _BY_TORCH = "+torchinductor_root"  # torch makes it where temporary files go: here, if nowhere else
 # The page is only noted to be missing: the results of the command are complete.
 _REPORT, _NO_REPORT = "~area/report.html", "Note: report.html could not be written"
+# OpenBLAS ends a process for which it finds no memory itself.
+_REASONS = ("Error", "OpenBLAS error: Memory allocation still failed")
 _NATIVE = re.compile(
     r"Traceback|Fatal Python error|terminate called|\*\*\* |Aborted|Segmentation|core dumped"
     r"|Exception ignored|Warning: |^  File \"",
@@ -274,7 +276,7 @@ def _wrong_output(output: str, lines: list[str], code: int, limit: Limit) -> lis
         wrong.append(f"exit code {code}")
     if _NATIVE.search(output):
         wrong.append("a stack trace")
-    said = [line for line in lines if line.startswith("Error") or line == STOPPED]
+    said = [line for line in lines if line.startswith(_REASONS) or line == STOPPED]
     if code > 0 and (len(said) != 1 or lines[-1] != said[0]):
         wrong.append(f"{len(said)} lines that say why, the last is {lines[-1:]}")
     return wrong
