@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test test-slow fuzz kill lint docs clean
+.PHONY: demo test test-slow fuzz kill limits lint docs clean
 
 $(VENV)/installed: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -50,6 +50,10 @@ fuzz: $(VENV)/installed
 # Kills every command at up to 30 of its changes of files on a small area, reruns and compares; Linux and cc only.
 kill: $(VENV)/installed
 	PYTHONPATH=.:cli $(BIN)/python -m faults.kill
+
+# Runs every command with a full disk, little memory and the like, and under signals; half an hour; needs to mount.
+limits: $(VENV)/installed
+	PYTHONPATH=.:cli $(BIN)/python -m faults.limits
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -12,7 +12,7 @@ from pathlib import Path
 REAL = """\
 kind = "scene-coordinates"
 weights = "published"
-options = { shrink = 2 }
+options = { shrink = 1 }
 [[stages]]
 name = "all"
 images = 24
@@ -26,6 +26,8 @@ TRAIN = (*AREA, *ONE, "--device", "cpu", "--precision", "float32", "--validation
 SECOND = "second/flight2.mp4"
 NAMED = ("--name", "medium", "--rate", "1", "--any-telemetry")
 REDONE = ("--seed", "3", "--gap", "0.5", "--overwrite")
+SHORT = ("--length-factor", "0.02", "--area-factor", "0.3")
+CAMERA = ("--camera", "area/4-eval/medium/camera.json")
 RUN = (*AREA, *ONE, "--device", "cpu", "--run", "real")
 
 
@@ -54,6 +56,12 @@ class Command:
 
 
 _DATA: tuple[Command, ...] = (
+    Command(
+        "simulate",
+        ("spn-data", "simulate", "simulated", "--preset", "demo", "--only", "flight1", *SHORT),
+        "flights",
+        ("simulated",),
+    ),
     Command(
         "reconstruct",
         ("spn-data", "reconstruct", "flights/mapping", *SMALL, "--fov", "72"),
@@ -141,7 +149,7 @@ _MODEL: tuple[Command, ...] = (
     ),
     Command(
         "evaluate",
-        ("spn-model", "evaluate", *RUN, "--dropout-samples", "0"),
+        ("spn-model", "evaluate", *RUN),
         "trained",
         ("area/runs", "area/report.html"),
     ),
@@ -153,9 +161,9 @@ _MODEL: tuple[Command, ...] = (
     ),
     Command(
         "predict",
-        ("spn-model", "predict", SECOND, *RUN, "--format", "geojson"),
+        ("spn-model", "predict", SECOND, *RUN, *CAMERA, "--format", "wgs84", "--to", "poses"),
         "trained",
-        ("area/runs", "area/report.html"),
+        ("poses",),
     ),
     Command(
         "benchmark",
@@ -176,7 +184,7 @@ _HELPERS: tuple[Command, ...] = (
         "trained",
         ("spn-model", "train", *TRAIN, "--recipe", "real.toml"),
         "split",
-        (),
+        ("area/runs", "area/report.html"),
     ),
     Command(
         "bundle",

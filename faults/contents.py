@@ -13,7 +13,7 @@ from typing import Any
 
 _TIMES = re.compile(
     r"(^|_)(seconds|started|finished|versions|threads|created)$"
-    r"|^(train_s|validate_s|wait_s|images_per_s|load_s|run_s|written|size_bytes)$"
+    r"|^(train_s|validate_s|wait_s|ms_an_image|images_per_s|load_s|run_s|written|size_bytes)$"
 )
 _TEXT_TIMES = re.compile(
     r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d)?(\+00:00|Z| UTC)?|\d+(\.\d+)? (s|ms|min|h)\b"

@@ -8,18 +8,21 @@ kills the process just before change k. Work that belongs to worker processes is
 so that it is killed at each change too; COLMAP's mapper is a child process and ends with it. All k are
 tried if there are at most `--kills`, otherwise as many, evenly spaced.
 
-Counted per command: kills | lost: something of the user's, or a finished stage that the command does not
-make, is changed or missing after the kill or the rerun | different: the rerun fails, or its files differ from
-those of an undisturbed run (times excepted; poses after mapping may differ by 1 cm).
+Counted per command: null: files that differ between two undisturbed runs | kills | lost: something of the
+user's, or a finished stage that the command does not make, is changed or missing after the kill or the
+rerun | different: the rerun fails, or its files differ from those of an undisturbed run (times excepted;
+poses after mapping may differ by 1 cm).
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib
 import json
 import multiprocessing
 import os
+import pkgutil
 import shutil
 import signal
 import subprocess
@@ -36,7 +39,7 @@ from faults.contents import contents, differences
 
 _HERE = Path(__file__).resolve().parent
 _PR_SET_CHILD_SUBREAPER = 36
-_LIMIT_S = 300
+LIMIT_S = 1800  # of a command, also on a busy machine
 
 
 @dataclass(frozen=True)
@@ -63,23 +66,34 @@ def counter(work: Path) -> Path:
     return library
 
 
-def prepare() -> None:
-    """Import what the commands need, so that a forked process starts at once."""
+def prepare(programs: set[str]) -> None:
+    """Import what commands of these programs need, so that a forked process starts at once."""
     import cv2
-    import torch
+    import spn_cli
 
+    import spn_data
+    import spn_model
     from spn_data.work.parallel import WorkerPool
-    from tests.worlds.training_world import register_tiny
 
     def run_here(_: WorkerPool, function: Any, batches: Any, on_result: Any) -> None:
         for _label, arguments in batches:
             on_result(function(*arguments))
 
+    packages = [spn_cli, spn_data, *([spn_model] if "spn-model" in programs else [])]
+    for package in packages:
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith((".__main__", ".cluster")):
+                importlib.import_module(module.name)
     WorkerPool.run = run_here  # type: ignore[method-assign]
     cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    register_tiny()
-    _adopt()
+    adopt_orphans()
+    if spn_model in packages:
+        import torch
+
+        from tests.worlds.training_world import register_tiny
+
+        torch.set_num_threads(1)
+        register_tiny()
 
 
 def run(command: Command, work: Path, at: int = -1, output: Path | None = None) -> int:
@@ -99,7 +113,7 @@ def run(command: Command, work: Path, at: int = -1, output: Path | None = None) 
 
 def _reaped(pid: int) -> int:
     """Wait for a process and all its descendants; return the exit code of the first."""
-    found, deadline = None, time.monotonic() + _LIMIT_S
+    found, deadline = None, time.monotonic() + LIMIT_S
     while True:
         try:
             ended, status = os.waitpid(-1, os.WNOHANG)
@@ -175,6 +189,16 @@ def undisturbed(command: Command, folder: Path) -> Undisturbed:
     return Undisturbed(start, contents(start), work, contents(work), changes)
 
 
+def same_again(command: Command, whole: Undisturbed, folder: Path) -> Kill:
+    """Compare two undisturbed runs: what differs between them, no kill has changed."""
+    work = folder / "again" / "work"
+    shutil.rmtree(work.parent, ignore_errors=True)
+    shutil.copytree(whole.start, work)
+    code = run(command, work)
+    changed = different(command, whole, work) if code == 0 else [f"exit code {code}"]
+    return Kill(command.name, 0, tuple(lost(command, whole.before, work)), tuple(changed))
+
+
 def kill_once(command: Command, whole: Undisturbed, folder: Path, at: int) -> Kill | None:
     """Kill a command at one change and run it again; None if it ended before the kill."""
     own = folder / f"worker-{os.getpid()}"
@@ -186,17 +210,15 @@ def kill_once(command: Command, whole: Undisturbed, folder: Path, at: int) -> Ki
         return None
     if code != -signal.SIGKILL:
         return Kill(command.name, at, (), (f"exit code {code} instead of a kill",))
-    lost = _lost(command, whole.before, work)
+    gone = lost(command, whole.before, work)
     code = run(command, work, output=own / "again")
-    lost += _lost(command, whole.before, work)
-    different = [f"exit code {code}"] if code else []
-    if not code:
-        different = _different(command, whole, work)
-    output = (own / "again").read_text()[-600:] if lost or different else ""
-    return Kill(command.name, at, tuple(dict.fromkeys(lost)), tuple(different), output)
+    gone += lost(command, whole.before, work)
+    changed = [f"exit code {code}"] if code else different(command, whole, work)
+    output = (own / "again").read_text()[-600:] if gone or changed else ""
+    return Kill(command.name, at, tuple(dict.fromkeys(gone)), tuple(changed), output)
 
 
-def _lost(command: Command, before: dict[str, str], work: Path) -> list[str]:
+def lost(command: Command, before: dict[str, str], work: Path) -> list[str]:
     """Return what was changed or removed outside what the command may write."""
     from spn_data.area.area import Area
 
@@ -224,7 +246,7 @@ def _is_stage(name: str) -> bool:
     )
 
 
-def _different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
+def different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
     """Return in what the result differs from that of an undisturbed run."""
     found = differences(whole.after, contents(work))
     if not command.is_mapped or not found:
@@ -239,32 +261,37 @@ def _different(command: Command, whole: Undisturbed, work: Path) -> list[str]:
 
 def evenly(changes: int, kills: int) -> list[int]:
     """Return numbers of changes from 1 to `changes`: all, or as many as wanted, evenly spaced."""
-    if changes <= kills:
-        return list(range(1, changes + 1))
+    if changes <= kills or kills < 2:
+        return list(range(1, min(changes, kills) + 1))
     return sorted({1 + round(k * (changes - 1) / (kills - 1)) for k in range(kills)})
 
 
 def campaign(names: list[str], folder: Path, kills: int, jobs: int) -> list[Kill]:
     """Kill the named commands and print a row for each."""
-    prepare()
+    prepare({COMMANDS[name].words[0] for name in names})
     found: list[Kill] = []
-    print(f"{'command':<28}{'changes':>8}{'kills':>7}{'lost':>6}{'different':>11}{'s':>7}")
+    print(
+        f"{'command':<28}{'changes':>8}{'null':>6}{'kills':>7}{'lost':>6}{'different':>11}{'s':>7}"
+    )
     for name in names:
         began = time.monotonic()
         command = COMMANDS[name]
         whole = undisturbed(command, folder)
+        null = same_again(command, whole, folder)
         ks = evenly(whole.changes, kills)
         context = multiprocessing.get_context("fork")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_adopt) as pool:
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=adopt_orphans) as pool:
             tried = list(pool.map(partial(kill_once, command, whole, folder), ks))
         done = [kill for kill in tried if kill is not None]
-        lost, different = totals(done)
+        gone, changed = totals(done)
         took = time.monotonic() - began
         print(
-            f"{name:<28}{whole.changes:>8}{len(done):>7}{lost:>6}{different:>11}{took:>7.0f}",
+            f"{name:<28}{whole.changes:>8}{len(null.different):>6}{len(done):>7}{gone:>6}{changed:>11}"
+            f"{took:>7.0f}",
             flush=True,
         )
         found += done
+        done = [null, *done]
         for kill in done:
             if kill.lost or kill.different:
                 print(f"  at {kill.at}: lost {kill.lost[:6]} different {kill.different[:6]}")
@@ -277,7 +304,8 @@ def totals(kills: list[Kill]) -> tuple[int, int]:
     return sum(bool(kill.lost) for kill in kills), sum(bool(kill.different) for kill in kills)
 
 
-def _adopt() -> None:
+def adopt_orphans() -> None:
+    """Become the parent of orphaned descendants, so that they can be waited for."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
@@ -298,11 +326,11 @@ def main() -> None:
         environment = {**os.environ, "LD_PRELOAD": library, "OMP_NUM_THREADS": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "faults.kill", *sys.argv[1:]], environment)
     kills = campaign(given.only, folder, given.kills, given.jobs)
-    lost, different = totals(kills)
-    print(f"{len(kills)} kills: {lost} lost, {different} different")
+    gone, changed = totals(kills)
+    print(f"{len(kills)} kills: {gone} lost, {changed} different")
     if given.json is not None:
         given.json.write_text(json.dumps([asdict(kill) for kill in kills], indent=1) + "\n")
-    sys.exit(bool(lost or different))
+    sys.exit(bool(gone or changed))
 
 
 if __name__ == "__main__":

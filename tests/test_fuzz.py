@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fuzz.__main__ import failed_input
 from fuzz.limits import Reader, limited, wait_for
 from fuzz.mutate import mutated
 from fuzz.seeds import make_small
@@ -158,3 +159,23 @@ def test_messages_are_one_line():
         str(FormatError("a.onnx: onnxruntime says\n  more\r\n")) == "a.onnx: onnxruntime says more"
     )
     assert str(InputError("x", path="a\nb")) == "a b: x"
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"\xd0\xff", "cannot be read"),
+        (b"[1]", "a list instead of an object"),
+        (b'{"target": "srt", "seed": 1}', "'number' is missing"),
+        (b'{"target": "nothing", "seed": 1, "number": 2}', "no target is named 'nothing'"),
+        (b'{"target": "srt", "seed": 1, "number": "2"}', "'2' is no number"),
+    ],
+)
+def test_what_is_no_input_of_a_failure_is_refused(tmp_path, content, told):
+    """`python -m fuzz --replay` refuses another file in one line that says what is wrong with it."""
+    path = tmp_path / "input.json"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=told):
+        failed_input(path)
+    path.write_bytes(b'{"target": "srt", "seed": 1, "number": -2, "origin": "a"}')
+    assert failed_input(path) == ("srt", -2, 1)

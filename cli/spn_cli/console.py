@@ -24,6 +24,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 from rich.text import Text
 
+from spn_cli.entry import STOPPED
 from spn_data.errors import SpnError
 from spn_data.work.timing import Progress
 
@@ -55,9 +56,7 @@ class Group(click.Group):
             is_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
             raise click.ClickException(f"{error}{_KEPT if is_full else ''}") from error
         except KeyboardInterrupt:
-            click.echo(
-                "\nStopped. Completed work is kept: run the same command to resume.", err=True
-            )
+            click.echo(f"\n{STOPPED}", err=True)
             ctx.exit(128 + _stopped_by)
         except OSError as error:
             # Without a file name it is a bug, unless the disk refused a write.

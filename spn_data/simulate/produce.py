@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -31,6 +30,7 @@ from spn_data.simulate.scene import SceneFaces, build_scene, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
+from spn_data.storage.files import LOCK, locked
 from spn_data.work.parallel import exit_with_parent
 
 Progress = Callable[[int, int], None]
@@ -68,20 +68,28 @@ def simulate(
     if out.exists():
         raise StageError(f"{out} already exists; choose another folder or remove it first")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.partial-", dir=out.parent))
+        partial = out.with_name(f".{out.name}.partial")
+        partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StageError(f"{out}: cannot be created ({error})") from error
-    try:
-        _produce(partial, options, paths, progress, workers or os.cpu_count() or 1)
-        partial.chmod(0o755)  # mkdtemp creates folders that only the owner can read
-        if out.exists():
-            raise StageError(
-                f"{out} was created by another process while rendering; nothing was written to it"
-            )
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with locked(partial, "spn-data simulate"):
+        _remove_files(partial)  # of a run that was killed
+        try:
+            _produce(partial, options, paths, progress, workers or os.cpu_count() or 1)
+            if out.exists():
+                raise StageError(
+                    f"{out} was created by another process while rendering; nothing was written to it"
+                )
+            (partial / LOCK).unlink()
+            partial.rename(out)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove_files(partial: Path) -> None:
+    for entry in partial.iterdir():
+        if entry.name != LOCK:
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
 def _produce(

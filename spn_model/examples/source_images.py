@@ -127,6 +127,7 @@ class SourceImages:
             hiding = hiding[~self.ground.is_at_or_below(hiding)]
         made = []
         for row in self.rows:
+            data.check()
             pose = data.poses[row : row + 1]
             _, pixels, depth = projected(hiding, pose, data.intrinsics[row], data.size)
             made.append(Occluders.from_points(pixels, depth, data.size, _OCCLUDER_PX))
@@ -137,6 +138,7 @@ class SourceImages:
         cells = ground.samples()
         sources, places, sines = [self._source], [self._place], [np.empty(0)]
         for k, row in enumerate(self.rows):
+            data.check()
             pose = data.poses[row : row + 1]
             index, pixels, depth = projected(cells, pose, data.intrinsics[row], data.size)
             index = index[~self.occluders[k].hide(pixels, depth)]

@@ -31,7 +31,8 @@ class TrainingSet:
     up_is_known : bool
         Whether z points up in the world.
     check : callable
-        Called before each image is read; may raise an exception to stop.
+        Called before the image or the points of a frame are used, by any thread; may raise an exception to
+        stop what uses them.
 
     Attributes
     ----------
@@ -47,6 +48,8 @@ class TrainingSet:
         Whether z points up in the world.
     has_points : bool
         Whether map points are available for training.
+    check : callable
+        As given; long work on the set calls it too.
 
     Raises
     ------
@@ -73,6 +76,7 @@ class TrainingSet:
                     f"images of {group.name} and {groups[0].name} have different sizes: they cannot be "
                     "trained on together"
                 )
+        self.check = check
         self._rows = [(group, k) for group in groups for k in range(len(group))]
         self.up_is_known = up_is_known
         self.size: tuple[int, int] = groups[0].image_size or (0, 0)
@@ -86,19 +90,22 @@ class TrainingSet:
             check()
             self._images.append(group.image(k))
         every_pixel = all(group.all_valid for group in groups)
-        self._valid = None if every_pixel else [group.valid(k) for group, k in self._rows]
         self.has_points = groups[0].points_for_training
-        self._points = (
-            [_points_to_train_on(group, k, to_zero) for group, k in self._rows]
-            if self.has_points
-            else []
-        )
+        self._valid: list[np.ndarray | None] | None = None if every_pixel else []
+        self._points = []
+        for group, k in self._rows:
+            check()
+            if self._valid is not None:
+                self._valid.append(group.valid(k))
+            if self.has_points:
+                self._points.append(_points_to_train_on(group, k, to_zero))
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def image(self, row: int) -> np.ndarray:
         """Return an image (H, W, 3) uint8 RGB, which must not be modified."""
+        self.check()
         if row < len(self._images):
             return self._images[row]
         group, k = self._rows[row]
@@ -113,6 +120,7 @@ class TrainingSet:
 
         Raises InputError if there are none for training.
         """
+        self.check()
         if not self.has_points:
             raise InputError("the data set has no map points for training")
         return self._points[row]

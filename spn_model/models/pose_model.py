@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -161,12 +161,10 @@ class PoseModel(ABC):
             Intrinsic matrices K.
         """
 
-    def held_out_views(
-        self, data: TrainingSet, count: int, check: Callable[[], None] = lambda: None
-    ) -> HeldOutViews | None:
+    def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
         """Render up to `count` novel views like those of the stage that the stage never draws.
 
-        Returns None if the stage renders no views. `check` is called before each view; it may raise to stop.
+        Returns None if the stage renders no views.
         """
         return None
 

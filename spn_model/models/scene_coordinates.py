@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from threading import Lock
 from typing import Any, ClassVar
@@ -140,11 +140,9 @@ class SceneCoordinatesModel(PoseModel):
             "known": torch.from_numpy(known),
         }
 
-    def held_out_views(
-        self, data: TrainingSet, count: int, check: Callable[[], None] = lambda: None
-    ) -> HeldOutViews | None:
+    def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:
         """Render up to `count` novel views that the stage never draws; None if it renders none."""
-        return self._examples_of(data).held_out_views(count, check)
+        return self._examples_of(data).held_out_views(count)
 
     def _examples_of(self, data: TrainingSet) -> SceneExamples:
         with self._making_examples:  # once, by whichever thread is first: it can take seconds

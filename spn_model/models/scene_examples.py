@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -272,16 +271,13 @@ class SceneExamples:
         share = min(1.0, progress / _ALL_VIEWS_AT)
         return min(self._view_count, max(_FIRST_VIEWS, round(self._view_count * share)))
 
-    def held_out_views(
-        self, count: int, check: Callable[[], None] = lambda: None
-    ) -> HeldOutViews | None:
+    def held_out_views(self, count: int) -> HeldOutViews | None:
         """Render up to `count` views that no batch contains; None if the stage renders none."""
         if not self._options.views_share:
             return None
         numbers = range(_MOST_VIEWS, _MOST_VIEWS + count)
         made = []
         for number in numbers:
-            check()
             view = self._view(number)
             if view is not None:
                 made.append(view)

@@ -235,7 +235,12 @@ def run_stage(
             rate = stage.learning_rate_at(at.step, progress)
             for group in optimizer.param_groups:
                 group["lr"] = rate * group["rate"]
-            parts = [_on_device(ahead.next(), machine) for _ in range(stage.parts)]
+            try:
+                parts = [_on_device(ahead.next(), machine) for _ in range(stage.parts)]
+            except TrainingStopped:  # the resumed training makes the same batch
+                if record is not None:
+                    record.save(optimizer)
+                raise
             torch.manual_seed(torch_seed_of_step(seed, index, at.step, ranks.rank))
             loss, figures = gradient.compute(parts)
             seconds, stop = ranks.average(parameters, clock.seconds, watch.wants_stop())

@@ -212,7 +212,7 @@ class Record:
     def _with_views(self) -> list[ValidationFrames]:
         """Return the frames to evaluate, including the stage's views, which are rendered on first use."""
         if self._images is not None:
-            views = self.model.held_out_views(self._images, _VIEWS, self.check)
+            views = self.model.held_out_views(self._images, _VIEWS)
             if views is not None:
                 rows = np.arange(len(views.poses))
                 self.judged = [ValidationFrames("views", views, rows), *self.judged]

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import threading
+import time
 from pathlib import Path
 
 import click
@@ -175,6 +176,38 @@ def test_a_first_signal_outside_the_steps_stops_at_once(place, monkeypatch, numb
             for run in ("whole", "cut")
         ]
         assert all(torch.equal(both[0][key], both[1][key]) for key in both[0])
+
+
+@pytest.mark.parametrize("at", [1, 9])
+def test_a_signal_does_not_wait_for_the_batches_that_are_being_made(place, monkeypatch, at):
+    """Ctrl-C before the first step, and later, stops the making of batches; the resumed run is the same."""
+    assert trained(place, "--run", "whole").exit_code == 0
+    inner, made, asked = TinyModel.batch, [], []
+
+    def slow(self, data, rows, *others):
+        made.append(1)
+        if len(made) >= at:
+            if len(made) == at:
+                os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(1000):  # a hundred novel views of many images each
+                asked.append(data.image(int(rows[0])))
+                time.sleep(0.01)
+        return inner(self, data, rows, *others)
+
+    monkeypatch.setattr(TinyModel, "batch", slow)
+    cut = trained(place, "--run", "cut")
+    assert cut.exit_code == 130, cut.output
+    assert len(asked) < 300
+    monkeypatch.undo()
+    register_tiny()
+    resumed = trained(place, "--run", "cut")
+    assert resumed.exit_code == 0, resumed.output
+    assert ("Resuming" in resumed.output) == (at > 1)
+    both = [
+        load(place / "area" / "runs" / run / "last.safetensors").model.network.state_dict()
+        for run in ("whole", "cut")
+    ]
+    assert all(torch.equal(both[0][key], both[1][key]) for key in both[0])
 
 
 def test_a_kill_before_the_state_is_removed_leaves_nothing(place):

@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from spn_data.errors import FormatError, InputError, StageError
+from spn_data.errors import FormatError, InputError, InUseError, StageError
 from spn_data.simulate import (
     MappingPaths,
     SimulateOptions,
@@ -161,6 +161,22 @@ def test_existing_folder_is_refused_and_a_stopped_run_leaves_nothing(tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         simulate(tmp_path / "stopped", replace(TINY, only=("low",)), stop, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_what_a_killed_run_left_is_replaced_and_a_second_run_is_refused(tmp_path: Path) -> None:
+    """Files of a run that was killed do not stay; two runs at once do not write into one folder."""
+    left = tmp_path / ".out.partial"
+    (left / "mapping").mkdir(parents=True)
+    (left / "mapping" / "flight9.mp4").write_bytes(b"left")
+    options = replace(TINY, only=("low",))
+
+    def start_another(done: int, total: int) -> None:
+        with pytest.raises(InUseError, match="in use by another spn-data simulate"):
+            simulate(tmp_path / "out", options, workers=1)
+
+    simulate(tmp_path / "out", options, start_another, workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.split("/")[0] for path in tree(tmp_path / "out")} == {"evaluation", "truth"}
 
 
 def test_progress_counts_every_frame(tmp_path: Path) -> None:

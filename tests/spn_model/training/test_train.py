@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -295,9 +294,7 @@ def test_covariances_are_scaled_by_views_that_are_not_trained_on(tmp_path, monke
     """
     stages = []
 
-    def views(
-        self: TinyModel, data: TrainingSet, count: int, check: Callable[[], None] = lambda: None
-    ) -> HeldOutViews:
+    def views(self: TinyModel, data: TrainingSet, count: int) -> HeldOutViews:
         stages.append(len(data))
         shown = 12
         poses = data.poses[:shown]
