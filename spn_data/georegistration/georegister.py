@@ -14,10 +14,15 @@ from spn_data.georegistration.fit import FIXED_OFFSET_M, Estimate, estimate
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, up_from_level_cameras
 from spn_data.georegistration.observe import Fixes, observe
-from spn_data.georegistration.problem import Kind, Problem
+from spn_data.georegistration.problem import SHARED, Kind, Problem
 from spn_data.georegistration.ransac import extent, ransac_similarity
 from spn_data.georegistration.result import FitSummary, GeoFit
-from spn_data.georegistration.uncertainty import Uncertainty, effective_fixes, require_determined
+from spn_data.georegistration.uncertainty import (
+    Uncertainty,
+    drift_covariance,
+    effective_fixes,
+    require_determined,
+)
 from spn_data.telemetry.track import Telemetry
 
 # A fix is an outlier if its residual exceeds this many sigma of the white noise.
@@ -139,7 +144,7 @@ def _geo_fit(
     distance = np.zeros((len(Kind), len(problem.model)))
     distance[problem.kind, problem.frame] = result.distance
     outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
-    covariance = result.covariance[:7, :7].copy()
+    covariance = result.covariance[:SHARED, :SHARED] + drift_covariance(problem, result)
     # Gravity constrains the cameras' rotations; telemetry cannot show how positions are tilted against them.
     covariance[[3, 4], [3, 4]] += np.deg2rad(options.model_bend_deg) ** 2
     if not fixes.has_heights:

@@ -56,7 +56,7 @@ class FitState:
 
     offsets_m : (F,) height of each flight's zero above the first flight's; gimbal_deg : (F, 3) constant
     gimbal error of each flight about the camera's axes; level_deg : (F,) mean roll of frames without gimbal
-    angles.
+    angles; bias : (G, 3) common error of each bias group's fixes, in its sigma.
     """
 
     rotation: np.ndarray
@@ -65,6 +65,7 @@ class FitState:
     offsets_m: np.ndarray
     gimbal_deg: np.ndarray
     level_deg: np.ndarray
+    bias: np.ndarray
 
     def updated(self, step: np.ndarray) -> FitState:
         """Apply a step (P,) of all parameters."""
@@ -75,13 +76,16 @@ class FitState:
             self.center + step[:3],
             self.offsets_m + step[SHARED : SHARED + f],
             self.gimbal_deg + step[SHARED + f : SHARED + 4 * f].reshape(f, 3),
-            self.level_deg + step[SHARED + 4 * f :],
+            self.level_deg + step[SHARED + 4 * f : SHARED + 5 * f],
+            self.bias + step[SHARED + 5 * f :].reshape(-1, 3),
         )
 
     @property
     def nuisance(self) -> np.ndarray:
-        """Parameters (5 F,) other than the similarity."""
-        return np.concatenate([self.offsets_m, self.gimbal_deg.ravel(), self.level_deg])
+        """Parameters (5 F + 3 G,) other than the similarity."""
+        return np.concatenate(
+            [self.offsets_m, self.gimbal_deg.ravel(), self.level_deg, self.bias.ravel()]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +166,7 @@ class Problem:
             offsets,
             np.zeros((f, 3)),
             np.zeros(f),
+            np.zeros((self.fixes.bias_group.max() + 1, 3)),
         )
 
     def linearise(
@@ -181,6 +186,7 @@ class Problem:
                 1 / offset_sigma_m**2,
                 1 / np.repeat(bias, 3) ** 2,
                 np.full(f, 1 / self.options.level_camera_sigma_deg**2),
+                np.ones(state.bias.size),
             ]
         )
         value = np.concatenate([np.zeros(SHARED), state.nuisance])
@@ -194,11 +200,14 @@ class Problem:
         n, f = len(self.model), len(self.fixes.flights)
         flight, every = self.fixes.flight, np.arange(n)
         residual: np.ndarray = np.full((len(Kind), n), np.nan)
-        jacobian: np.ndarray = np.zeros((len(Kind), n, SHARED + 5 * f))
+        jacobian: np.ndarray = np.zeros((len(Kind), n, SHARED + 5 * f + state.bias.size))
         lever = state.scale * self.model @ state.rotation.T
         residual[:3] = (self.fixes.enu_m - lever - state.center).T
         residual[2] += state.offsets_m[flight]
+        group = self.fixes.bias_group
+        residual[:3] -= (self.fixes.bias_m * state.bias[group]).T
         for k in range(3):
+            jacobian[k, every, SHARED + 5 * f + 3 * group + k] = self.fixes.bias_m[:, k]
             jacobian[k, :, k] = 1.0
             jacobian[k, :, 6] = lever[:, k]
         # omega x lever
