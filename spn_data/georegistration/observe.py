@@ -49,6 +49,7 @@ class Fixes:
     relative: np.ndarray
     origin: GeoOrigin
     has_heights: bool
+    free_zero: bool  # nothing relates the zero of the heights to the origin's
     free_heights: bool  # each flight's heights may have a constant offset
     notes: tuple[str, ...]
 
@@ -197,8 +198,11 @@ def observe(
     sequence: Sequence[str],
     time_s: np.ndarray,
     options: GeoregisterOptions,
+    control_origin: GeoOrigin | None = None,
 ) -> Fixes:
     """Convert the telemetry rows of N frames to observations in a local frame.
+
+    With an origin of surveyed points, frames need no fix, and heights may have another zero than the origin.
 
     Raises GeometryError if no frame has a fix, or if the heights cannot be converted to the origin to keep.
     """
@@ -207,7 +211,7 @@ def observe(
         raise ValueError(
             f"{n} telemetry rows, {len(sequence)} names and {len(time_s)} times must be equal in number"
         )
-    if not telemetry.has_fix.any():
+    if control_origin is None and not telemetry.has_fix.any():
         raise GeometryError(
             f"none of {n} frames has a fix: georegistration needs telemetry with positions"
         )
@@ -222,9 +226,18 @@ def observe(
         notes.append("Heights are above take-off in some flights and absolute in others.")
     use_relative = bool(relative[with_height].any())
     reference = options.height_reference or telemetry.abs_reference
-    origin = options.origin or _new_origin(telemetry, heights, use_relative, reference, options)
+    origin = (
+        control_origin
+        or options.origin
+        or _new_origin(telemetry, heights, use_relative, reference, options)
+    )
+    free_zero = control_origin is not None and not _is_comparable(
+        origin, use_relative, reference, options
+    )
     # Metres from the zero of the local frame to the zero of the heights.
-    zero = _zero_of_heights(origin, use_relative, reference, options) if known.any() else 0.0
+    zero = 0.0
+    if known.any() and not free_zero:
+        zero = _zero_of_heights(origin, use_relative, reference, options)
     up = heights + zero
     if mixed:
         # Start the other kind at the same median height; its offset is a free parameter afterwards.
@@ -232,12 +245,12 @@ def observe(
             heights[known & ~relative[flight]]
         )
         up = np.where(relative[flight], up, heights + offset)
-    if not known.any():
+    if not known.any() and control_origin is None:
         notes.append(
             "No heights are known: the mean camera height is set to 0 and the vertical position is "
             "undetermined."
         )
-    elif not use_relative and reference is HeightReference.UNKNOWN:
+    elif not use_relative and reference is HeightReference.UNKNOWN and not free_zero:
         notes.append(
             "Heights are absolute with an unknown reference: they constrain the shape, but the "
             "vertical zero is unknown."
@@ -267,6 +280,7 @@ def observe(
         relative,
         origin,
         bool(known.any()),
+        free_zero,
         use_relative or reference is HeightReference.UNKNOWN,
         tuple(notes),
     )
@@ -294,6 +308,21 @@ def _new_origin(
             lat, lon, 0.0, HeightReference.TAKEOFF if known.any() else HeightReference.UNKNOWN
         )
     return GeoOrigin(lat, lon, float(np.round(np.median(heights[known]))), reference)
+
+
+def _is_comparable(
+    origin: GeoOrigin,
+    use_relative: bool,
+    reference: HeightReference,
+    options: GeoregisterOptions,
+) -> bool:
+    """Return whether the heights of the telemetry can be converted to the origin's reference."""
+    if (
+        origin.height_reference is HeightReference.UNKNOWN
+        or reference is not origin.height_reference
+    ):
+        return False
+    return not use_relative or options.takeoff_alt_m is not None
 
 
 def _zero_of_heights(

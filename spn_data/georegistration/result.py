@@ -11,6 +11,7 @@ import numpy as np
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Similarity
+from spn_data.georegistration.control import PointResidual
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.storage.json_files import finite_or_none, number_or
@@ -70,6 +71,8 @@ class GeoFit:
         Kinds of observations used: "fixes", "heights", "gimbal", "level cameras".
     notes : tuple of str
         Sentences for the user.
+    control : tuple of PointResidual
+        Residuals of the surveyed points, in the order of their file.
     """
 
     world_from_model: Similarity
@@ -86,6 +89,7 @@ class GeoFit:
     summary: FitSummary
     observations: tuple[str, ...]
     notes: tuple[str, ...]
+    control: tuple[PointResidual, ...] = ()
 
     @property
     def height_reference(self) -> HeightReference:
@@ -125,6 +129,7 @@ class GeoFit:
             "residuals_m": self.residuals_m,
             "outlier": self.outlier,
             "gravity_deg": self.gravity_deg,
+            "control": [asdict(point) for point in self.control],
         }
         return _plain(value)
 
@@ -170,6 +175,7 @@ class GeoFit:
                 FitSummary(**_numbers(value["summary"])),
                 tuple(str(o) for o in value["observations"]),
                 tuple(str(n) for n in value["notes"]),
+                tuple(_point(p) for p in value.get("control", ())),
             )
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise FormatError(f"damaged georegistration: {type(error).__name__} {error}") from error
@@ -189,6 +195,18 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.floating | float):
         return finite_or_none(value)
     return str(value)
+
+
+def _point(value: dict[str, Any]) -> PointResidual:
+    return PointResidual(
+        str(value["name"]),
+        str(value["role"]),
+        int(value["marks"]),
+        _triple(value["residual_m"]),
+        _triple(value["sigma_m"]),
+        number_or(value["reprojection_px"]),
+        bool(value["is_outlier"]),
+    )
 
 
 def _triple(value: Any) -> tuple[float, float, float]:

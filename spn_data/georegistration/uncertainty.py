@@ -9,6 +9,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import gammaincinv
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.least_squares import similarity_jacobian
 from spn_data.geometry.pose import Similarity
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.georegistration.fit import Estimate, covariance_of
@@ -74,14 +75,7 @@ class Uncertainty:
 
     def point_covariance(self, points_m: np.ndarray) -> np.ndarray:
         """Propagate the covariance to world points (N, 3); return (N, 3, 3), due to georegistration alone."""
-        lever = np.asarray(points_m) - self.middle_m
-        jacobian = np.zeros((len(lever), 3, 7))
-        jacobian[:, :, :3] = np.eye(3)
-        x, y, z = lever.T
-        jacobian[:, 0, 4], jacobian[:, 0, 5] = z, -y
-        jacobian[:, 1, 3], jacobian[:, 1, 5] = -z, x
-        jacobian[:, 2, 3], jacobian[:, 2, 4] = y, -x
-        jacobian[:, :, 6] = lever
+        jacobian = similarity_jacobian(np.asarray(points_m) - self.middle_m)
         return jacobian @ self.covariance @ jacobian.transpose(0, 2, 1)
 
 
@@ -185,6 +179,8 @@ def _weights_of(part: Problem, problem: Problem, result: Estimate) -> np.ndarray
 
 def effective_fixes(problem: Problem, result: Estimate) -> float:
     """Return how many independent fixes would determine the middle's east and north equally well."""
+    if not problem.fixes.has_fix.any():
+        return 0.0
     counts = []
     for kind in (Kind.EAST, Kind.NORTH):
         mine = problem.kind == kind

@@ -51,6 +51,7 @@ def _problem(noise: float) -> tuple[Problem, FitState]:
         np.ones(2, dtype=bool),
         GeoOrigin(0, 0, 0),
         True,
+        False,
         True,
         (),
     )
