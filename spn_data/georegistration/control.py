@@ -8,7 +8,6 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.geodesy import GeoOrigin
-
 from spn_data.geometry.least_squares import similarity_jacobian
 from spn_data.geometry.pose import Similarity
 from spn_data.ground_control.triangulation import Views
@@ -78,10 +77,10 @@ class Control:
         return survey[:, :, None] * np.eye(3) + turn @ self.model_covariance @ turn.T
 
     def whitened(self, world_from_model: Similarity) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the used points' errors (C, 3), their derivatives (C, 3, 7), both of unit variance, and weights.
+        """Return the used points' errors (C, 3) and derivatives (C, 3, 7), unit variance, and weights (C,).
 
-        The seven parameters are the centre, the rotation vector in the world and the logarithm of scale. The
-        weights (C,) are Huber's: one wrong point cannot pull the fit far.
+        The derivatives are those of `similarity_jacobian`. The weights are Huber's: one wrong point cannot
+        pull the fit far.
         """
         used = np.flatnonzero(self.used)
         covariance = self.covariance_m(world_from_model)[used] * self.scale**2
@@ -94,7 +93,7 @@ class Control:
         return error, white @ similarity_jacobian(lever), weight
 
     def initial(self) -> Similarity:
-        """Return the similarity from the used points alone; raise GeometryError if they do not determine it."""
+        """Return the similarity from the used points; raise GeometryError if they do not determine it."""
         known = self.used & np.isfinite(self.enu_m).all(axis=1)
         if known.sum() < 3:
             raise GeometryError(

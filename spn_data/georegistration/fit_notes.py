@@ -100,9 +100,9 @@ def _control_notes(problem: Problem, result: Estimate) -> list[str]:
         if sigmas.max() > _CONTRADICTION_SIGMAS:
             expected = ", ".join(f"{s:.2f}" for s in sigma[: len(sigmas)])
             notes.append(
-                f"GNSS{of} and ground control contradict each other: fixes are {_east_north_up(off)} m off where "
-                f"{expected} m (1 sigma) are expected; check coordinate system, datum and heights of the points, "
-                "or state --gnss-bias."
+                f"GNSS{of} and ground control contradict each other: fixes are {_east_north_up(off)} m off "
+                f"where {expected} m (1 sigma) are expected; check coordinate system, datum and heights of "
+                "the points, or state --gnss-bias."
             )
         else:
             notes.append(f"Fixes{of} are {_east_north_up(off)} m off the ground control.")

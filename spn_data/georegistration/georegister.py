@@ -127,7 +127,7 @@ def _initial(
     control: Control | None,
     options: GeoregisterOptions,
 ) -> tuple[Fixes, RansacResult]:
-    """Return an initial similarity, and the fixes that agree with it: none if only surveyed points give one."""
+    """Return the fixes to use and an initial similarity: without fixes if only surveyed points give one."""
     try:
         _require_enough(fixes, options)
         up_model = gravity.direction
@@ -221,16 +221,22 @@ def _geo_fit(
         _summary(problem, result, residuals, outlier),
         _observations(problem, gravity),
         fixes.notes + fit_notes(problem, result, gravity, outlier, held_out[0]),
-        _residuals_of_control(problem, result, uncertainty),
+        _residuals_of_control(problem, world_from_model, uncertainty, middle, size),
     )
 
 
 def _residuals_of_control(
-    problem: Problem, result: Estimate, uncertainty: Uncertainty
+    problem: Problem,
+    world_from_model: Similarity,
+    uncertainty: Uncertainty,
+    middle: np.ndarray,
+    size: float,
 ) -> tuple[PointResidual, ...]:
-    control, world_from_model = problem.control, result.state.similarity
-    if control is None:
+    if problem.control is None:
         return ()
+    control = problem.control.centred(
+        -middle / size, 1 / size
+    )  # back in the model's own coordinates
     covariance = uncertainty.point_covariance(world_from_model.apply(control.model))
     return point_residuals(control, world_from_model, covariance)
 

@@ -19,8 +19,8 @@ DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
 }
 UNKNOWN_KIND_SIGMA_M = (1.5, 2.5)
 
-# Standard deviation (horizontal per axis, vertical) in metres of the part of a fix's error that all flights of
-# a day share, because orbits, clocks and atmosphere change over hours: no number of fixes averages it.
+# Standard deviation (horizontal per axis, vertical) in metres of the part of a fix's error that all flights
+# of a day share, because orbits, clocks and atmosphere change over hours: no number of fixes averages it.
 GNSS_BIAS_M: dict[str, tuple[float, float]] = {"gopro": (1.5, 3.0), "gpx": (1.5, 3.0)}
 USUAL_GNSS_BIAS_M = (1.0, 2.5)
 # Of a height above take-off: the receiver's bias cancels, the drift of the air pressure remains.
@@ -135,6 +135,6 @@ def default_sigma_m(kind: str) -> np.ndarray:
 
 
 def default_bias_m(kind: str) -> np.ndarray:
-    """Return the usual bias sigma (3,) east, north, up in metres of absolute positions of a kind of source."""
+    """Return the usual bias sigma (3,) east, north, up in metres of positions of a kind of source."""
     horizontal, vertical = GNSS_BIAS_M.get(kind, USUAL_GNSS_BIAS_M)
     return np.array([horizontal, horizontal, vertical])

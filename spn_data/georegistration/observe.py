@@ -32,9 +32,9 @@ class Fixes:
     enu_m : (N, 3), NaN if unknown (up independently of east and north); sigma_m : (N, 3); up_cam : (N, 3)
     unit direction of up in camera axes according to the gimbal, NaN if unknown; attitude : (N, 3, 3)
     cam_from_world according to the gimbal, including heading, NaN if not used; flight : (N,) index into
-    `flights`; time_s : (N,) within the flight; bias_m : (N, 3) sigma of the error that all fixes of a bias group share;
-    day : (F,) index of each flight's day, the same for all if a day is unknown; relative : (F,) bool, whether the flight's heights are above
-    its take-off.
+    `flights`; time_s : (N,) within the flight; bias_m : (N, 3) sigma of the error that all fixes of a bias
+    group share; day : (F,) index of each flight's day, the same for all if a day is unknown; relative : (F,)
+    bool, whether the flight's heights are above its take-off.
     """
 
     enu_m: np.ndarray
@@ -148,7 +148,7 @@ def _sigma(telemetry: Telemetry, options: GeoregisterOptions) -> np.ndarray:
 def _bias(
     telemetry: Telemetry, sigma_m: np.ndarray, is_relative: np.ndarray, options: GeoregisterOptions
 ) -> np.ndarray:
-    """Return the bias sigma (N, 3) of each fix: the user's, or its kind's, less where a smaller sigma is stated."""
+    """Return the bias sigma (N, 3) of each fix: the user's, or its kind's, less for a small sigma."""
     if options.gnss_bias_m is not None:
         horizontal, vertical = options.gnss_bias_m
         return np.tile([horizontal, horizontal, vertical], (len(telemetry), 1))

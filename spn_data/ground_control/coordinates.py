@@ -103,8 +103,8 @@ def surveyed_positions(
     if wanted is not None and reference is not wanted:
         if wanted is not HeightReference.ELLIPSOID:
             raise InputError(
-                f"heights of {crs.name} are above the ellipsoid, but heights above '{wanted}' are needed: give "
-                "the points in a system with a vertical datum, such as EPSG:25832+7837",
+                f"heights of {crs.name} are above the ellipsoid, but heights above '{wanted}' are needed: "
+                "give the points in a system with a vertical datum, such as EPSG:25832+7837",
                 path=file.path,
             )
         metres = _above_ellipsoid(file, crs, east, north, height)
@@ -123,7 +123,7 @@ def _crs(file: ControlFile) -> CRS:
     pyproj.network.set_network_enabled(active=False)
     text = file.crs.strip()
     shown = f"{text[:60]!r} is not a coordinate system that is known here"
-    how = "the first line should be an EPSG code (EPSG:32632, EPSG:25832+7837), WGS84 UTM 32N, or a PROJ string"
+    how = "give an EPSG code (EPSG:32632, EPSG:25832+7837), WGS84 UTM 32N, or a PROJ string"
     epsg, utm = _EPSG.fullmatch(text), _UTM.fullmatch(text)
     if epsg:
         wanted = f"EPSG:{epsg[1]}" + (f"+{epsg[2]}" if epsg[2] else "")
@@ -208,7 +208,7 @@ def _require_inside(file: ControlFile, crs: CRS, place: np.ndarray, swapped: np.
 
 
 def _best(file: ControlFile, crs: CRS, target: int, place: tuple[np.ndarray, np.ndarray]) -> Any:
-    """Return the best transformation at a place; raise InputError if it needs a grid that is not installed."""
+    """Return the best transformation at a place; raise InputError if its grid is not installed."""
     from pyproj import CRS
     from pyproj.aoi import AreaOfInterest
     from pyproj.transformer import TransformerGroup

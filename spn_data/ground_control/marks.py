@@ -101,7 +101,7 @@ def marked_points(
     found = [triangulate(v) for v in views]
     _require_meeting(file, images, views, found)
     notes = list(find.notes())
-    for point, v, result, marks in zip(file.points, views, found, placed, strict=True):
+    for point, result, marks in zip(file.points, found, placed, strict=True):
         if result.problem:
             notes.append(f"Point {point.name} is not used: {result.problem}.")
             continue
@@ -208,7 +208,7 @@ def _views(
 def _require_meeting(
     file: ControlFile, images: ModelImages, views: Sequence[Views], found: Sequence[Triangulated]
 ) -> None:
-    """Raise InputError if hardly any point's rays meet, but would if images were larger, smaller or turned."""
+    """Raise InputError if most points' rays do not meet, but would in images of another size or turned."""
     several = [k for k, v in enumerate(views) if len(v) >= 2]
     failed = [k for k in several if found[k].problem]
     if not several or len(failed) <= len(several) / 2:

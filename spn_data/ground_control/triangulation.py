@@ -12,6 +12,7 @@ from spn_data.geometry.pose import Poses, to_camera
 _ROUNDS = 15
 _LIMIT_SIGMAS = 5.0  # a mark farther than this from the others' point is wrong
 _LEAST_LIMIT_PX = 5.0
+_TRIED_EACH = 8  # up to so many marks, the wrong one is found by leaving out each
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,45 +92,60 @@ def triangulate(views: Views) -> Triangulated:
     Triangulated
     """
     used = np.ones(len(views), dtype=bool)
-    if len(views) < 2:
-        return _none(views, "it is marked in one image only, and two are needed" if len(views) else "it has no mark in an image of the model")  # fmt: skip
+    if not len(views):
+        return _none(views, "it has no mark in an image of the model")
+    if len(views) == 1:
+        return _none(views, "it is marked in one image only, and two are needed")
     limit = np.maximum(_LIMIT_SIGMAS * views.sigma_px, _LEAST_LIMIT_PX)
     while True:
         part = views.select(used)
         point, covariance = _solve(part)
+        if not np.isfinite(point).all():
+            return _none(views, "its rays do not cross: mark it in images from farther apart")
         distance = _distances(views, point)
-        bad = ~(distance <= limit)
-        if not (bad & used).any():
+        if (distance[used] <= limit[used]).all():
             break
-        worst = float(np.nanmax(np.where(np.isfinite(distance), distance, np.inf)[used]))
-        told = f"{worst:.0f} px" if np.isfinite(worst) else "behind a camera"
-        if used.sum() < 3:
-            return _none(views, f"its two marks disagree by {told}: one of them is wrong")
-        candidates = []
-        for k in np.flatnonzero(used):
-            rest = used.copy()
-            rest[k] = False
-            trial, _ = _solve(views.select(rest))
-            error = _distances(views, trial)
-            worse = np.where(np.isfinite(error), error / limit, np.inf)[rest].max()
-            candidates.append((float(worse), int(k)))
-        candidates.sort()
-        if used.sum() == 3:
-            fitting = [k for worse, k in candidates if worse <= 1]
-            if len(fitting) != 1:
-                return _none(
-                    views, f"its three marks disagree by {told}, and which is wrong cannot be told"
-                )
-        if used.sum() <= len(views) / 2:
-            return _none(views, f"its {len(views)} marks disagree by {told}")
-        used[candidates[0][1]] = False
+        told = f"its {used.sum()} marks disagree by {_shown(distance[used])}"
+        wrong = _wrong_mark(views, used, distance / limit, limit)
+        if wrong is None or used.sum() <= len(views) / 2:
+            return _none(views, f"{told}, and which is wrong cannot be told")
+        used[wrong] = False
     residual = part.residuals_px(point) / part.sigma_px[:, None]
-    freedom = 2 * len(part) - 3
-    # One that agrees worse than its sigma says is known worse in proportion.
-    scale = max(1.0, float((residual**2).sum()) / freedom)
-    if not np.isfinite(covariance).all():
-        return _none(views, "its rays are parallel: mark it in images from farther apart")
+    # A point whose marks agree worse than their sigma says is known worse in proportion.
+    scale = max(1.0, float((residual**2).sum()) / (2 * len(part) - 3))
     return Triangulated(point, covariance * scale, used, distance)
+
+
+def marks_meet(views: Views, limit_px: float) -> bool:
+    """Return whether all marks are within a distance of one point's projections."""
+    point, _ = _solve(views)
+    return bool((_distances(views, point) <= limit_px).all())
+
+
+def _wrong_mark(
+    views: Views, used: np.ndarray, relative: np.ndarray, limit: np.ndarray
+) -> int | None:
+    """Return the mark without which the others agree best; None if that cannot be told."""
+    rows = np.flatnonzero(used)
+    if len(rows) < 3:
+        return None
+    if len(rows) > _TRIED_EACH:
+        return int(rows[np.argmax(relative[rows])])
+    worst = []
+    for k in rows:
+        rest = used.copy()
+        rest[k] = False
+        point, _ = _solve(views.select(rest))
+        worst.append(float((_distances(views, point) / limit)[rest].max()))
+    if len(rows) == 3 and sum(w <= 1 for w in worst) != 1:
+        return None  # two marks nearly always agree
+    return int(rows[np.argmin(worst)])
+
+
+def _shown(distance: np.ndarray) -> str:
+    """Return the largest distance in words."""
+    known = distance[np.isfinite(distance)]
+    return f"{known.max():.0f} px" if len(known) else "more than can be measured"
 
 
 def _none(views: Views, problem: str) -> Triangulated:
@@ -139,9 +155,9 @@ def _none(views: Views, problem: str) -> Triangulated:
 
 
 def _distances(views: Views, point: np.ndarray) -> np.ndarray:
-    if not np.isfinite(point).all():
-        return np.full(len(views), np.inf)
-    return np.linalg.norm(views.residuals_px(point), axis=1)
+    """Return the distances (M,) in pixels of the marks from a point's projections, infinite if it has none."""
+    distance = np.linalg.norm(views.residuals_px(point), axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
 
 
 def _solve(views: Views) -> tuple[np.ndarray, np.ndarray]:
