@@ -141,7 +141,7 @@ def _crs(file: ControlFile) -> CRS:
         crs = pyproj.CRS.from_user_input(wanted)
     except pyproj.exceptions.CRSError as error:
         raise InputError(f"{shown} (PROJ: {error}): {how}", path=file.path) from error
-    if crs.is_vertical:
+    if crs.is_vertical and not crs.is_compound:
         raise InputError(
             f"{crs.name} is only a vertical datum: name the horizontal system first, such as "
             f"EPSG:32632+{epsg[1] if epsg else '5773'}",

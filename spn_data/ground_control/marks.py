@@ -16,9 +16,28 @@ from spn_data.ground_control.triangulation import Triangulated, Views, triangula
 
 _NAMES_SHOWN = 3
 # Sizes and orientations of images, in terms of the model's, that are tried if marks do not meet.
-_FACTORS = (0.125, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0, 5.0, 8.0)
-_TURNS = (0, 90, 180, 270)
-_POINTS_TRIED = 12
+_SIZES = tuple(
+    (factor, 0)
+    for factor in (
+        0.125,
+        0.2,
+        0.25,
+        1 / 3,
+        0.5,
+        2 / 3,
+        0.75,
+        1.0,
+        4 / 3,
+        1.5,
+        2.0,
+        3.0,
+        4.0,
+        5.0,
+        8.0,
+    )
+)
+_TURNED = ((1.0, 90), (1.0, 180), (1.0, 270))
+_POINTS_TRIED = 6
 _MET = 0.7  # share of points that have to meet under another size
 _MEET_PX = 5.0
 
@@ -216,8 +235,7 @@ def _require_meeting(
     tried = several[:_POINTS_TRIED]
     shares = {
         (factor, turn): float(np.mean([_meets(views[k], factor, turn) for k in tried]))
-        for factor in _FACTORS
-        for turn in _TURNS
+        for factor, turn in (*_SIZES, *_TURNED)
     }
     (factor, turn), share = max(shares.items(), key=lambda item: item[1])
     if share < _MET or (factor, turn) == (1.0, 0):
@@ -256,6 +274,8 @@ def _meets(views: Views, factor: float, turn: int) -> bool:
         180: (width - x, height - y),
         270: (y, height - x),
     }[turn]
+    if not all((0 <= v).all() and (v <= s).all() for v, s in zip(turned, size.T, strict=True)):
+        return False
     moved = Views(np.column_stack(turned), views.sigma_px, views.poses, views.cameras)
     result = triangulate(moved)
     return not result.problem and bool(result.used.all() and (result.distance_px <= _MEET_PX).all())

@@ -49,7 +49,12 @@ def test_tables_name_their_columns(tmp_path: Path) -> None:
     found = read(tmp_path, TABLE)
     assert found.crs == "EPSG:4979"
     first, second = found.points
-    assert (first.east, first.north, first.sigma_h_m, first.sigma_v_m) == (9.0001, 48.75, 0.02, 0.04)
+    assert (first.east, first.north, first.sigma_h_m, first.sigma_v_m) == (
+        9.0001,
+        48.75,
+        0.02,
+        0.04,
+    )
     assert len(first.marks) == 2
     assert (first.role, second.role) == (Role.CONTROL, Role.CHECK)
     assert np.isnan(read(tmp_path, TABLE.replace("211;", ";")).points[1].height)

@@ -66,7 +66,9 @@ def test_points_are_triangulated_within_their_stated_sigma() -> None:
     assert np.array([p.found.point for p in exact]) == pytest.approx(POINTS, abs=1e-6)
     for point, true in zip(found_of(a_file(1.0))[0], POINTS, strict=True):
         error = point.found.point - true
-        assert error @ np.linalg.solve(point.found.covariance, error) < 14.2  # 3 sigma, 3 coordinates
+        assert (
+            error @ np.linalg.solve(point.found.covariance, error) < 14.2
+        )  # 3 sigma, 3 coordinates
         assert np.sqrt(np.trace(point.found.covariance)) < 0.3
 
 
@@ -90,7 +92,14 @@ def test_a_wrong_mark_is_left_out_by_name() -> None:
 
 def test_images_are_found_by_any_of_their_names() -> None:
     """A photo is found by its name, its frame's name and its folder; others are told with the reason."""
-    names = ["DJI_0.JPG", "photos/DJI_1.jpg", "/home/me/photos/DJI_2.JPG", "dji_3", "DJI_9.JPG", "X.JPG"]
+    names = [
+        "DJI_0.JPG",
+        "photos/DJI_1.jpg",
+        "/home/me/photos/DJI_2.JPG",
+        "dji_3",
+        "DJI_9.JPG",
+        "X.JPG",
+    ]
     file = a_file()
     point = replace(
         file.points[0],
@@ -102,11 +111,15 @@ def test_images_are_found_by_any_of_their_names() -> None:
     assert "1 mark is not used, in DJI_9.JPG: it has no pose in the model." in notes
     assert "1 mark is not used, in X.JPG: there is no such image." in notes
     nowhere = changed(file, lambda m: replace(m, image="IMG_1.JPG"))
-    with pytest.raises(InputError, match=r"none of its images is in the model: it names IMG_1\.JPG"):
+    with pytest.raises(
+        InputError, match=r"none of its images is in the model: it names IMG_1\.JPG"
+    ):
         found_of(nowhere)
     twice = images()
     twice = replace(twice, files=["DJI_0.JPG"] * N)
-    with pytest.raises(InputError, match=r"gcp\.txt:2: image DJI_0\.JPG may be photos/DJI_0\.jpg and"):
+    with pytest.raises(
+        InputError, match=r"gcp\.txt:2: image DJI_0\.JPG may be photos/DJI_0\.jpg and"
+    ):
         marked_points(file, twice, 1.0)
 
 
