@@ -3,8 +3,8 @@
     python benchmarks/gnss_bias.py [--draws 200] [--seed 1] [--cases NAME ...] [--json OUT]
 
 The model of each draw is that of `benchmarks/georegister.py`. Its fixes have a constant error, the same for
-all flights of a day; a drift over half an hour; errors of some 40 s, white noise and bursts. None of these has
-the size or the correlation time that the fit assumes. Errors are relative to the ground truth, without
+all flights of a day; a drift over half an hour; errors of some 40 s, white noise and bursts. None of these
+has the size or the correlation time that the fit assumes. Errors are relative to the ground truth, without
 alignment.
 """
 

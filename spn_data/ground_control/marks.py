@@ -274,7 +274,7 @@ def _meets(views: Views, factor: float, turn: int) -> bool:
         180: (width - x, height - y),
         270: (y, height - x),
     }[turn]
-    if not all((0 <= v).all() and (v <= s).all() for v, s in zip(turned, size.T, strict=True)):
+    if not all((v >= 0).all() and (v <= s).all() for v, s in zip(turned, size.T, strict=True)):
         return False
     moved = Views(np.column_stack(turned), views.sigma_px, views.poses, views.cameras)
     result = triangulate(moved)

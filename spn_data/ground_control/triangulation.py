@@ -155,7 +155,7 @@ def _none(views: Views, problem: str) -> Triangulated:
 
 
 def _distances(views: Views, point: np.ndarray) -> np.ndarray:
-    """Return the distances (M,) in pixels of the marks from a point's projections, infinite if it has none."""
+    """Return the distances (M,) in pixels of the marks from a point's projections; infinite if unknown."""
     distance = np.linalg.norm(views.residuals_px(point), axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 

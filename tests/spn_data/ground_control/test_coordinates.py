@@ -87,7 +87,7 @@ def test_mistakes_are_refused_with_what_to_do(
 
 
 def test_heights_above_the_ellipsoid_need_the_grid_of_their_datum() -> None:
-    """Without its geoid grid a datum is not converted, and heights above the ellipsoid are no heights of it."""
+    """Without its geoid grid a datum is not converted, in neither direction."""
     with pytest.raises(InputError, match=r"de_bkg_gcg2016\.tif, which is not installed"):
         positions("EPSG:25832+7837", 500_000.0, 5_371_830.0, wanted=HeightReference.ELLIPSOID)
     with pytest.raises(InputError, match="above the ellipsoid, but heights above 'amsl'"):
