@@ -42,7 +42,7 @@ def fixes(
     relative: bool = False,
     sigma_m: float | None = None,
 ) -> Telemetry:
-    """Return fixes with a constant bias and white noise of 0.2 m, or sigma; heights are ellipsoidal or relative."""
+    """Return fixes with a constant bias and white noise of 0.2 m, or sigma."""
     noise = 0.2 if sigma_m is None else sigma_m
     enu = true.centers + bias_m + noise * rng.standard_normal((N, 3))
     place = ORIGIN.wgs84_from_enu(enu)
