@@ -140,7 +140,9 @@ def _initial(
         try:
             found = control.initial()
         except GeometryError as other:
-            raise GeometryError(f"{error}; and {other}") from other
+            raise GeometryError(
+                f"the fixes do not tell where the model is ({error}), and neither does ground control: {other}"
+            ) from other
         if fixes.has_fix.any():
             note = f"Fixes are not used, only ground control and gimbal angles: {error}."
             fixes = replace(

@@ -122,7 +122,7 @@ def _crs(file: ControlFile) -> CRS:
         ) from error
     pyproj.network.set_network_enabled(active=False)
     text = file.crs.strip()
-    shown = f"{text[:60]!r} is not a coordinate system that is known here"
+    shown = repr(text[:60])
     how = "give an EPSG code (EPSG:32632, EPSG:25832+7837), WGS84 UTM 32N, or a PROJ string"
     epsg, utm = _EPSG.fullmatch(text), _UTM.fullmatch(text)
     if epsg:
@@ -136,11 +136,16 @@ def _crs(file: ControlFile) -> CRS:
     ):
         wanted = text
     else:
-        raise InputError(f"{shown}: {how}", path=file.path)
+        raise InputError(
+            f"{shown} is not a coordinate system that is known here: {how}", path=file.path
+        )
     try:
         crs = pyproj.CRS.from_user_input(wanted)
     except pyproj.exceptions.CRSError as error:
-        raise InputError(f"{shown} (PROJ: {error}): {how}", path=file.path) from error
+        raise InputError(
+            f"{shown} is not a coordinate system that is known here (PROJ: {error}): {how}",
+            path=file.path,
+        ) from error
     if crs.is_vertical and not crs.is_compound:
         raise InputError(
             f"{crs.name} is only a vertical datum: name the horizontal system first, such as "

@@ -225,7 +225,6 @@ def _require_near(
         return
     k = int(np.argmax(distance))
     point = file.points[k]
-    told = f"point {point.name!r} is {distance[k] / 1000:.0f} km from the fixes of the telemetry"
     swapped = replace(
         file, points=tuple(replace(p, east=p.north, north=p.east) for p in file.points)
     )
@@ -239,7 +238,11 @@ def _require_near(
         else "east and north"
     )
     why = f"{axes} are swapped" if is_swapped else f"is {positions.system} its coordinate system?"
-    raise InputError(f"{told}: {why}", path=file.path, line=point.line)
+    raise InputError(
+        f"point {point.name!r} is {distance[k] / 1000:.0f} km from the fixes of the telemetry: {why}",
+        path=file.path,
+        line=point.line,
+    )
 
 
 def _checked(

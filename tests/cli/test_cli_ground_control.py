@@ -39,7 +39,7 @@ def area(finished_area: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write_points(area: Path, path: Path) -> None:
-    """Write six map points, surveyed as if the map were SHIFT_M off, with a mark in up to five frames each."""
+    """Write six map points, surveyed as if the map were SHIFT_M off, with up to five marks each."""
     scene = read_scene(area / GEO)
     origin = GeoOrigin(
         **{
