@@ -141,7 +141,8 @@ def _initial(
             found = control.initial()
         except GeometryError as other:
             raise GeometryError(
-                f"the fixes do not tell where the model is ({error}), and neither does ground control: {other}"
+                f"the fixes do not tell where the model is ({error}), and neither does ground control: "
+                f"{other}"
             ) from other
         if fixes.has_fix.any():
             note = f"Fixes are not used, only ground control and gimbal angles: {error}."

@@ -244,12 +244,13 @@ def _read_csv(text: str, path: Path) -> ControlFile:
             else:
                 east = finite_number(row[first], first)
                 north = finite_number(row[second], second)
-                height = _optional(row, "height") if row.get("height") else math.nan
+                told = _optional(row, "height")
+                height = math.nan if told is None else told
             point = SurveyedPoint(
                 name,
                 east,
                 north,
-                math.nan if height is None else height,
+                height,
                 line,
                 _role(row.get("role", "")),
                 sigma_h_m=_positive(row, "sigma_h"),
