@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import georegister as georegister_draws
 import numpy as np
 from georegister import Model, simulated_model
 
@@ -158,7 +159,9 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", help="run only these cases [default: all]")
     parser.add_argument("--no-bias", action="store_true", help="fit as if there were no bias")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--frames-per-s", type=float, default=georegister_draws.FRAMES_PER_S)
     args = parser.parse_args()
+    georegister_draws.FRAMES_PER_S = args.frames_per_s
     options = preset("standard", seed=args.seed)
     fit_options = GeoregisterOptions(gnss_bias_m=(0.0, 0.0)) if args.no_bias else None
     figures = {}
@@ -167,7 +170,7 @@ def main() -> None:
             continue
         found = evaluate(options, receiver, range(args.draws), fit_options)
         figures[name] = found
-        print(f"{name}: {found['draws']} draws")
+        print(f"{name}: {found['draws']} draws", flush=True)
         print("  within 2 sigma:", {n: f"{s:.1%}" for n, s in found["within_2_sigma"].items()})
         print("  stated (median):", {n: f"{s:.3g}" for n, s in found["stated"].items()})
     if args.json is not None:
