@@ -165,7 +165,7 @@ class _Points:
         ):
             raise InputError(
                 f"point {point.name!r} has other coordinates than in line {before.line}: "
-                f"{point.east:g} {point.north:g} {point.height:g}; give each point its own name",
+                f"{point.east:.12g} {point.north:.12g} {point.height:g}; give each point its own name",
                 path=self._path,
                 line=point.line,
             )

@@ -206,7 +206,7 @@ def _require_inside(file: ControlFile, crs: CRS, place: np.ndarray, swapped: np.
         return
     k = int(np.argmax(outside))
     point = file.points[k]
-    told = f"{point.east:g} {point.north:g} is outside the area where {crs.name} is used"
+    told = f"{point.east:.12g} {point.north:.12g} is outside the area where {crs.name} is used"
     if inside(swapped)[outside].all():
         raise _at(file, k, f"{told}: it looks as if east and north are swapped")
     raise _at(file, k, f"{told}: is this the right zone and system?")

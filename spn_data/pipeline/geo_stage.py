@@ -142,14 +142,14 @@ def _georegister(
         )
     scene = read_scene(area.folder(MODEL))
     frames = registered_frames(area, scene)
+    with stopwatch.step("ground control"):  # first: a mistake in its file is told at once
+        control, notes = _control(area, scene, options, tracks)
     with stopwatch.step("time offset"):
         offsets = _time_offsets(scene, frames, tracks, options, progress)
     shifted = {
         name: track.shifted(offsets[name].applied_s if name in offsets else 0.0)
         for name, track in tracks.items()
     }
-    with stopwatch.step("ground control"):
-        control, notes = _control(area, scene, options, tracks)
     with stopwatch.step("fit"):
         telemetry = align_telemetry(shifted, frames.sequences.tolist(), frames.time_s)
         sequences = frames.sequences.tolist()
