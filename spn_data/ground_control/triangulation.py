@@ -176,27 +176,27 @@ def _solve(views: Views) -> tuple[np.ndarray, np.ndarray]:
         return nothing
     point = np.linalg.solve(matrix, np.einsum("mij,mj->i", across, centers))
     focal = np.array([np.mean(c.focal_px) for c in views.cameras])
-    weight = focal / views.sigma_px
-    information = matrix
+    weight = (focal / views.sigma_px)[:, None]
+    reach = float(np.linalg.norm(point - centers, axis=1).max())
     for _ in range(_ROUNDS):
-        x, y, z = to_camera(np.tile(point, (len(rays), 1)), centers, rotations).T
-        if (np.abs(z) < 1e-12).any():
+        in_camera = to_camera(np.tile(point, (len(rays), 1)), centers, rotations)
+        depth = in_camera[:, 2:]
+        if (np.abs(depth) < 1e-9 * reach).any():
             return nothing
-        error = rays - np.column_stack([x / z, y / z])
-        zero = np.zeros_like(z)
-        slope = np.stack(
-            [
-                np.stack([1 / z, zero, -x / z**2], axis=1),
-                np.stack([zero, 1 / z, -y / z**2], axis=1),
-            ],
-            axis=1,
-        )
-        jacobian = (slope @ rotations * weight[:, None, None]).reshape(-1, 3)
+        seen = in_camera[:, :2] / depth
+        # Derivatives of x/z and y/z.
+        slope = (rotations[:, :2] - seen[:, :, None] * rotations[:, 2:]) / depth[:, :, None]
+        jacobian = (slope * weight[:, :, None]).reshape(-1, 3)
         information = jacobian.T @ jacobian
-        if np.linalg.cond(information) > 1e14:
+        try:
+            step = np.linalg.solve(information, jacobian.T @ ((rays - seen) * weight).ravel())
+        except np.linalg.LinAlgError:
             return nothing
-        step = np.linalg.solve(information, jacobian.T @ (error * weight[:, None]).ravel())
         point = point + step
+        if np.linalg.norm(step) < 1e-9 * reach:
+            break
+    if np.linalg.cond(information) > 1e14:
+        return nothing
     if not np.isfinite(point).all():
         return nothing
     return point, np.linalg.inv(information)

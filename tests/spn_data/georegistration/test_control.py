@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
@@ -66,7 +67,15 @@ def surveyed(count: int, rng: np.random.Generator, check: int = 0) -> Control:
     model = MODEL_FROM_WORLD.apply(true + mark_m * rng.standard_normal((count, 3)))
     covariance = np.tile((mark_m / WORLD_FROM_MODEL.scale) ** 2 * np.eye(3), (count, 1, 1))
     held = np.arange(count) < check
-    nothing = Views(np.zeros((0, 2)), np.zeros(0), Poses.unknown(0), ())
+    # One camera above, which looks down.
+    pose = Poses.from_rotations(
+        np.array([[0.0, 0, 60]]), rotations_from_angles(np.array([[0.0, -90, 0]]))
+    )
+    pose = MODEL_FROM_WORLD.apply_to_poses(pose)
+    camera = Camera.from_horizontal_fov(1000, 1000, 90.0)
+    views = [
+        Views(camera.project(pose.to_camera(m[None])), np.ones(1), pose, (camera,)) for m in model
+    ]
     return Control(
         tuple(f"P{k}" for k in range(count)),
         model,
@@ -76,7 +85,7 @@ def surveyed(count: int, rng: np.random.Generator, check: int = 0) -> Control:
         held,
         ORIGIN,
         ~held,
-        (nothing,) * count,
+        tuple(views),
     )
 
 
@@ -166,6 +175,7 @@ def test_ground_control_takes_the_bias_out() -> None:
     assert np.abs(shift_m(found, true)).max() < 0.05
     assert found.uncertainty.horizontal_m < 0.04
     assert [p.role for p in found.control] == ["check"] * 3 + ["control"] * 5
+    assert max(p.reprojection_px for p in found.control) < 2
     residual = np.array([p.residual_m for p in found.control[:3]])
     sigma = np.array([p.sigma_m for p in found.control[:3]])
     assert (np.abs(residual) < 3 * sigma).all()
