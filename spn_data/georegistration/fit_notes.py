@@ -6,6 +6,7 @@ import numpy as np
 
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.fit import Estimate
+from spn_data.georegistration.georegister_options import BIAS_DRIFT_SHARE
 from spn_data.georegistration.gravity import Gravity
 from spn_data.georegistration.problem import Problem
 
@@ -13,6 +14,7 @@ from spn_data.georegistration.problem import Problem
 _GIMBAL_BIAS_SIGMAS = 4.0
 # GNSS and ground control contradict each other beyond this many sigma of the receiver's bias.
 _CONTRADICTION_SIGMAS = 3.0
+_LEAST_M = 0.1  # a smaller difference is no contradiction, whatever is stated
 _WIDENED = 1.5  # sigma of ground control from its residuals, as a factor of what is stated
 
 
@@ -85,20 +87,22 @@ def _control_notes(problem: Problem, result: Estimate) -> list[str]:
             "No check points: residuals of fitted points do not tell how true the map is; hold some out with "
             "--check-points."
         )
-    group = fixes.bias_group
+    group, residual = fixes.bias_group, problem.residuals(result.state)[:3].T
     for g in range(len(result.state.bias)) if fitted else ():
         mine = fixes.has_fix & (group == g)
         if not mine.any():
             continue
         sigma = fixes.bias_m[mine].mean(axis=0)
-        off, sigmas = result.state.bias[g] * sigma, np.abs(result.state.bias[g])
-        if fixes.free_zero or not np.isfinite(fixes.enu_m[mine, 2]).any():
-            off, sigmas = np.append(off[:2], np.nan), sigmas[:2]
+        # Large contradictions are taken for drift in part: what counts is how far off the fixes are.
+        off = np.median(residual[mine], axis=0) + result.state.bias[g] * sigma
+        if fixes.free_zero:
+            off[2] = np.nan
+        sigmas = np.abs(off) / np.maximum(np.hypot(1.0, BIAS_DRIFT_SHARE) * sigma, _LEAST_M)
         of = " of " + ", ".join(
             dict.fromkeys(fixes.flights[f] for f in fixes.flight[mine].tolist())
         ) if len(result.state.bias) > 1 else ""  # fmt: skip
-        if sigmas.max() > _CONTRADICTION_SIGMAS:
-            expected = ", ".join(f"{s:.2f}" for s in sigma[: len(sigmas)])
+        if np.nanmax(sigmas) > _CONTRADICTION_SIGMAS:
+            expected = ", ".join(f"{s:.2f}" for s in sigma[np.isfinite(off)])
             notes.append(
                 f"GNSS{of} and ground control contradict each other: fixes are {_east_north_up(off)} m off "
                 f"where {expected} m (1 sigma) are expected; check coordinate system, datum and heights of "

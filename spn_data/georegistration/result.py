@@ -52,7 +52,7 @@ class GeoFit:
         By flight: what to add to its heights to obtain up coordinates. For heights above take-off this is the
         height of the take-off point above the zero (the first flight's, if the take-offs differ).
     residuals_m : ndarray, shape (N, 3)
-        Fix minus fitted centre, east, north, up; NaN if unknown.
+        Fix minus fitted centre, less the bias that ground control shows, east, north, up; NaN if unknown.
     outlier : ndarray of bool, shape (N,)
         Frames whose fix is an outlier.
     gravity_deg : ndarray, shape (N, 2)
