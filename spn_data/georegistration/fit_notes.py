@@ -74,7 +74,7 @@ def _control_notes(problem: Problem, result: Estimate) -> list[str]:
     for k in np.flatnonzero(~control.check & ~control.used):
         off = control.errors_m(result.state.similarity)[k]
         notes.append(
-            f"Ground control point {control.names[k]} is left out: it is {_east_north_up(off)} m from where "
+            f"Ground control point {control.names[k]} is left out: it is {_east_north_up(off)} from where "
             "the other points place it; check its coordinates and marks."
         )
     if control.scale > _WIDENED:
@@ -104,15 +104,15 @@ def _control_notes(problem: Problem, result: Estimate) -> list[str]:
         if np.nanmax(sigmas) > _CONTRADICTION_SIGMAS:
             expected = ", ".join(f"{s:.2f}" for s in sigma[np.isfinite(off)])
             notes.append(
-                f"GNSS{of} and ground control contradict each other: fixes are {_east_north_up(off)} m off "
+                f"GNSS{of} and ground control contradict each other: fixes are {_east_north_up(off)} off "
                 f"where {expected} m (1 sigma) are expected; check coordinate system, datum and heights of "
                 "the points, or state --gnss-bias."
             )
         else:
-            notes.append(f"Fixes{of} are {_east_north_up(off)} m off the ground control.")
+            notes.append(f"Fixes{of} are {_east_north_up(off)} off the ground control.")
     return notes
 
 
 def _east_north_up(metres: np.ndarray) -> str:
     axes = ("east", "north", "up")
-    return ", ".join(f"{m:+.2f} {axis}" for m, axis in zip(metres, axes, strict=True) if m == m)
+    return ", ".join(f"{m:+.2f} m {axis}" for m, axis in zip(metres, axes, strict=True) if m == m)
