@@ -172,7 +172,11 @@ def _horizontal(file: ControlFile, crs: CRS, east: np.ndarray, north: np.ndarray
     place = np.nanmin(rough, axis=0), np.nanmax(rough, axis=0)
     transformer = _best(file, crs, 4326, place)
     lon, lat = transformer.transform(east, north)
-    return np.column_stack([lat, lon])
+    found = np.column_stack([lat, lon])
+    lost = ~np.isfinite(found).all(axis=1)
+    if lost.any():
+        raise _at(file, int(np.argmax(lost)), f"{crs.name} cannot be converted to WGS84 there")
+    return found
 
 
 def _transform(crs: CRS, east: np.ndarray, north: np.ndarray) -> np.ndarray:
