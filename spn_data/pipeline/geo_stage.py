@@ -186,9 +186,16 @@ def _control(
             path=options.control.file,
         )
     reference = options.fit.height_reference
-    return read_control(
+    control, notes = read_control(
         area, scene, options.control, tracks=tracks, origin=origin, reference=reference
     )
+    if control.check.all():
+        raise InputError(
+            f"all of its {len(control)} points that can be used are check points: leave some to the fit, or "
+            "compare them with spn-data check-points",
+            path=options.control.file,
+        )
+    return control, notes
 
 
 def registered_frames(area: Area, scene: Scene) -> Frames:

@@ -119,6 +119,10 @@ def test_wrong_points_leave_the_area_as_it_was(area: Path, tmp_path: Path) -> No
     result = run("georegister", "--area", area, "--gcp", other, *OPTIONS)
     assert result.exit_code == 1
     assert "none of its images is in the model" in result.stderr
+    every = ("--gcp", area.parent / "points.csv", "--check-points", "T0,T1,T2,T3,T4,T5")
+    result = run("georegister", "--area", area, *every, *OPTIONS)
+    assert result.exit_code == 1
+    assert "all of its 6 points that can be used are check points" in result.stderr
     result = run("georegister", "--area", area, "--check-points", "2")
     assert result.exit_code == 2
     assert "--check-points needs --gcp" in result.stderr
