@@ -40,7 +40,7 @@ _COLUMNS: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class Role(StrEnum):
+class PointRole(StrEnum):
     """What a surveyed point is for."""
 
     CONTROL = "control"  # fitted
@@ -86,7 +86,7 @@ class SurveyedPoint:
         NaN if the file has none.
     line : int
         Line of the file where it first appears.
-    role : Role
+    role : PointRole
     marks : tuple of Mark
     sigma_h_m, sigma_v_m : float, optional
         Standard deviation of the survey, horizontal per axis and vertical.
@@ -97,7 +97,7 @@ class SurveyedPoint:
     north: float
     height: float
     line: int
-    role: Role = Role.CONTROL
+    role: PointRole = PointRole.CONTROL
     marks: tuple[Mark, ...] = ()
     sigma_h_m: float | None = None
     sigma_v_m: float | None = None
@@ -319,12 +319,12 @@ def _same_crs(before: str, text: str) -> str:
     return crs
 
 
-def _role(text: str) -> Role:
+def _role(text: str) -> PointRole:
     role = text.strip().lower()
     if role in _CHECKED:
-        return Role.CHECK
+        return PointRole.CHECK
     if role in _CONTROLLED:
-        return Role.CONTROL
+        return PointRole.CONTROL
     raise ValueError(f"the role is {text[:40]!r}: control or check")
 
 

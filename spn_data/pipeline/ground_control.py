@@ -17,7 +17,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.control import Control, PointResidual, point_residuals
 from spn_data.georegistration.result import GeoFit
-from spn_data.ground_control.control_file import ControlFile, Role, read_control_file
+from spn_data.ground_control.control_file import ControlFile, PointRole, read_control_file
 from spn_data.ground_control.coordinates import SurveyedPositions, surveyed_positions
 from spn_data.ground_control.marks import ModelImages, marked_points
 from spn_data.storage.json_files import read_json, reporting_damage
@@ -250,7 +250,7 @@ def _checked(
 ) -> np.ndarray:
     """Return which points are held out (K,); raise InputError if a name is unknown or none would be left."""
     names = [p.name for p in file.points]
-    check = np.array([p.role is Role.CHECK for p in file.points])
+    check = np.array([p.role is PointRole.CHECK for p in file.points])
     unknown = [name for name in wanted if name not in names]
     if len(wanted) == 1 and unknown and wanted[0].isdigit():
         free = np.flatnonzero(found & ~check)

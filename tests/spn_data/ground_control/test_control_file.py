@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spn_data.errors import InputError
-from spn_data.ground_control.control_file import ControlFile, Role, read_control_file
+from spn_data.ground_control.control_file import ControlFile, PointRole, read_control_file
 
 LIST = """WGS84 UTM 32N
 # from the total station
@@ -56,7 +56,7 @@ def test_tables_name_their_columns(tmp_path: Path) -> None:
         0.04,
     )
     assert len(first.marks) == 2
-    assert (first.role, second.role) == (Role.CONTROL, Role.CHECK)
+    assert (first.role, second.role) == (PointRole.CONTROL, PointRole.CHECK)
     assert np.isnan(read(tmp_path, TABLE.replace("211;", ";")).points[1].height)
 
 

@@ -95,7 +95,7 @@ def test_images_are_found_by_any_of_their_names() -> None:
     names = [
         "DJI_0.JPG",
         "photos/DJI_1.jpg",
-        "/home/me/photos/DJI_2.JPG",
+        "D:/flight/photos/DJI_2.JPG",
         "dji_3",
         "DJI_9.JPG",
         "X.JPG",
