@@ -68,6 +68,7 @@ def make(folder: Path) -> None:
 def make_small(folder: Path, flight: Path) -> None:
     """Write the seeds that take a second in all: telemetry, photos and videos, also of a flight."""
     _telemetry(folder / "telemetry", flight)
+    _control(folder / "control")
     _pictures(folder / "photos")
     _videos(folder / "video")
     _data_tracks(folder / "data-tracks")
@@ -112,6 +113,19 @@ def _flight_and_area(folder: Path) -> None:
         *("--threads", 1),
     )
     _run(model_command, "evaluate", "--run", "default", "--area", area, "--threads", 1)
+
+
+def _control(folder: Path) -> None:
+    folder.mkdir()
+    rows = [(f"P{k // 2}", f"{9 + k // 2 * 1e-4:.6f}", f"DJI_{k % 2}.JPG") for k in range(8)]
+    (folder / "gcp_list.txt").write_text(
+        "EPSG:4326\n"
+        + "".join(f"{lon} 48.5 210 9 20 {image} {name}\n" for name, lon, image in rows)
+    )
+    (folder / "points.csv").write_text(
+        "name,lat,lon,height,epsg,image,x,y,role\n"
+        + "".join(f"{name},48.5,{lon},210,4979,{image},9,20,check\n" for name, lon, image in rows)
+    )
 
 
 def _telemetry(folder: Path, flight: Path) -> None:

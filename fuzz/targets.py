@@ -29,6 +29,8 @@ from spn_data.dataset.nvm import read_nvm_models
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import read_camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.ground_control.control_file import read_control_file
+from spn_data.ground_control.coordinates import surveyed_positions
 from spn_data.inputs.area_labels import read_written_world
 from spn_data.inputs.network_runs import read_runs
 from spn_data.labels.labels import read_label_observations, read_labels
@@ -210,6 +212,10 @@ def _recipe(path: Path) -> None:
     read_recipe(str(path))
 
 
+def _control(path: Path) -> None:
+    surveyed_positions(read_control_file(path))
+
+
 def _waypoints(path: Path) -> None:
     read_waypoints(path, _PLACE)
 
@@ -231,6 +237,7 @@ TARGETS = (
         "telemetry/*.ulg telemetry/*.bin telemetry/*.tlog telemetry/*.fit telemetry/*.nmea",
         read_telemetry,
     ),
+    Target("ground control", "control/*", _control),
     Target("subtitles", "subtitled/*", read_subtitles),
     Target("data tracks", "data-tracks/*.ts data-tracks/*.mp4", read_embedded),
     Target("payloads", "data-tracks/payloads/*", _payload),

@@ -9,6 +9,7 @@ import click
 
 from spn_cli import options
 from spn_cli.audit import audit
+from spn_cli.check_points import check_points
 from spn_cli.console import Group
 from spn_cli.coverage import coverage
 from spn_cli.export import export
@@ -120,6 +121,7 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
         page.refresh(area)
 
 
+main.add_command(check_points)
 main.add_command(register)
 main.add_command(coverage)
 main.add_command(split)

@@ -102,6 +102,28 @@ class FilePerSequence(click.ParamType[tuple[str, str]]):
         return sequence or "*", path
 
 
+class HorizontalVertical(click.ParamType[tuple[float, float]]):
+    """Metres horizontally and, after a comma, vertically; 2.5 times as much vertically if left out."""
+
+    name = "H[,V]"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        """Return both numbers; fail if one is none, negative or not finite."""
+        if isinstance(value, tuple):
+            return value
+        horizontal, comma, vertical = str(value).partition(",")
+        try:
+            h = float(horizontal)
+            v = float(vertical) if comma else 2.5 * h
+        except ValueError:
+            self.fail(f"{value!r} is not a number, or two with a comma", param, ctx)
+        if not (0 <= h < math.inf and 0 <= v < math.inf):
+            self.fail(f"{value!r} is not between 0 and infinity", param, ctx)
+        return h, v
+
+
 camera = click.option(
     "--camera",
     "camera_files",
@@ -115,6 +137,25 @@ fov = click.option(
     type=PerSequence(5, 170),
     multiple=True,
     help="Horizontal field of view in degrees, as initial value.",
+)
+
+
+gcp_sigma = click.option(
+    "--gcp-sigma",
+    "gcp_sigma_m",
+    type=(Finite(0, min_open=True), Finite(0, min_open=True)),
+    metavar="H V",
+    default=(0.03, 0.05),
+    show_default=True,
+    help="Standard deviation of surveyed points in metres, horizontal (per axis) and vertical.",
+)
+mark_sigma = click.option(
+    "--mark-sigma",
+    "mark_sigma_px",
+    type=Finite(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Standard deviation of marks of ground control points in pixels.",
 )
 
 
@@ -140,6 +181,26 @@ _GEOREGISTRATION = (
         help="Standard deviation of a GNSS fix in metres, horizontal (per axis) and vertical.  "
         "[default: the source's own, otherwise that of its kind]",
     ),
+    click.option(
+        "--gnss-bias",
+        "gnss_bias_m",
+        type=HorizontalVertical(),
+        help="Standard deviation in metres of the error that all fixes of a day share, horizontal (per axis) "
+        "and vertical (2.5 times that if left out).  [default: that of the source's kind]",
+    ),
+    click.option(
+        "--gcp",
+        "gcp_file",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="Ground control points with their marks in images: ODM's gcp_list.txt, or CSV.",
+    ),
+    click.option(
+        "--check-points",
+        metavar="N|NAME,...",
+        help="Ground control points to hold out, to check the map: so many, or these.",
+    ),
+    gcp_sigma,
+    mark_sigma,
     click.option(
         "--time-offset",
         "time_offset_s",
@@ -187,6 +248,11 @@ def georegistration(command: Any) -> Any:
 def geo_options(
     *,
     gnss_sigma_m: tuple[float, float] | None,
+    gnss_bias_m: tuple[float, float] | None,
+    gcp_file: Path | None,
+    check_points: str | None,
+    gcp_sigma_m: tuple[float, float],
+    mark_sigma_px: float,
     time_offset_s: tuple[tuple[str, float], ...],
     heights: str,
     height_reference: str | None,
@@ -198,15 +264,28 @@ def geo_options(
     from spn_data.geometry.geodesy import HeightReference
     from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
     from spn_data.pipeline.geo_stage import GeoStageOptions
+    from spn_data.pipeline.ground_control import ControlOptions
 
     if takeoff_alt_m is not None and height_reference is None:
         raise click.UsageError("--takeoff-alt needs --height-reference")
     fit = GeoregisterOptions(
         gnss_sigma_m=gnss_sigma_m,
+        gnss_bias_m=gnss_bias_m,
         heights=Heights(heights),
         height_reference=None if height_reference is None else HeightReference(height_reference),
         takeoff_alt_m=takeoff_alt_m,
         correlation_time_s=correlation_time_s,
         use_gimbal=not ignore_gimbal,
     )
-    return GeoStageOptions(fit=fit, time_offset_s=dict(time_offset_s))
+    control = None
+    if gcp_file is not None:
+        names = (name.strip() for name in (check_points or "").split(","))
+        control = ControlOptions(
+            file=str(gcp_file.resolve()),
+            check=tuple(name for name in names if name),
+            sigma_m=gcp_sigma_m,
+            mark_sigma_px=mark_sigma_px,
+        )
+    elif check_points is not None:
+        raise click.UsageError("--check-points needs --gcp")
+    return GeoStageOptions(fit=fit, time_offset_s=dict(time_offset_s), control=control)

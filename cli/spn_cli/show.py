@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -194,7 +194,45 @@ def georegistration(record: StageRecord) -> None:
             show_labels.time_row(record),
         ],
     )
+    if c.get("control"):
+        surveyed(c["control"])
     show_labels.notes(record)
+
+
+def surveyed(points: Sequence[Mapping[str, Any]]) -> None:
+    """Print the residuals of surveyed points, and their RMSE beside what is stated."""
+    rows = []
+    for point in points:
+        role = f"{point['role']} (left out)" if point["is_outlier"] else point["role"]
+        east, north, up = (_signed(v) for v in point["residual_m"])
+        sigma = ", ".join(_format(v, ".3f") for v in point["sigma_m"])
+        pixels = _format(point["reprojection_px"], ".2f")
+        rows.append((point["name"], role, str(point["marks"]), east, north, up, sigma, pixels))
+    header = ("point", "role", "marks", "east m", "north m", "up m", "sigma E, N, U", "px")
+    console.table("Ground control: surveyed minus mapped", rows, header)
+    for role in ("control", "check"):
+        mine = [p for p in points if p["role"] == role and not p["is_outlier"]]
+        if mine:
+            console.out.print(f"{len(mine)} {role} points: {', '.join(_rmse(mine))}.")
+
+
+def _rmse(points: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the RMSE east, north and up of points, and the RMS of their stated sigmas."""
+    told = []
+    for k, axis in enumerate(("east", "north", "up")):
+        pairs = [
+            (p["residual_m"][k], p["sigma_m"][k]) for p in points if p["residual_m"][k] is not None
+        ]
+        if pairs:
+            found, stated = (
+                math.sqrt(sum(v * v for v in col) / len(pairs)) for col in zip(*pairs, strict=True)
+            )
+            told.append(f"{axis} RMSE {found:.3f} m (stated {stated:.3f} m)")
+    return told
+
+
+def _signed(value: float | None) -> str:
+    return _format(value, "+.3f")
 
 
 def _run(area: Area, name: str) -> tuple[str, str, str, str]:

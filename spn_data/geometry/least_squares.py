@@ -202,3 +202,19 @@ def cluster_scores(
         (residuals, (np.repeat(cluster, 2), np.arange(m))), (int(cluster.max()) + 1, m)
     )
     return (gather @ design).tocsr()
+
+
+def similarity_jacobian(lever: np.ndarray) -> np.ndarray:
+    """Return the derivatives (N, 3, 7) of points with a lever (N, 3) from a similarity's centre.
+
+    The parameters are the centre, the rotation vector in the target frame and the logarithm of scale.
+    """
+    jacobian = np.zeros((len(lever), 3, 7))
+    jacobian[:, :, :3] = np.eye(3)
+    # omega x lever
+    x, y, z = lever.T
+    jacobian[:, 0, 4], jacobian[:, 0, 5] = z, -y
+    jacobian[:, 1, 3], jacobian[:, 1, 5] = -z, x
+    jacobian[:, 2, 3], jacobian[:, 2, 4] = y, -x
+    jacobian[:, :, 6] = lever
+    return jacobian

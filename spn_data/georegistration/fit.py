@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -136,4 +136,4 @@ def _from_first(state: FitState, first: int, *, drop: bool = False) -> FitState:
     """Return the state with offsets relative to one flight's, and the centre's height adjusted to match."""
     offsets = np.zeros_like(state.offsets_m) if drop else state.offsets_m - state.offsets_m[first]
     center = state.center - np.array([0.0, 0.0, state.offsets_m[first]])
-    return FitState(state.rotation, state.scale, center, offsets, state.gimbal_deg, state.level_deg)
+    return replace(state, center=center, offsets_m=offsets)

@@ -9,21 +9,26 @@ import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, Similarity
-from spn_data.georegistration.cross_validation import HeldOut, cross_validate, time_blocks
+from spn_data.georegistration.control import Control, PointResidual, point_residuals
+from spn_data.georegistration.cross_validation import cross_validate, time_blocks
 from spn_data.georegistration.fit import FIXED_OFFSET_M, Estimate, estimate
+from spn_data.georegistration.fit_notes import fit_notes
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.gravity import Gravity, gravity_from_gimbal, up_from_level_cameras
 from spn_data.georegistration.observe import Fixes, observe
-from spn_data.georegistration.problem import Kind, Problem
-from spn_data.georegistration.ransac import extent, ransac_similarity
+from spn_data.georegistration.problem import SHARED, Kind, Problem
+from spn_data.georegistration.ransac import RansacResult, extent, ransac_similarity
 from spn_data.georegistration.result import FitSummary, GeoFit
-from spn_data.georegistration.uncertainty import Uncertainty, effective_fixes, require_determined
+from spn_data.georegistration.uncertainty import (
+    Uncertainty,
+    drift_covariance,
+    effective_fixes,
+    require_determined,
+)
 from spn_data.telemetry.track import Telemetry
 
 # A fix is an outlier if its residual exceeds this many sigma of the white noise.
 _OUTLIER_SIGMAS = 5.0
-# A constant gimbal error above this many sigma is reported to the user.
-_GIMBAL_BIAS_SIGMAS = 4.0
 
 
 def georegister(
@@ -32,6 +37,7 @@ def georegister(
     sequence: Sequence[str],
     time_s: np.ndarray,
     options: GeoregisterOptions | None = None,
+    control: Control | None = None,
 ) -> GeoFit:
     """Georegister a model from its cameras' fixes, heights and gimbal angles.
 
@@ -47,6 +53,8 @@ def georegister(
         Time of each frame within its flight, in seconds.
     options : GeoregisterOptions, optional
         Noise model, robust estimation and acceptance limits.
+    control : Control, optional
+        Surveyed points. The world has their origin; three or more can do without telemetry.
 
     Returns
     -------
@@ -70,10 +78,12 @@ def georegister(
         raise ValueError(
             f"{len(model)} poses and {len(telemetry)} telemetry rows must be equal in number"
         )
-    fixes = observe(telemetry, sequence, time_s, options)
-    _require_enough(fixes, options)
+    fixes = observe(
+        telemetry, sequence, time_s, options, None if control is None else control.origin
+    )
     # Normalise: the fit uses centred coordinates of unit size, independent of the gauge.
-    middle = model.centers[fixes.has_fix].mean(axis=0)
+    known = fixes.has_fix if fixes.has_fix.any() else np.ones(len(model), dtype=bool)
+    middle = model.centers[known].mean(axis=0)
     size = float(np.sqrt(((model.centers - middle) ** 2).sum(axis=1).mean()))
     if not size > 0:
         raise GeometryError("all cameras of the model are at one point")
@@ -87,22 +97,62 @@ def georegister(
         up_cam=np.where(gravity.usable[:, None], fixes.up_cam, np.nan),
         notes=fixes.notes + gravity.notes,
     )
-    use_level = fixes.has_fix & ~gravity.usable
-    up_model = gravity.direction
-    if up_model is None and not fixes.has_heights:
-        up_model = _up_of_level_cameras(rotations)
-    initial = ransac_similarity(centers, fixes, up_model, options)
+    if control is not None:
+        control = control.centred(middle, size)
+    fixes, initial = _initial(centers, rotations, fixes, gravity, control, options)
     if initial.sigma_factor > 1:
         note = (
             f"Fixes agree with the model only within {initial.sigma_factor:g} times their stated "
             "sigma."
         )
         fixes = replace(fixes, notes=(*fixes.notes, note))
-    problem = Problem.build(centers, rotations, fixes, use_level, options)
+    use_level = fixes.has_fix & ~gravity.usable
+    problem = Problem.build(centers, rotations, fixes, use_level, options, control)
     state = problem.initial_state(initial.world_from_model, initial.inlier)
     result = estimate(problem, state, initial.inlier)
+    if control is not None:
+        judged = control.judged(result.state.similarity)
+        if judged is not control:
+            problem = replace(problem, control=judged)
+            result = estimate(problem, result.state, initial.inlier)
     require_determined(problem, result, options)
     return _geo_fit(problem, result, gravity, middle, size)
+
+
+def _initial(
+    centers: np.ndarray,
+    rotations: np.ndarray,
+    fixes: Fixes,
+    gravity: Gravity,
+    control: Control | None,
+    options: GeoregisterOptions,
+) -> tuple[Fixes, RansacResult]:
+    """Return the fixes to use and an initial similarity: without fixes if only surveyed points give one."""
+    try:
+        _require_enough(fixes, options)
+        up_model = gravity.direction
+        if up_model is None and not fixes.has_heights:
+            up_model = _up_of_level_cameras(rotations)
+        return fixes, ransac_similarity(centers, fixes, up_model, options)
+    except GeometryError as error:
+        if control is None:
+            raise
+        try:
+            found = control.initial()
+        except GeometryError as other:
+            raise GeometryError(
+                f"the fixes do not tell where the model is ({error}), and neither does ground control: "
+                f"{other}"
+            ) from other
+        if fixes.has_fix.any():
+            note = f"Fixes are not used, only ground control and gimbal angles: {error}."
+            fixes = replace(
+                fixes,
+                enu_m=np.full_like(fixes.enu_m, np.nan),
+                has_heights=False,
+                notes=(*fixes.notes, note),
+            )
+        return fixes, RansacResult(found, np.ones(len(centers), dtype=bool), 1.0)
 
 
 def _require_enough(fixes: Fixes, options: GeoregisterOptions) -> None:
@@ -139,10 +189,10 @@ def _geo_fit(
     distance = np.zeros((len(Kind), len(problem.model)))
     distance[problem.kind, problem.frame] = result.distance
     outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
-    covariance = result.covariance[:7, :7].copy()
+    covariance = result.covariance[:SHARED, :SHARED] + drift_covariance(problem, result)
     # Gravity constrains the cameras' rotations; telemetry cannot show how positions are tilted against them.
     covariance[[3, 4], [3, 4]] += np.deg2rad(options.model_bend_deg) ** 2
-    if not fixes.has_heights:
+    if not fixes.has_heights and problem.control is None:
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = np.inf
     uncertainty = Uncertainty.from_covariance(covariance, state.center)
@@ -158,7 +208,8 @@ def _geo_fit(
         fixes.origin,
         {
             # A tight prior holds the reference flight at zero.
-            name: 0.0 if result.offset_sigma_m[f] <= FIXED_OFFSET_M else float(offset)
+            name: (0.0 if result.offset_sigma_m[f] <= FIXED_OFFSET_M else float(offset))
+            - _zero_m(problem, result, f)
             for f, (name, offset) in enumerate(zip(fixes.flights, state.offsets_m, strict=True))
             if np.isfinite(fixes.enu_m[fixes.flight == f, 2]).any()
         },
@@ -172,8 +223,34 @@ def _geo_fit(
         held_out[1],
         _summary(problem, result, residuals, outlier),
         _observations(problem, gravity),
-        fixes.notes + _notes(problem, result, gravity, outlier, held_out[0]),
+        fixes.notes + fit_notes(problem, result, gravity, outlier, held_out[0]),
+        _residuals_of_control(problem, world_from_model, uncertainty, middle, size),
     )
+
+
+def _residuals_of_control(
+    problem: Problem,
+    world_from_model: Similarity,
+    uncertainty: Uncertainty,
+    middle: np.ndarray,
+    size: float,
+) -> tuple[PointResidual, ...]:
+    if problem.control is None:
+        return ()
+    control = problem.control.centred(
+        -middle / size, 1 / size
+    )  # back in the model's own coordinates
+    covariance = uncertainty.point_covariance(world_from_model.apply(control.model))
+    return point_residuals(control, world_from_model, covariance)
+
+
+def _zero_m(problem: Problem, result: Estimate, flight: int) -> float:
+    """Return how far a flight's heights are above the origin's if nothing else relates the two."""
+    if not problem.fixes.free_zero:
+        return 0.0
+    mine = (problem.fixes.flight == flight) & np.isfinite(problem.fixes.enu_m[:, 2])
+    bias = problem.fixes.bias_m[mine, 2] * result.state.bias[problem.fixes.bias_group[mine], 2]
+    return float(np.median(bias))
 
 
 def _noise(problem: Problem, result: Estimate) -> dict[str, tuple[float, float]]:
@@ -212,7 +289,9 @@ def _summary(
 
 
 def _observations(problem: Problem, gravity: Gravity) -> tuple[str, ...]:
-    used = ["fixes"]
+    used = ["ground control"] if problem.control is not None and problem.control.used.any() else []
+    if problem.fixes.has_fix.any():
+        used.append("fixes")
     if problem.fixes.has_heights:
         used.append("heights")
     if gravity.usable.any():
@@ -220,46 +299,6 @@ def _observations(problem: Problem, gravity: Gravity) -> tuple[str, ...]:
     if problem.use_level.any():
         used.append("level cameras")
     return tuple(used)
-
-
-def _notes(
-    problem: Problem, result: Estimate, gravity: Gravity, outlier: np.ndarray, held_out: HeldOut
-) -> tuple[str, ...]:
-    """Return sentences on the quality of the fit for the user."""
-    fixes, state, options = problem.fixes, result.state, problem.options
-    notes = []
-    if not gravity.usable.any():
-        notes.append(
-            "No gimbal angles: up is estimated from the fixes and from the assumption that cameras fly level "
-            f"on average (sigma {options.level_camera_sigma_deg:g} deg)."
-        )
-    for f, name in enumerate(fixes.flights):
-        mine = fixes.has_fix & (fixes.flight == f)
-        if not mine.any():
-            notes.append(
-                f"{name}: no frame has a fix; it is georegistered through the other flights only."
-            )
-        elif np.mean(outlier[mine]) > 0.3:
-            notes.append(
-                f"{name}: {np.mean(outlier[mine]):.0%} of its fixes are outliers: this may be the "
-                "telemetry of another flight, or its clock may be off."
-            )
-        if result.offset_sigma_m[f] > 10:
-            notes.append(
-                f"{name}: its heights are offset by {state.offsets_m[f]:+.1f} m from the first flight's."
-            )
-        bias = float(np.linalg.norm(state.gimbal_deg[f]))
-        if bias > _GIMBAL_BIAS_SIGMAS * options.gimbal_bias_deg:
-            notes.append(f"{name}: its gimbal angles have a constant error of {bias:.1f} deg.")
-    for group, name in enumerate(("horizontal", "vertical")):
-        level = float(
-            np.hypot(*np.exp([result.levels.log_bias[group], result.levels.log_white[group]]))
-        )
-        if level > 2 and (problem.chains.group == group).any():
-            notes.append(f"The {name} errors of the fixes are {level:.1f} times the stated sigma.")
-    if held_out.folds == 0:
-        notes.append("The flights are too short for cross-validation by time blocks.")
-    return tuple(notes)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -22,6 +22,19 @@ DEFAULT_SIGMA_M: dict[str, tuple[float, float]] = {
 }
 UNKNOWN_KIND_SIGMA_M = (1.5, 2.5)
 
+# Standard deviation (horizontal per axis, vertical) in metres of the part of a fix's error that all flights
+# of a day share, because orbits, clocks and atmosphere change over hours: no number of fixes averages it.
+GNSS_BIAS_M: dict[str, tuple[float, float]] = {"gopro": (1.5, 3.0), "gpx": (1.5, 3.0)}
+USUAL_GNSS_BIAS_M = (1.0, 2.5)
+# Of a height above take-off: the receiver's bias cancels, the drift of the air pressure remains.
+RELATIVE_HEIGHT_BIAS_M = 1.0
+# A source that states less than its kind's sigma has a bias smaller in proportion, down to that of a
+# differential fix: its base and its antenna.
+LEAST_GNSS_BIAS_M = (0.02, 0.03)
+# This share of the bias drifts, with this correlation time.
+BIAS_DRIFT_SHARE = 0.5
+BIAS_DRIFT_TIME_S = 1200.0
+
 # A fix with a smaller horizontal sigma is a carrier-phase differential one (RTK, PPK). Its errors follow a
 # different process from those of the same receiver without corrections.
 RTK_SIGMA_M = 0.15
@@ -44,6 +57,9 @@ class GeoregisterOptions:
     gnss_sigma_m : tuple of float, optional
         Sigma of one fix in metres, horizontal per axis and vertical. None: the sigma stated by the source,
         or `DEFAULT_SIGMA_M` if it states none.
+    gnss_bias_m : tuple of float, optional
+        Sigma in metres, horizontal per axis and vertical, of the error that all fixes of a day share. None:
+        that of the source's kind, less if the source states a smaller sigma than its kind has.
     correlation_time_s : float
         Correlation time of the GNSS errors within a flight (first-order Gauss-Markov process).
     heights : Heights
@@ -81,6 +97,7 @@ class GeoregisterOptions:
     """
 
     gnss_sigma_m: tuple[float, float] | None = None
+    gnss_bias_m: tuple[float, float] | None = None
     correlation_time_s: float = 60.0
     heights: Heights = Heights.AUTO
     height_reference: HeightReference | None = None
@@ -106,6 +123,10 @@ class GeoregisterOptions:
             np.isfinite(s) and s > 0 for s in self.gnss_sigma_m
         ):
             raise ValueError(f"gnss_sigma_m must be positive, got {self.gnss_sigma_m}")
+        if self.gnss_bias_m is not None and not all(
+            np.isfinite(b) and b >= 0 for b in self.gnss_bias_m
+        ):
+            raise ValueError(f"gnss_bias_m must not be negative, got {self.gnss_bias_m}")
         if not self.correlation_time_s > 0:
             raise ValueError(f"correlation_time_s must be positive, got {self.correlation_time_s}")
 
@@ -113,4 +134,10 @@ class GeoregisterOptions:
 def default_sigma_m(kind: str) -> np.ndarray:
     """Return the default sigma (3,) east, north, up in metres for a kind of source that states none."""
     horizontal, vertical = DEFAULT_SIGMA_M.get(kind, UNKNOWN_KIND_SIGMA_M)
+    return np.array([horizontal, horizontal, vertical])
+
+
+def default_bias_m(kind: str) -> np.ndarray:
+    """Return the usual bias sigma (3,) east, north, up in metres of positions of a kind of source."""
+    horizontal, vertical = GNSS_BIAS_M.get(kind, USUAL_GNSS_BIAS_M)
     return np.array([horizontal, horizontal, vertical])

@@ -130,6 +130,8 @@ def apply_inverse_covariance(
 
     weights : (M,) robust weights, which divide the variance of the white noise.
     """
+    if not len(columns):
+        return columns, 0.0
     white_var = (np.exp(levels.log_white)[chains.group] * chains.unit) ** 2 / weights
     amplitude = np.exp(levels.log_bias)[chains.group] * chains.unit
     banded = chains.precision.copy()
@@ -146,13 +148,15 @@ class LinearSystem:
     """Linearised observations ``residual = jacobian @ step + noise`` with a prior on the parameters.
 
     residual : (M,); jacobian : (M, P); prior_precision : (P,) of a zero-mean prior; value : (P,) current
-    values.
+    values; control : (C, P + 1) jacobian and residual of further observations with independent errors of
+    unit variance.
     """
 
     residual: np.ndarray
     jacobian: np.ndarray
     prior_precision: np.ndarray
     value: np.ndarray
+    control: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +173,8 @@ def _normal(matrix: np.ndarray, linear: LinearSystem) -> tuple[np.ndarray, np.nd
 
     matrix : (P + 1, P + 1) products of (jacobian, residual) under the inverse covariance.
     """
+    if linear.control is not None:
+        matrix = matrix + linear.control.T @ linear.control
     pull = linear.prior_precision * linear.value
     information = matrix[:-1, :-1] + np.diag(linear.prior_precision)
     return (

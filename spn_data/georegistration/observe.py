@@ -11,9 +11,12 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.georegistration.georegister_options import (
+    LEAST_GNSS_BIAS_M,
+    RELATIVE_HEIGHT_BIAS_M,
     RTK_SIGMA_M,
     GeoregisterOptions,
     Heights,
+    default_bias_m,
     default_sigma_m,
 )
 from spn_data.telemetry.track import Telemetry
@@ -29,8 +32,9 @@ class Fixes:
     enu_m : (N, 3), NaN if unknown (up independently of east and north); sigma_m : (N, 3); up_cam : (N, 3)
     unit direction of up in camera axes according to the gimbal, NaN if unknown; attitude : (N, 3, 3)
     cam_from_world according to the gimbal, including heading, NaN if not used; flight : (N,) index into
-    `flights`; time_s : (N,) within the flight; relative : (F,) bool, whether the flight's heights are above
-    its take-off.
+    `flights`; time_s : (N,) within the flight; bias_m : (N, 3) sigma of the error that all fixes of a bias
+    group share; day : (F,) index of each flight's day, the same for all if a day is unknown; relative : (F,)
+    bool, whether the flight's heights are above its take-off.
     """
 
     enu_m: np.ndarray
@@ -40,9 +44,12 @@ class Fixes:
     flight: np.ndarray
     flights: tuple[str, ...]
     time_s: np.ndarray
+    bias_m: np.ndarray
+    day: np.ndarray
     relative: np.ndarray
     origin: GeoOrigin
     has_heights: bool
+    free_zero: bool  # nothing relates the zero of the heights to the origin's
     free_heights: bool  # each flight's heights may have a constant offset
     notes: tuple[str, ...]
 
@@ -55,6 +62,12 @@ class Fixes:
     def is_rtk(self) -> np.ndarray:
         """Mask (N,) of carrier-phase differential fixes (RTK, PPK)."""
         return self.sigma_m[:, :2].max(axis=1) < RTK_SIGMA_M
+
+    @property
+    def bias_group(self) -> np.ndarray:
+        """Index (N,) of the set of fixes with a common bias: those of one day, differential ones apart."""
+        group = self.day[self.flight] * 2 + self.is_rtk
+        return np.unique(group, return_inverse=True)[1].ravel()
 
     def only(self, mask: np.ndarray) -> Fixes:
         """Return the same frames without the observations of frames outside the mask (N,)."""
@@ -132,6 +145,34 @@ def _sigma(telemetry: Telemetry, options: GeoregisterOptions) -> np.ndarray:
     return np.where(np.isfinite(stated) & (stated > 0), stated, default_sigma_m(telemetry.kind))
 
 
+def _bias(
+    telemetry: Telemetry, sigma_m: np.ndarray, is_relative: np.ndarray, options: GeoregisterOptions
+) -> np.ndarray:
+    """Return the bias sigma (N, 3) of each fix: the user's, or its kind's, less for a small sigma."""
+    if options.gnss_bias_m is not None:
+        horizontal, vertical = options.gnss_bias_m
+        return np.tile([horizontal, horizontal, vertical], (len(telemetry), 1))
+    usual = np.tile(default_bias_m(telemetry.kind), (len(telemetry), 1))
+    usual[is_relative, 2] = RELATIVE_HEIGHT_BIAS_M
+    horizontal, vertical = LEAST_GNSS_BIAS_M
+    stated = np.minimum(sigma_m / default_sigma_m(telemetry.kind), 1.0)
+    return np.maximum(usual * stated, [horizontal, horizontal, vertical])
+
+
+def _days(telemetry: Telemetry, flight: np.ndarray, n_flights: int) -> np.ndarray:
+    """Return the index (F,) of each flight's day; zeros if any flight with fixes does not state its date."""
+    utc_s = np.full(n_flights, np.nan)
+    for f in range(n_flights):
+        mine = telemetry.utc_s[(flight == f) & telemetry.has_fix]
+        known = mine[np.isfinite(mine)]
+        if len(known):
+            utc_s[f] = known[0]
+        elif len(mine):
+            return np.zeros(n_flights, dtype=np.int64)
+    day = np.nan_to_num(np.floor(utc_s / 86400.0), nan=-1.0)
+    return np.unique(day, return_inverse=True)[1].ravel()
+
+
 def _heights(
     telemetry: Telemetry, flight: np.ndarray, n_flights: int, options: GeoregisterOptions
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -157,8 +198,11 @@ def observe(
     sequence: Sequence[str],
     time_s: np.ndarray,
     options: GeoregisterOptions,
+    control_origin: GeoOrigin | None = None,
 ) -> Fixes:
     """Convert the telemetry rows of N frames to observations in a local frame.
+
+    With an origin of surveyed points, frames need no fix, and heights may have another zero than the origin.
 
     Raises GeometryError if no frame has a fix, or if the heights cannot be converted to the origin to keep.
     """
@@ -167,7 +211,7 @@ def observe(
         raise ValueError(
             f"{n} telemetry rows, {len(sequence)} names and {len(time_s)} times must be equal in number"
         )
-    if not telemetry.has_fix.any():
+    if control_origin is None and not telemetry.has_fix.any():
         raise GeometryError(
             f"none of {n} frames has a fix: georegistration needs telemetry with positions"
         )
@@ -182,9 +226,18 @@ def observe(
         notes.append("Heights are above take-off in some flights and absolute in others.")
     use_relative = bool(relative[with_height].any())
     reference = options.height_reference or telemetry.abs_reference
-    origin = options.origin or _new_origin(telemetry, heights, use_relative, reference, options)
+    origin = (
+        control_origin
+        or options.origin
+        or _new_origin(telemetry, heights, use_relative, reference, options)
+    )
+    free_zero = control_origin is not None and not _is_comparable(
+        origin, use_relative, reference, options
+    )
     # Metres from the zero of the local frame to the zero of the heights.
-    zero = _zero_of_heights(origin, use_relative, reference, options) if known.any() else 0.0
+    zero = 0.0
+    if known.any() and not free_zero:
+        zero = _zero_of_heights(origin, use_relative, reference, options)
     up = heights + zero
     if mixed:
         # Start the other kind at the same median height; its offset is a free parameter afterwards.
@@ -192,12 +245,12 @@ def observe(
             heights[known & ~relative[flight]]
         )
         up = np.where(relative[flight], up, heights + offset)
-    if not known.any():
+    if not known.any() and control_origin is None:
         notes.append(
             "No heights are known: the mean camera height is set to 0 and the vertical position is "
             "undetermined."
         )
-    elif not use_relative and reference is HeightReference.UNKNOWN:
+    elif not use_relative and reference is HeightReference.UNKNOWN and not free_zero:
         notes.append(
             "Heights are absolute with an unknown reference: they constrain the shape, but the "
             "vertical zero is unknown."
@@ -212,18 +265,22 @@ def observe(
     time_s = np.asarray(time_s, dtype=np.float64)
     if not np.isfinite(time_s).all():
         notes.append("Frames without a time are assumed to share one GNSS error per flight.")
+    sigma_m = _sigma(telemetry, options)
     # Frames without a time are placed at one instant, so their errors are fully correlated.
     return Fixes(
         enu,
-        _sigma(telemetry, options),
+        sigma_m,
         up_cam,
         np.full((n, 3, 3), np.nan),
         flight,
         flights,
         np.where(np.isfinite(time_s), time_s, 0.0),
+        _bias(telemetry, sigma_m, relative[flight], options),
+        _days(telemetry, flight, len(flights)),
         relative,
         origin,
         bool(known.any()),
+        free_zero,
         use_relative or reference is HeightReference.UNKNOWN,
         tuple(notes),
     )
@@ -251,6 +308,21 @@ def _new_origin(
             lat, lon, 0.0, HeightReference.TAKEOFF if known.any() else HeightReference.UNKNOWN
         )
     return GeoOrigin(lat, lon, float(np.round(np.median(heights[known]))), reference)
+
+
+def _is_comparable(
+    origin: GeoOrigin,
+    use_relative: bool,
+    reference: HeightReference,
+    options: GeoregisterOptions,
+) -> bool:
+    """Return whether the heights of the telemetry can be converted to the origin's reference."""
+    if (
+        origin.height_reference is HeightReference.UNKNOWN
+        or reference is not origin.height_reference
+    ):
+        return False
+    return not use_relative or options.takeoff_alt_m is not None
 
 
 def _zero_of_heights(

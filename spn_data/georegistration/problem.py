@@ -7,8 +7,10 @@ from enum import IntEnum
 
 import numpy as np
 
+from spn_data.geometry.least_squares import similarity_jacobian
 from spn_data.geometry.pose import Similarity
 from spn_data.geometry.rotations import quats_from_rotations, rotations_from_vectors
+from spn_data.georegistration.control import Control
 from spn_data.georegistration.georegister_options import GeoregisterOptions
 from spn_data.georegistration.noise import Chains, LinearSystem, NoiseLevels
 from spn_data.georegistration.observe import Fixes
@@ -56,7 +58,7 @@ class FitState:
 
     offsets_m : (F,) height of each flight's zero above the first flight's; gimbal_deg : (F, 3) constant
     gimbal error of each flight about the camera's axes; level_deg : (F,) mean roll of frames without gimbal
-    angles.
+    angles; bias : (G, 3) common error of each bias group's fixes, in its sigma.
     """
 
     rotation: np.ndarray
@@ -65,6 +67,7 @@ class FitState:
     offsets_m: np.ndarray
     gimbal_deg: np.ndarray
     level_deg: np.ndarray
+    bias: np.ndarray
 
     def updated(self, step: np.ndarray) -> FitState:
         """Apply a step (P,) of all parameters."""
@@ -75,13 +78,21 @@ class FitState:
             self.center + step[:3],
             self.offsets_m + step[SHARED : SHARED + f],
             self.gimbal_deg + step[SHARED + f : SHARED + 4 * f].reshape(f, 3),
-            self.level_deg + step[SHARED + 4 * f :],
+            self.level_deg + step[SHARED + 4 * f : SHARED + 5 * f],
+            self.bias + step[SHARED + 5 * f :].reshape(-1, 3),
         )
 
     @property
+    def similarity(self) -> Similarity:
+        """From centred model coordinates to the world."""
+        return Similarity(self.scale, self.rotation, self.center)
+
+    @property
     def nuisance(self) -> np.ndarray:
-        """Parameters (5 F,) other than the similarity."""
-        return np.concatenate([self.offsets_m, self.gimbal_deg.ravel(), self.level_deg])
+        """Parameters (5 F + 3 G,) other than the similarity."""
+        return np.concatenate(
+            [self.offsets_m, self.gimbal_deg.ravel(), self.level_deg, self.bias.ravel()]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +101,7 @@ class Problem:
 
     model : (N, 3) camera centres, centred and scaled to unit size; cam_from_model : (N, 3, 3); use_level :
     (N,) bool, frames whose roll is observed as zero; kind, frame : (M,) kind and frame index of each
-    observation, in the order of `chains`.
+    observation, in the order of `chains`; control : surveyed points, in the coordinates of `model`.
     """
 
     model: np.ndarray
@@ -101,6 +112,7 @@ class Problem:
     chains: Chains
     kind: np.ndarray
     frame: np.ndarray
+    control: Control | None = None
 
     @classmethod
     def build(
@@ -110,6 +122,7 @@ class Problem:
         fixes: Fixes,
         use_level: np.ndarray,
         options: GeoregisterOptions,
+        control: Control | None = None,
     ) -> Problem:
         """Collect the observations; see the class for the arguments."""
         gimbal = np.isfinite(fixes.up_cam).all(axis=1)
@@ -129,9 +142,8 @@ class Problem:
         twin = np.array([0, 0, 1, 2, 2, 3, 4])[kind] * len(model) + frame
         tau = np.where(kind == Kind.HEADING, _HEADING_TIME_S, options.correlation_time_s)
         chains, order = Chains.build(chain, fixes.time_s[frame], tau, group, unit, twin)
-        return cls(
-            model, cam_from_model, fixes, use_level, options, chains, kind[order], frame[order]
-        )
+        kind, frame = kind[order], frame[order]
+        return cls(model, cam_from_model, fixes, use_level, options, chains, kind, frame, control)
 
     def prior_levels(self) -> NoiseLevels:
         """Return the prior noise levels."""
@@ -162,6 +174,7 @@ class Problem:
             offsets,
             np.zeros((f, 3)),
             np.zeros(f),
+            np.zeros((self.fixes.bias_group.max() + 1, 3)),
         )
 
     def linearise(
@@ -181,31 +194,50 @@ class Problem:
                 1 / offset_sigma_m**2,
                 1 / np.repeat(bias, 3) ** 2,
                 np.full(f, 1 / self.options.level_camera_sigma_deg**2),
+                self._bias_precision(state),
             ]
         )
         value = np.concatenate([np.zeros(SHARED), state.nuisance])
         if not self.fixes.has_heights:
             precision[2], value[2] = 1 / _FREE_HEIGHT_M**2, state.center[2]
         rows = self.kind, self.frame
-        return LinearSystem(residual[rows], jacobian[rows], precision, value)
+        control = None if self.control is None else self._control_rows(state, len(value))
+        return LinearSystem(residual[rows], jacobian[rows], precision, value, control)
+
+    def _bias_precision(self, state: FitState) -> np.ndarray:
+        """Return the prior precision (3 G,) of the biases; the zero of heights may be free."""
+        precision = np.ones_like(state.bias)
+        if self.fixes.free_zero:
+            group, known = self.fixes.bias_group, np.isfinite(self.fixes.enu_m[:, 2])
+            for g in np.unique(group[known]):
+                usual = self.fixes.bias_m[known & (group == g), 2].mean()
+                precision[g, 2] = (usual / _FREE_HEIGHT_M) ** 2
+        return precision.ravel()
+
+    def _control_rows(self, state: FitState, parameters: int) -> np.ndarray:
+        """Return jacobian and residual (3 C, P + 1) of the control points, weighted and of unit variance."""
+        assert self.control is not None
+        residual, jacobian, weight = self.control.whitened(state.similarity)
+        rows = np.zeros((residual.size, parameters + 1))
+        root = np.sqrt(np.repeat(weight, 3))[:, None]
+        rows[:, :SHARED] = jacobian.reshape(-1, SHARED) * root
+        rows[:, -1] = residual.ravel() * root[:, 0]
+        return rows
 
     def _dense_residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (7, N) and their Jacobian (7, N, P); NaN for missing observations."""
         n, f = len(self.model), len(self.fixes.flights)
         flight, every = self.fixes.flight, np.arange(n)
         residual: np.ndarray = np.full((len(Kind), n), np.nan)
-        jacobian: np.ndarray = np.zeros((len(Kind), n, SHARED + 5 * f))
+        jacobian: np.ndarray = np.zeros((len(Kind), n, SHARED + 5 * f + state.bias.size))
         lever = state.scale * self.model @ state.rotation.T
         residual[:3] = (self.fixes.enu_m - lever - state.center).T
         residual[2] += state.offsets_m[flight]
+        group = self.fixes.bias_group
+        residual[:3] -= (self.fixes.bias_m * state.bias[group]).T
+        jacobian[:3, :, :SHARED] = similarity_jacobian(lever).transpose(1, 0, 2)
         for k in range(3):
-            jacobian[k, :, k] = 1.0
-            jacobian[k, :, 6] = lever[:, k]
-        # omega x lever
-        x, y, z = lever.T
-        jacobian[0, :, 4], jacobian[0, :, 5] = z, -y
-        jacobian[1, :, 3], jacobian[1, :, 5] = -z, x
-        jacobian[2, :, 3], jacobian[2, :, 4] = y, -x
+            jacobian[k, every, SHARED + 5 * f + 3 * group + k] = self.fixes.bias_m[:, k]
         jacobian[2, every, SHARED + flight] = -1.0
 
         cam_from_world = self.cam_from_model @ state.rotation.T
@@ -248,6 +280,7 @@ class Problem:
             self.fixes,
             np.zeros_like(self.use_level),
             self.options,
+            self.control,
         )
 
     def on_frames(self, mask: np.ndarray) -> Problem:
@@ -258,6 +291,7 @@ class Problem:
             self.fixes.only(mask),
             self.use_level & mask,
             self.options,
+            self.control,
         )
 
 

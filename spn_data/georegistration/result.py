@@ -12,6 +12,7 @@ from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.geometry.json_values import numbers
 from spn_data.geometry.pose import Similarity
+from spn_data.georegistration.control import PointResidual
 from spn_data.georegistration.cross_validation import HeldOut
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.storage.json_files import DAMAGE, finite_or_none, kind_of, number_or
@@ -52,7 +53,7 @@ class GeoFit:
         By flight: what to add to its heights to obtain up coordinates. For heights above take-off this is the
         height of the take-off point above the zero (the first flight's, if the take-offs differ).
     residuals_m : ndarray, shape (N, 3)
-        Fix minus fitted centre, east, north, up; NaN if unknown.
+        Fix minus fitted centre, less the bias that ground control shows, east, north, up; NaN if unknown.
     outlier : ndarray of bool, shape (N,)
         Frames whose fix is an outlier.
     gravity_deg : ndarray, shape (N, 2)
@@ -71,6 +72,8 @@ class GeoFit:
         Kinds of observations used: "fixes", "heights", "gimbal", "level cameras".
     notes : tuple of str
         Sentences for the user.
+    control : tuple of PointResidual
+        Residuals of the surveyed points, in the order of their file.
     """
 
     world_from_model: Similarity
@@ -87,6 +90,7 @@ class GeoFit:
     summary: FitSummary
     observations: tuple[str, ...]
     notes: tuple[str, ...]
+    control: tuple[PointResidual, ...] = ()
 
     @property
     def height_reference(self) -> HeightReference:
@@ -126,6 +130,7 @@ class GeoFit:
             "residuals_m": self.residuals_m,
             "outlier": self.outlier,
             "gravity_deg": self.gravity_deg,
+            "control": [asdict(point) for point in self.control],
         }
         return _plain(value)
 
@@ -171,6 +176,7 @@ class GeoFit:
                 FitSummary(**_numbers(value["summary"])),
                 _texts(value["observations"]),
                 _texts(value["notes"]),
+                tuple(_point(p) for p in value.get("control", ())),
             )
         except DAMAGE as error:
             raise FormatError(f"damaged georegistration: {type(error).__name__} {error}") from error
@@ -190,6 +196,18 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.floating | float):
         return finite_or_none(value)
     return str(value)
+
+
+def _point(value: dict[str, Any]) -> PointResidual:
+    return PointResidual(
+        str(value["name"]),
+        str(value["role"]),
+        int(value["marks"]),
+        _triple(value["residual_m"]),
+        _triple(value["sigma_m"]),
+        number_or(value["reprojection_px"]),
+        bool(value["is_outlier"]),
+    )
 
 
 def _triple(value: Any) -> tuple[float, float, float]:

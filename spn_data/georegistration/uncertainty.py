@@ -5,15 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import gammaincinv
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.least_squares import similarity_jacobian
 from spn_data.geometry.pose import Similarity
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.georegistration.fit import Estimate, covariance_of
-from spn_data.georegistration.georegister_options import GeoregisterOptions
-from spn_data.georegistration.noise import apply_inverse_covariance, solve
-from spn_data.georegistration.problem import Kind, Problem
+from spn_data.georegistration.georegister_options import (
+    BIAS_DRIFT_SHARE,
+    BIAS_DRIFT_TIME_S,
+    GeoregisterOptions,
+)
+from spn_data.georegistration.noise import Chains, apply_inverse_covariance, solve
+from spn_data.georegistration.observe import Fixes
+from spn_data.georegistration.problem import SHARED, Kind, Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +47,8 @@ class Uncertainty:
 
     Notes
     -----
-    The 95 % hold if the errors follow the noise model of the fit.
+    The 95 % hold if the errors follow the noise model of the fit. They include the common bias of all fixes,
+    which moves the map as a whole; covariances of labels in the map do not.
     """
 
     horizontal_m: float
@@ -67,15 +75,46 @@ class Uncertainty:
 
     def point_covariance(self, points_m: np.ndarray) -> np.ndarray:
         """Propagate the covariance to world points (N, 3); return (N, 3, 3), due to georegistration alone."""
-        lever = np.asarray(points_m) - self.middle_m
-        jacobian = np.zeros((len(lever), 3, 7))
-        jacobian[:, :, :3] = np.eye(3)
-        x, y, z = lever.T
-        jacobian[:, 0, 4], jacobian[:, 0, 5] = z, -y
-        jacobian[:, 1, 3], jacobian[:, 1, 5] = -z, x
-        jacobian[:, 2, 3], jacobian[:, 2, 4] = y, -x
-        jacobian[:, :, 6] = lever
+        jacobian = similarity_jacobian(np.asarray(points_m) - self.middle_m)
         return jacobian @ self.covariance @ jacobian.transpose(0, 2, 1)
+
+
+def drift_covariance(problem: Problem, result: Estimate) -> np.ndarray:
+    """Return the covariance (7, 7) of the similarity due to the slow drift of the fixes' common bias.
+
+    The fit knows a constant bias of each group and errors of about a minute. What lies between, a first-order
+    Gauss-Markov process over a group's flights one after the other, is propagated through the fit as it is.
+    """
+    linear = problem.linearise(result.state, result.offset_sigma_m, result.bias_weight)
+    inverse, _ = apply_inverse_covariance(
+        problem.chains, result.levels, result.weights, linear.jacobian
+    )
+    rows = np.flatnonzero(problem.kind <= Kind.UP)
+    kind, frame = problem.kind[rows], problem.frame[rows]
+    fixes = problem.fixes
+    gain = result.covariance[:SHARED] @ inverse[rows].T
+    unit = BIAS_DRIFT_SHARE * fixes.bias_m[frame, kind]
+    chains, order = Chains.build(
+        fixes.bias_group[frame] * 3 + kind,
+        _running_clock(fixes)[frame],
+        np.full(len(rows), BIAS_DRIFT_TIME_S),
+        np.zeros(len(rows), dtype=np.int64),
+        unit,
+        np.arange(len(rows)),
+    )
+    moved = (gain[:, order] * chains.unit).T
+    return moved.T @ cho_solve_banded((cholesky_banded(chains.precision), False), moved)
+
+
+def _running_clock(fixes: Fixes) -> np.ndarray:
+    """Return the times (N,) on a clock that stands still between flights."""
+    clock, elapsed_s = np.zeros(len(fixes.flight)), 0.0
+    for f in range(len(fixes.flights)):
+        mine = fixes.flight == f
+        time_s = fixes.time_s[mine]
+        clock[mine] = elapsed_s + time_s - time_s.min()
+        elapsed_s += float(np.ptp(time_s))
+    return clock
 
 
 def radius_sigma(covariance: np.ndarray) -> float:
@@ -140,6 +179,8 @@ def _weights_of(part: Problem, problem: Problem, result: Estimate) -> np.ndarray
 
 def effective_fixes(problem: Problem, result: Estimate) -> float:
     """Return how many independent fixes would determine the middle's east and north equally well."""
+    if not problem.fixes.has_fix.any():
+        return 0.0
     counts = []
     for kind in (Kind.EAST, Kind.NORTH):
         mine = problem.kind == kind

@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
-from spn_data.georegistration.georegister_options import default_sigma_m
+from spn_data.georegistration.georegister_options import (
+    RELATIVE_HEIGHT_BIAS_M,
+    default_bias_m,
+    default_sigma_m,
+)
 from spn_data.georegistration.offset import estimate_time_offset
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import Labels
@@ -123,8 +127,11 @@ def check_gnss(
     vertical = difference[has_height, 2]
     compares_height = len(vertical) >= _MIN_FIXES
     offset_u = float(np.median(vertical)) if compares_height else None
-    fix_sigma = default_sigma_m(track.kind)
     # Fixes of one flight share their error: many are hardly better than one.
+    bias = default_bias_m(track.kind)
+    if origin.height_reference is HeightReference.TAKEOFF:
+        bias[2] = RELATIVE_HEIGHT_BIAS_M
+    fix_sigma = np.hypot(default_sigma_m(track.kind), bias)
     sigma_h = float(np.hypot(geo.uncertainty.horizontal_m, np.hypot(*fix_sigma[:2])))
     sigma_v = float(np.hypot(geo.uncertainty.vertical_m, fix_sigma[2])) if compares_height else None
     too_far = float(np.hypot(*middle[:2])) > _CONTRADICTION * sigma_h

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,18 @@ from spn_data.area.area import Area, StageWork
 from spn_data.area.names import FRAMES, FRAMES_TABLE, GEO, GEO_FIT, MODEL, TELEMETRY
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene, read_scene, write_transformed
-from spn_data.errors import FormatError, GeometryError
+from spn_data.errors import FormatError, GeometryError, InputError
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.georegistration.control import Control
 from spn_data.georegistration.georegister import georegister as fit
 from spn_data.georegistration.georegister_options import GeoregisterOptions, Heights
 from spn_data.georegistration.observe import align_telemetry
 from spn_data.georegistration.offset import TimeOffset, estimate_time_offset
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.label_move import move_labels
-from spn_data.storage.json_files import finite_or_none, write_json
+from spn_data.pipeline.ground_control import ControlOptions, read_control
+from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import finite, finite_or_none, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.table import read_track
 from spn_data.telemetry.track import Telemetry
@@ -36,10 +40,13 @@ class GeoStageOptions:
     fit : GeoregisterOptions
     time_offset_s : mapping of str to float
         Added to the times of the telemetry, by sequence ("*" for all). It is estimated for other sequences.
+    control : ControlOptions or None
+        Ground control points.
     """
 
     fit: GeoregisterOptions = field(default_factory=GeoregisterOptions)
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
+    control: ControlOptions | None = None
 
 
 def recorded_options(record: StageRecord) -> GeoStageOptions:
@@ -47,17 +54,24 @@ def recorded_options(record: StageRecord) -> GeoStageOptions:
     try:
         fit = dict(record.options["fit"])
         sigma, reference, origin = fit["gnss_sigma_m"], fit["height_reference"], fit["origin"]
+        bias, control = fit.get("gnss_bias_m"), record.options.get("control")
         if origin is not None:
             place = HeightReference(origin["height_reference"])
             origin = GeoOrigin(**{**origin, "height_reference": place})
         fit |= {
             "gnss_sigma_m": None if sigma is None else tuple(sigma),
+            "gnss_bias_m": None if bias is None else tuple(bias),
             "heights": Heights(fit["heights"]),
             "height_reference": None if reference is None else HeightReference(reference),
             "origin": origin,
         }
+        if control is not None:
+            lists = {"check": tuple(control["check"]), "sigma_m": tuple(control["sigma_m"])}
+            control = ControlOptions(**{**control, **lists})
         return GeoStageOptions(
-            fit=GeoregisterOptions(**fit), time_offset_s=dict(record.options["time_offset_s"])
+            fit=GeoregisterOptions(**fit),
+            time_offset_s=dict(record.options["time_offset_s"]),
+            control=control,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{record.stage}: its options cannot be read ({error!r})") from error
@@ -94,17 +108,22 @@ def georegister(
     Raises
     ------
     GeometryError
-        If the telemetry does not determine the similarity.
+        If telemetry and ground control do not determine the similarity.
+    InputError
+        If the ground control points cannot be used.
     StageError
         If frames or model are missing or stale.
     """
-    begun = area.begin(GEO, asdict(options), {}, overwrite=overwrite)
+    inputs = {}
+    if options.control is not None:
+        inputs["ground control"] = content_fingerprint(Path(options.control.file))
+    begun = area.begin(GEO, asdict(options), inputs, overwrite=overwrite)
     if isinstance(begun, StageRecord):
         record = begun
     else:
         try:
             record = _georegister(area, begun, options, progress)
-        except GeometryError:
+        except (GeometryError, InputError):
             begun.discard()  # nothing in it could be reused
             raise
     move_labels(area)  # also after an interrupted call that did not get this far
@@ -116,13 +135,15 @@ def _georegister(
 ) -> StageRecord:
     stopwatch = Stopwatch()
     tracks = read_tracks(area)
-    if not any(track.has_fix.any() for track in tracks.values()):
+    if options.control is None and not any(track.has_fix.any() for track in tracks.values()):
         raise GeometryError(
             f"{area.root}: no telemetry with a fix; the model stays in its own gauge (units: model). Put "
             "telemetry next to the sources and run spn-data reconstruct VIDEO --overwrite"
         )
     scene = read_scene(area.folder(MODEL))
     frames = registered_frames(area, scene)
+    with stopwatch.step("ground control"):  # first: a mistake in its file is told at once
+        control, notes = _control(area, scene, options, tracks)
     with stopwatch.step("time offset"):
         offsets = _time_offsets(scene, frames, tracks, options, progress)
     shifted = {
@@ -131,7 +152,8 @@ def _georegister(
     }
     with stopwatch.step("fit"):
         telemetry = align_telemetry(shifted, frames.sequences.tolist(), frames.time_s)
-        result = fit(scene.poses, telemetry, frames.sequences.tolist(), frames.time_s, options.fit)
+        sequences = frames.sequences.tolist()
+        result = fit(scene.poses, telemetry, sequences, frames.time_s, options.fit, control)
     with stopwatch.step("write"):
         write_transformed(area.folder(MODEL), work.path, result.world_from_model)
         write_json(
@@ -146,8 +168,34 @@ def _georegister(
         counts=_counts(result),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
-        notes=(*(o.describe(name) for name, o in offsets.items()), *result.notes),
+        notes=(*(o.describe(name) for name, o in offsets.items()), *notes, *result.notes),
     )
+
+
+def _control(
+    area: Area, scene: Scene, options: GeoStageOptions, tracks: Mapping[str, Telemetry]
+) -> tuple[Control | None, tuple[str, ...]]:
+    """Return the ground control points, if there are any, and notes on them."""
+    if options.control is None:
+        return None, ()
+    origin = options.fit.origin
+    if origin is not None and origin.height_reference is HeightReference.TAKEOFF:
+        raise InputError(
+            "heights of the area are above take-off, those of ground control points are not: run spn-data "
+            f"georegister --gcp {options.control.file} --overwrite first, then add",
+            path=options.control.file,
+        )
+    reference = options.fit.height_reference
+    control, notes = read_control(
+        area, scene, options.control, tracks=tracks, origin=origin, reference=reference
+    )
+    if control.check.all():
+        raise InputError(
+            f"all of its {len(control)} points that can be used are check points: leave some to the fit, or "
+            "compare them with spn-data check-points",
+            path=options.control.file,
+        )
+    return control, notes
 
 
 def registered_frames(area: Area, scene: Scene) -> Frames:
@@ -201,6 +249,7 @@ def _counts(result: GeoFit) -> dict[str, Any]:
         "sigma_tilt_deg": _rounded(stated.tilt_deg),
         "sigma_heading_deg": _rounded(stated.heading_deg),
         "sigma_scale": _rounded(stated.scale, 6),
+        "control": [finite(asdict(point)) for point in result.control],
         "observations": list(result.observations),
         "height_reference": result.height_reference.value,
         "origin": [result.origin.lat_deg, result.origin.lon_deg, result.origin.alt_m],

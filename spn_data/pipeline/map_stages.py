@@ -176,7 +176,7 @@ def _stages(
     report(frames, before.get(FRAMES))
     model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
     report(model, before.get(MODEL))
-    if not has_fixes(area):
+    if not has_fixes(area) and _geo_options(area, options).control is None:
         return
     try:
         geo_options = _geo_options(area, options)

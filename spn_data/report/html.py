@@ -42,7 +42,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "verdict": sections.verdict_box(verdict(data)),
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
-        "residuals": sections.residuals(data),
+        "residuals": sections.residuals(data) + sections.control(data),
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),

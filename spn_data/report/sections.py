@@ -102,6 +102,28 @@ def residuals(data: ReportData) -> str:
     return f"<section><h2>GNSS residuals in plan view</h2>{drawn}{extra}</section>"
 
 
+def control(data: ReportData) -> str:
+    """Return the table of surveyed points: residuals beside what is stated."""
+    if data.geo is None or not data.geo.control:
+        return ""
+    rows = []
+    for point in data.geo.control:
+        role = f"{point.role} (left out)" if point.is_outlier else point.role
+        metres = [
+            f"{format_value(value, '+.3f')} ({format_value(sigma, '.3f')})"
+            for value, sigma in zip(point.residual_m, point.sigma_m, strict=True)
+        ]
+        pixels = format_value(point.reprojection_px, ".2f")
+        rows.append((point.name, role, f"{point.marks}", *metres, pixels))
+    header = ("point", "role", "marks", "east m", "north m", "up m", "px")
+    return (
+        "<section><h2>Ground control</h2>"
+        f"{_table(header, rows, 'control')}"
+        '<p class="note">Surveyed minus mapped, with the stated standard deviation in brackets. Check points '
+        "are not fitted: their residuals are errors of the map.</p></section>"
+    )
+
+
 def timeline(data: ReportData, left_out: dict[str, int]) -> str:
     """Return frames over time, which the script draws, and the reasons of failed frames."""
     frames = data.frames

@@ -46,7 +46,7 @@ def read_text(path: Path | str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
             raise InputError("not a file", path=path)
         if size > max_bytes:
             raise InputError(
-                f"has {size / 1e6:.0f} MB; telemetry files of up to {max_bytes / 1e6:.0f} MB are supported",
+                f"has {size / 1e6:.0f} MB; files of up to {max_bytes / 1e6:.0f} MB are supported",
                 path=path,
             )
         with path.open("rb") as file:

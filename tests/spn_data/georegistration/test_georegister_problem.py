@@ -34,6 +34,7 @@ def _problem(noise: float) -> tuple[Problem, FitState]:
         np.array([0.0, 4.0]),
         np.zeros((2, 3)),
         np.zeros(2),
+        np.zeros((2, 3)),
     )
     enu = 7.0 * model @ ROTATION.T + state.center - np.outer(state.offsets_m[flight], [0, 0, 1])
     shake = rotations_from_vectors(noise * rng.standard_normal((n, 3)))
@@ -45,9 +46,12 @@ def _problem(noise: float) -> tuple[Problem, FitState]:
         flight,
         ("a", "b"),
         np.arange(n, dtype=np.float64),
+        np.full((n, 3), 2.0),
+        np.arange(2),
         np.ones(2, dtype=bool),
         GeoOrigin(0, 0, 0),
         True,
+        False,
         True,
         (),
     )
@@ -72,10 +76,10 @@ def test_the_jacobian_is_the_residuals_derivative():
     """The Jacobian equals central differences for all observations and parameters."""
     problem, state = _problem(1e-4)
     linear = problem.linearise(state, np.full(2, 1e3), np.ones(2))
-    assert linear.jacobian.shape == (7 * 9, SHARED + 10)
+    assert linear.jacobian.shape == (7 * 9, SHARED + 16)
     h = 1e-6
-    for k in range(SHARED + 10):
-        step = np.zeros(SHARED + 10)
+    for k in range(SHARED + 16):
+        step = np.zeros(SHARED + 16)
         step[k] = h
         after, before = (
             problem.residuals(state.updated(step)),

@@ -1,0 +1,1 @@
+"""Ground control: surveyed points, their coordinate system, and their marks in images."""
