@@ -10,7 +10,9 @@ import contextlib
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust_long_tracks
+from spn_data.colmap.focal_limits import limit_focal_lengths
 from spn_data.colmap.job import MappingJob
+from spn_data.geometry.initial_lens import Hold
 from spn_data.work import child
 
 _MAX_IMAGES_COLMAP = 1000  # up to which COLMAP's own bundle adjustment uses a direct solver
@@ -24,6 +26,11 @@ def map_incrementally(job: MappingJob) -> dict[int, pycolmap.Reconstruction]:
     options = _pipeline_options(job)
     with contextlib.closing(pycolmap.Database.open(job.database)) as database:
         images = database.num_images()
+        cameras = database.read_all_cameras()
+    limit_focal_lengths(options, cameras)
+    limit_focal_lengths(options.mapper, cameras)
+    limit_focal_lengths(options.triangulation, cameras)
+    _hold(options, dict(job.held), {camera.camera_id for camera in cameras})
     run = _map_small if images <= _MAX_IMAGES_COLMAP else _map_large
     return run(job, options)
 
@@ -37,9 +44,6 @@ def _pipeline_options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     )
     options.min_model_size = job.min_model_size
     options.extract_colors = False  # `refine` extracts them once
-    # A field of view of 127 degrees: shorter focal lengths only fit the noise of a weak geometry.
-    for part in (options, options.mapper, options.triangulation):
-        part.min_focal_length_ratio = 0.25
     if job.hold_intrinsics:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = False
@@ -51,6 +55,18 @@ def _pipeline_options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     options.ba_global_max_num_iterations = 30
     options.ba_global_function_tolerance = _CONVERGED
     return options
+
+
+def _hold(
+    options: pycolmap.IncrementalPipelineOptions, held: dict[int, Hold], cameras: set[int]
+) -> None:
+    """Keep held lenses, and the focal lengths if all cameras hold theirs; else distortion has to wait too."""
+    if held.keys() == cameras:
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+        constant = {i for i, hold in held.items() if hold == Hold.LENS}
+    else:
+        constant = set(held)
+    options.constant_cameras = options.mapper.constant_cameras = constant
 
 
 class _ProgressCounter:

@@ -175,7 +175,8 @@ def sample_frames(
             path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
-    lenses = start_lenses(frames, candidates.photos, fov, {} if given is None else {"*": given})
+    cameras = {} if given is None else {"*": given}
+    lenses, notes = start_lenses(frames, candidates.photos, fov, cameras)
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)
@@ -185,7 +186,7 @@ def sample_frames(
         folder / STORED / source.sequence,
         progress=lambda done: progress("frames", done, int(frames.chosen.sum())),
     )
-    return SampledSequence(frames, track, lenses[keys[0]], list(candidates.notes))
+    return SampledSequence(frames, track, lenses[keys[0]], [*candidates.notes, *notes])
 
 
 def _sampled(

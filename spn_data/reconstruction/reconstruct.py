@@ -13,6 +13,7 @@ from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triang
 from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import MapObservations, Scene, count_registered, read_map, read_scene
 from spn_data.errors import StageError
+from spn_data.geometry.initial_lens import Hold
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
@@ -177,7 +178,7 @@ def reconstruct(
         raise StageError(
             failure_message(work, len(frames.names), 0 if best is None else best.registered, notes)
         )
-    refined = _refine(run, best.model, notes)
+    refined = _refine(run, best, notes)
     scene, observations, points = read_map(refined)
     with MapDatabase.open(work / best.database) as database:
         registrations = diagnose(database, frames, scene, observations)
@@ -201,7 +202,8 @@ def _best_attempt(run: _Run, notes: list[str]) -> _Candidate | None:
     """Return the first attempt that is good enough, otherwise the best of all."""
     options = run.options
     best: _Candidate | None = None
-    for attempt in attempts(options):
+    known = all(lens.focal_is_known for lens in run.frames.lenses.values())
+    for attempt in attempts(options, focal_is_known=known):
         found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, notes)
         if found is None:
             continue
@@ -289,6 +291,7 @@ def _map(
     n = len(run.frames.names)
     with run.stopwatch.step("mapping"):
         database = run.work / (chance or attempt).database
+        held = _held(run, database)
         # Frames that are missing then get a second chance with all features.
         if attempt.thinned and chance is None:
             thinned = folder / "thinned.db"
@@ -306,6 +309,7 @@ def _map(
             snapshot_every=max(3, n // 10),
             min_model_size=10 if n >= 30 else 3,
             hold_intrinsics=attempt.hold_intrinsics,
+            held=tuple(held.items()),
             start_from="" if snapshot is None else str(snapshot),
         )
         run.progress("mapping", 0 if snapshot is None else count_registered(snapshot), n)
@@ -316,6 +320,15 @@ def _map(
         )
     saved_models.write_submodels(folder, models)
     return models
+
+
+def _held(run: _Run, database: Path) -> dict[int, Hold]:
+    """Return what is held of the cameras, by COLMAP's id."""
+    frames = run.frames
+    with MapDatabase.open(database) as opened:
+        ids = opened.cameras_of(dict(zip(frames.names, frames.cameras.tolist(), strict=True)))
+    holds = {ids[key]: lens.hold for key, lens in frames.lenses.items()}
+    return {i: hold for i, hold in holds.items() if hold is not Hold.NOTHING}
 
 
 def _settled(run: _Run, attempt: Attempt, model: Path, notes: list[str]) -> Path:
@@ -375,18 +388,19 @@ def _without_misplaced(run: _Run, database: str, model: Path, notes: list[str]) 
     return target
 
 
-def _refine(run: _Run, model: Path, notes: list[str]) -> Path:
+def _refine(run: _Run, best: _Candidate, notes: list[str]) -> Path:
     target, frames, options = run.work / "refined", run.frames, run.options
     run.progress("refinement", 0, 1)
     known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
     with run.stopwatch.step("refinement"):
         done = refine(
-            model,
+            best.model,
             target,
             images=frames.folder,
             positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
             camera_model=options.camera_model,
             refine_principal_point=options.refine_principal_point,
+            held=_held(run, run.work / best.database),
             threads=options.threads,
             log=run.work / "mapping.log",
         )
