@@ -126,7 +126,7 @@ def _solve(
         options.refine_focal_length = False
         _run(native, options, lens)
         options.refine_focal_length = True
-        if not native.cameras.keys() - held.keys():
+        if not set(native.cameras) - held.keys():
             return
     _run(native, options, lens | focal)
 
@@ -141,7 +141,7 @@ def _run(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in native.reg_image_ids():
         config.add_image(image_id)
-    for camera_id in constant & native.cameras.keys():
+    for camera_id in constant & set(native.cameras):
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_ceres_bundle_adjuster(options, config, native).solve()

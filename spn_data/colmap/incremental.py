@@ -70,26 +70,27 @@ def _hold(
 
 
 class _ProgressCounter:
-    """Number of registered images, reported to the parent process."""
+    """Number of images in the largest sub-model so far, reported to the parent process."""
 
     def __init__(self, job: MappingJob):
-        # The mapper announces an initial pair even if it continues from a model.
-        self._initial = 0 if job.start_from else 2
-        self._registered = 0
+        self._continued = 0  # images of the model from which the mapper continues
         if job.start_from:
-            self._registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
+            self._continued = pycolmap.Reconstruction(job.start_from).num_reg_images()
+        self._current = self._largest = 0
 
     def initial(self) -> None:
-        """Count the initial pair."""
-        self._report(self._initial)
+        """Count the initial pair of a sub-model; the mapper announces one for a continued model too."""
+        self._current, self._continued = self._continued or 2, 0
+        self._report()
 
     def next(self) -> None:
         """Count one more image."""
-        self._report(1)
+        self._current += 1
+        self._report()
 
-    def _report(self, new: int) -> None:
-        self._registered += new
-        child.send({"registered": self._registered})
+    def _report(self) -> None:
+        self._largest = max(self._largest, self._current)
+        child.send({"registered": self._largest})
 
 
 def _map_small(

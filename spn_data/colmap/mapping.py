@@ -25,7 +25,7 @@ def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) 
     log : Path
         Log file of the child process.
     progress : callable
-        Called with the number of registered images.
+        Called with the number of images in the largest sub-model so far.
 
     Returns
     -------

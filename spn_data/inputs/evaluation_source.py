@@ -110,6 +110,7 @@ def sample_frames(
     *,
     rate_hz: float,
     fov_deg: float | None,
+    fixed_lens: bool,
     any_telemetry: bool,
     time_offset_s: float | None,
 ) -> SampledSequence:
@@ -127,6 +128,8 @@ def sample_frames(
         Frames per second to sample from a video; all photos are used.
     fov_deg : float or None
         Horizontal field of view, if known.
+    fixed_lens : bool
+        Whether to hold the lens that is given.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
     time_offset_s : float or None
@@ -176,7 +179,7 @@ def sample_frames(
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
     cameras = {} if given is None else {"*": given}
-    lenses, notes = start_lenses(frames, candidates.photos, fov, cameras)
+    lenses, notes = start_lenses(frames, candidates.photos, fov, cameras, fixed=fixed_lens)
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)

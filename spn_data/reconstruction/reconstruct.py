@@ -316,7 +316,7 @@ def _map(
         models = run_mapping(
             job,
             log=run.work / "mapping.log",
-            progress=lambda registered: run.progress("mapping", min(registered, n), n),
+            progress=lambda registered: run.progress("mapping", registered, n),
         )
     saved_models.write_submodels(folder, models)
     return models
