@@ -77,7 +77,7 @@ class FieldOfView(Finite):
         angle = super().convert(value, param, ctx)
         if angle > _WIDEST_DEG:
             self.fail(
-                f"{angle:g} is above {_WIDEST_DEG:g} degrees, which needs a fisheye model, and --camera takes "
+                f"{angle:g} is above {_WIDEST_DEG:g} degrees, which needs a fisheye model; --camera takes "
                 "none either: render the images as those of a pinhole first",
                 param,
                 ctx,

@@ -10,8 +10,8 @@ import contextlib
 
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust_long_tracks
-from spn_data.colmap.focal_limits import limit_focal_lengths
 from spn_data.colmap.job import MappingJob
+from spn_data.colmap.lens_limits import fit_to_lenses
 from spn_data.geometry.initial_lens import Hold
 from spn_data.work import child
 
@@ -27,9 +27,9 @@ def map_incrementally(job: MappingJob) -> dict[int, pycolmap.Reconstruction]:
     with contextlib.closing(pycolmap.Database.open(job.database)) as database:
         images = database.num_images()
         cameras = database.read_all_cameras()
-    limit_focal_lengths(options, cameras)
-    limit_focal_lengths(options.mapper, cameras)
-    limit_focal_lengths(options.triangulation, cameras)
+    fit_to_lenses(options, cameras)
+    fit_to_lenses(options.mapper, cameras)
+    fit_to_lenses(options.triangulation, cameras)
     _hold(options, dict(job.held), {camera.camera_id for camera in cameras})
     run = _map_small if images <= _MAX_IMAGES_COLMAP else _map_large
     return run(job, options)

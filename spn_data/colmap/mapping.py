@@ -177,12 +177,12 @@ def _map(job: MappingJob) -> None:
 
 def _map_globally(job: MappingJob) -> Any:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.focal_limits import limit_focal_lengths
+    from spn_data.colmap.lens_limits import fit_to_lenses
 
     options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=job.seed)
     with contextlib.closing(pycolmap.Database.open(job.database)) as database:
         cameras = database.read_all_cameras()
-    limit_focal_lengths(options.mapper.retriangulation, cameras)
+    fit_to_lenses(options.mapper.retriangulation, cameras)
     if (
         job.held
     ):  # the mapper knows only all cameras or none; what it holds too much is adjusted later
@@ -195,7 +195,7 @@ def _map_globally(job: MappingJob) -> Any:
 
 def _triangulate(source: str, target: str, database: str) -> None:
     from spn_data.colmap import pycolmap
-    from spn_data.colmap.focal_limits import limit_focal_lengths
+    from spn_data.colmap.lens_limits import fit_to_lenses
     from spn_data.colmap.model import write_native
 
     posed, model = pycolmap.Reconstruction(source), pycolmap.Reconstruction()
@@ -213,7 +213,7 @@ def _triangulate(source: str, target: str, database: str) -> None:
         pycolmap.IncrementalMapperOptions(),
     )
     for limited in (options, filtering):
-        limit_focal_lengths(limited, model.cameras.values())
+        fit_to_lenses(limited, model.cameras.values())
     mapper.begin_reconstruction(model)
     for image_id in sorted(model.reg_image_ids()):
         mapper.triangulate_image(options, image_id)

@@ -19,8 +19,8 @@ _GUESSED_FOCAL_SHARE = 0.7
 # Relative standard deviations of focal lengths: of a calibration, and of a field of view, which makers round
 # and often state for the diagonal or before a crop.
 _GIVEN_SIGMA, _FOV_SIGMA = 0.005, 0.05
-# Focal length in image widths above which it is held: at 14 it is still estimated to 0.7 %, at 20 no more than
-# 4 of 12 images register unless it is held (benchmarks/telephoto.py).
+# Focal length in image widths above which it is held. On an orbit of 12 images with exact matches and 0.3 px
+# of noise, 14 are still estimated to 0.7 %; at 20, 4 images register unless the lens is held.
 _TELEPHOTO = 10.0
 
 

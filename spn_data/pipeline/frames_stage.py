@@ -248,11 +248,9 @@ def choose_frames(
         frames = _frames_with_telemetry(one, track, choice)
         if stored is not None:
             write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", stored)
-        found_lenses, doubts = start_lenses(
-            frames, one.photos, options.fov_deg, given, fixed=options.fixed_lens
-        )
-        lenses.update(found_lenses)
-        notes += doubts
+        fixed = options.fixed_lens
+        own, doubts = start_lenses(frames, one.photos, options.fov_deg, given, fixed=fixed)
+        lenses, notes = lenses | own, notes + doubts
         if one.source.sequence in masks:
             write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:

@@ -13,7 +13,6 @@ from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triang
 from spn_data.colmap.misplaced import drop_misplaced
 from spn_data.colmap.model import MapObservations, Scene, count_registered, read_map, read_scene
 from spn_data.errors import StageError
-from spn_data.geometry.initial_lens import Hold
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
@@ -24,6 +23,7 @@ from spn_data.reconstruction.correspondences import (
     FramesToMap,
     appearance_of,
     extract_missing,
+    held_cameras,
     match_missing,
 )
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
@@ -291,7 +291,7 @@ def _map(
     n = len(run.frames.names)
     with run.stopwatch.step("mapping"):
         database = run.work / (chance or attempt).database
-        held = _held(run, database)
+        held = held_cameras(database, run.frames)
         # Frames that are missing then get a second chance with all features.
         if attempt.thinned and chance is None:
             thinned = folder / "thinned.db"
@@ -320,15 +320,6 @@ def _map(
         )
     saved_models.write_submodels(folder, models)
     return models
-
-
-def _held(run: _Run, database: Path) -> dict[int, Hold]:
-    """Return what is held of the cameras, by COLMAP's id."""
-    frames = run.frames
-    with MapDatabase.open(database) as opened:
-        ids = opened.cameras_of(dict(zip(frames.names, frames.cameras.tolist(), strict=True)))
-    holds = {ids[key]: lens.hold for key, lens in frames.lenses.items()}
-    return {i: hold for i, hold in holds.items() if hold is not Hold.NOTHING}
 
 
 def _settled(run: _Run, attempt: Attempt, model: Path, notes: list[str]) -> Path:
@@ -400,7 +391,7 @@ def _refine(run: _Run, best: _Candidate, notes: list[str]) -> Path:
             positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
             camera_model=options.camera_model,
             refine_principal_point=options.refine_principal_point,
-            held=_held(run, run.work / best.database),
+            held=held_cameras(run.work / best.database, frames),
             threads=options.threads,
             log=run.work / "mapping.log",
         )

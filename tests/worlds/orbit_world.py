@@ -17,6 +17,7 @@ from spn_data.matching.features import Features
 
 WIDTH, HEIGHT = 960, 540
 _SEEN_M = 44.0
+_NOISE_PX = 0.3
 
 
 def lens_of(widths: float) -> Camera:
@@ -29,36 +30,44 @@ def write_orbit(
     true: Camera,
     start: InitialLens,
     *,
+    other: InitialLens | None = None,
     images: int = 12,
     points: int = 200,
-    noise_px: float = 0.3,
-    turn_deg: float = 180.0,
-) -> tuple[dict[str, InitialLens], Poses]:
-    """Write a database of images from far enough to see the whole courtyard; return lenses and true poses."""
+    track: int = 100,
+) -> Poses:
+    """Write a database of images from far enough to see the whole courtyard; return the true poses.
+
+    Each point is seen in at most `track` successive images. Every second image is of camera `other` if that
+    is given.
+    """
     rng = np.random.default_rng(0)
     xyz = rng.uniform([-18, -18, 0], [18, 18, 12], (points, 3))
-    headings = np.linspace(0.0, turn_deg, images)
-    angles = np.column_stack([headings, np.full(images, -45.0), np.zeros(images)])
+    angles = np.zeros((images, 3))
+    angles[:, 0], angles[:, 1] = np.linspace(0.0, 180.0, images), -45.0
     rotations = rotations_from_angles(angles)
     distance_m = _SEEN_M * true.focal_px[0] / true.width
-    poses = Poses.from_rotations(
-        np.array([0.0, 0.0, 6.0]) - distance_m * rotations[:, 2], rotations
-    )
-    lenses = {"orbit": start}
+    centers = np.array([0.0, 0.0, 6.0]) - distance_m * rotations[:, 2]
+    poses = Poses.from_rotations(centers, rotations)
     names = [f"{k:02d}.jpg" for k in range(images)]
+    begins = rng.integers(1 - track, images, points)
+    keys = ["other" if other is not None and k % 2 else "orbit" for k in range(images)]
+    lenses = {"orbit": start} | ({} if other is None else {"other": other})
     with MapDatabase.open(path) as database:
-        database.add_images([DatabaseImage(name, "orbit") for name in names], lenses)
+        database.add_images(
+            [DatabaseImage(*pair) for pair in zip(names, keys, strict=True)], lenses
+        )
         seen = []
         for k, name in enumerate(names):
-            pixels = true.project(poses.to_camera(xyz, k)) + rng.normal(0, noise_px, (points, 2))
-            seen.append(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1))
+            pixels = true.project(poses.to_camera(xyz, k))
+            inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1)
+            seen.append(inside & (begins <= k) & (k < begins + track))
+            pixels = pixels + rng.normal(0, _NOISE_PX, (points, 2))
             keypoints = np.column_stack([pixels, np.ones(points), np.zeros(points)])
-            database.write_features(
-                name, Features(keypoints.astype(np.float32), np.zeros((points, 128), np.uint8))
-            )
+            features = Features(keypoints.astype(np.float32), np.zeros((points, 128), np.uint8))
+            database.write_features(name, features)
         for i, j in combinations(range(images), 2):
             rows = np.flatnonzero(seen[i] & seen[j]).astype(np.uint32)
             matches = np.column_stack([rows, rows])
             pair = (database.ids[names[i]], database.ids[names[j]])
             database.write_pair(VerifiedPair(pair, matches, matches, 2, np.eye(3), np.eye(3), None))
-    return lenses, poses
+    return poses
