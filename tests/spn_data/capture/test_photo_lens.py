@@ -24,10 +24,13 @@ XMP = (
 
 @pytest.mark.parametrize(
     ("name", "focal_px", "near_px"),
-    [("photos-two-passes/DJI_0054.JPG", 468.1, 475.0), ("photos-dji-xmp/DJI_0018.JPG", 1166.9, 1160.0)],
+    [
+        ("photos-two-passes/DJI_0054.JPG", 468.1, 475.0),
+        ("photos-dji-xmp/DJI_0018.JPG", 1166.9, 1160.0),
+    ],
 )
 def test_real_photos_state_their_focal_length(name: str, focal_px: float, near_px: float) -> None:
-    """Photos of 4:3 and their 16:9 crops have the focal length of the drone's sensor, near the estimated one."""
+    """Photos of 4:3 and 16:9 crops have the focal length of the drone's sensor, near the estimated one."""
     if not (DATA / name).exists():
         pytest.skip(f"{DATA} holds no real photos")
     stated, note = read_headers([DATA / name]).focal(0)
@@ -40,7 +43,7 @@ def test_real_photos_state_their_focal_length(name: str, focal_px: float, near_p
 
 
 def test_the_tags_of_a_resized_photo_are_read(tmp_path: Path) -> None:
-    """Pixels per millimetre and a calibration are of the original size, which tags or the optical centre tell."""
+    """Pixel density and calibration are of the original size, which tags or the optical centre tell."""
     exif = Image.Exif()
     exif[272] = "unknown"
     exif.get_ifd(0x8769).update(
@@ -63,12 +66,16 @@ def test_the_tags_of_a_resized_photo_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("size", "shortest", "longest"),
-    [((4000, 3000), 24 / 36, 24 / 36 * 1.083), ((4000, 2250), 0.636, 0.693), ((3000, 2000), 0.667, 0.693)],
+    [
+        ((4000, 3000), 24 / 36, 24 / 36 * 1.083),
+        ((4000, 2250), 0.636, 0.693),
+        ((3000, 2000), 0.667, 0.693),
+    ],
 )
 def test_a_35_mm_equivalent_covers_what_it_may_mean(
     size: tuple[int, int], shortest: float, longest: float
 ) -> None:
-    """The sigma of an equivalent covers diagonals and widths, of the photo and of the sensor it is cut from."""
+    """The sigma of an equivalent covers diagonals and widths, of the photo and of the whole sensor."""
     for width, height in (size, size[::-1]):
         stated, _ = stated_focal(replace(PHOTO, width=width, height=height, focal_35mm=24.0))
         assert stated is not None
@@ -78,7 +85,7 @@ def test_a_35_mm_equivalent_covers_what_it_may_mean(
 
 
 def test_statements_that_disagree_are_told() -> None:
-    """A resized photo that kept its pixel density contradicts the equivalent: a note, and the larger sigma."""
+    """A resized photo that kept its pixel density contradicts the equivalent: a note, the larger sigma."""
     resized = replace(
         PHOTO, width=1000, height=750, focal_mm=4.5, focal_plane_px_per_mm=625.0, focal_35mm=24.0
     )
@@ -95,10 +102,10 @@ def test_statements_that_disagree_are_told() -> None:
 @pytest.mark.parametrize(
     ("model", "focal_mm", "equivalent_mm"),
     [
-        ("FC300S", 3.61, 20), ("FC330", 3.61, 20), ("FC220", 4.73, 28), ("FC2103", 4.5, 24), ("FC7203", 4.49, 24),
-        ("FC7303", 4.49, 24), ("FC3170", 4.5, 24), ("FC3582", 6.72, 24), ("FC6310", 8.8, 24), ("FC6510", 8.8, 24),
-        ("L1D-20c", 10.26, 28), ("L2D-20c", 12.29, 24), ("M3E", 12.29, 24), ("FC6520", 15, 30),
-        ("ZenmuseP1", 35, 35),
+        ("FC300S", 3.61, 20), ("FC330", 3.61, 20), ("FC220", 4.73, 28), ("FC2103", 4.5, 24),
+        ("FC7203", 4.49, 24), ("FC7303", 4.49, 24), ("FC3170", 4.5, 24), ("FC3582", 6.72, 24),
+        ("FC6310", 8.8, 24), ("FC6510", 8.8, 24), ("L1D-20c", 10.26, 28), ("L2D-20c", 12.29, 24),
+        ("M3E", 12.29, 24), ("FC6520", 15, 30), ("ZenmuseP1", 35, 35),
     ],
 )  # fmt: skip
 def test_the_sensors_agree_with_the_published_equivalents(

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.job import MappingJob
+from spn_data.colmap.lens_limits import fit_to_lenses
 from spn_data.colmap.mapping import run_mapping
 from spn_data.colmap.model import load_native, read_scene, scene_of
+from spn_data.colmap.verify import native_camera
 from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.geometry.pose import Similarity, pose_errors
 from tests.worlds.orbit_world import lens_of, write_orbit
@@ -103,3 +106,18 @@ def test_a_free_lens_beside_a_held_one_is_estimated(tmp_path: Path) -> None:
     assert scene.cameras[1].params[0] == 0.8 * 960
     assert scene.cameras[1].params[3] != 0
     assert scene.cameras[2].params[0] == pytest.approx(0.8 * 960, rel=0.005)
+
+
+def test_the_limits_of_colmap_fit_the_lens() -> None:
+    """A telephoto raises the limit of the focal length and tightens angles; a wide lens changes neither."""
+    default = pycolmap.IncrementalTriangulatorOptions()
+    for widths, longest, angle_deg in (
+        (0.8, 10.0, 2.0),
+        (62.0, 124.0, 2.0 / 62),
+        (8.0, 16.0, 0.25),
+    ):
+        options = pycolmap.IncrementalTriangulatorOptions()
+        fit_to_lenses(options, [native_camera(lens_of(widths), focal_is_known=True)])
+        assert options.max_focal_length_ratio == pytest.approx(longest)
+        assert options.create_max_angle_error == pytest.approx(angle_deg)
+        assert options.min_angle == default.min_angle
