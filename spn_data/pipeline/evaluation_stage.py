@@ -280,7 +280,8 @@ def lens_notes(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
                 f"its estimated focal length is {camera.focal_px[0]:.0f} px, that of {key} (same image size) "
                 f"is {lens.focal_px[0]:.0f} px. If both are the same lens, one of them is wrong, and "
                 f"with it heights by about {abs(difference):.0%}: a flight at one height with one viewing "
-                "direction hardly determines the focal length. Map from two heights, or give --camera"
+                "direction hardly determines the focal length. Map from two heights, or hold a calibrated "
+                "lens with --camera and --fixed-lens"
             ]
     return []
 
