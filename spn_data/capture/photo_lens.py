@@ -12,10 +12,8 @@ _DIAGONAL_35MM = 43.267
 _CALIBRATED_SIGMA = 0.01
 _NOMINAL_SIGMA = 0.02  # of a focal length in millimetres: samples differ, and so does the focus
 _EQUIVALENT_SIGMA = 0.03
-_ROUNDED_MM, _ROUNDED_35MM = (
-    0.03,
-    0.29,
-)  # of focal lengths given to 0.1 mm, and to whole 35 mm equivalents
+# Of rounding to 0.1 mm, and to whole 35 mm equivalents.
+_ROUNDED_MM, _ROUNDED_35MM = 0.03, 0.29
 _DISAGREE = 2.0  # standard deviations of the difference
 # Aspect ratios up to which an image is taken to be 4:3 and 3:2; wider ones are crops of either.
 _4_TO_3, _3_TO_2 = 1.42, 1.6
