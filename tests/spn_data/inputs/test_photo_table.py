@@ -84,3 +84,9 @@ def test_a_table_that_does_not_fit_is_refused(
     """Tables of other photos, with two rows of one photo, or of another place are refused in one line."""
     with pytest.raises(InputError, match=message):
         telemetry_of(tmp_path, HEADER + rows, own_lat=own_lat)
+
+
+def test_names_of_something_else_are_not_those_of_photos(tmp_path: Path) -> None:
+    """A log whose column of names holds no photos is a log as before, here one without dates."""
+    with pytest.raises(InputError, match="cannot be paired with the photos, as it has no dates"):
+        telemetry_of(tmp_path, "name,time_s,lat,lon\nwaypoint,0,49.1,8.1\nhome,1,49.1,8.1\n")
