@@ -20,6 +20,7 @@ _4_TO_3, _3_TO_2 = 1.42, 1.6
 _SHORTEST, _LONGEST = 0.1, 1000.0  # believed, in units of the longer side
 _SAME_ASPECT = 0.02
 _SAME_CENTRE = 0.05
+_MAX_SIDE_PX = 1_000_000
 # Width and height in millimetres of the sensors of common drones, by the camera model in EXIF. Their makers
 # publish the type: 1/2.3, 1/2, 1/1.3, 1 and 4/3 inches.
 _2_3_INCH, _2_INCH, _1_3_INCH = (6.17, 4.63), (6.4, 4.8), (9.6, 7.2)
@@ -72,6 +73,8 @@ def stated_focal(photo: PhotoMetadata) -> tuple[StatedFocal | None, str]:
     note : str
         Empty if they agree.
     """
+    if min(photo.width, photo.height) <= 0:
+        return None, ""
     candidates = (_focal_plane(photo), _calibrated(photo), _by_sensor(photo), _equivalent(photo))
     best, note, longer_px = None, "", max(photo.width, photo.height)
     for other in candidates:
@@ -108,7 +111,8 @@ def _calibrated(photo: PhotoMetadata) -> StatedFocal | None:
         return None
     width, height = photo.original_size or (photo.width, photo.height)
     centre_x, centre_y = photo.calibrated_center_px
-    if centre_x > 0 and centre_y > 0 and abs(2 * centre_x / width - 1) > _SAME_CENTRE:
+    centre_is_stated = 1 <= centre_x <= _MAX_SIDE_PX and 1 <= centre_y <= _MAX_SIDE_PX
+    if centre_is_stated and abs(2 * centre_x / width - 1) > _SAME_CENTRE:
         width, height = round(2 * centre_x), round(2 * centre_y)
     focal_px = photo.calibrated_focal_px * _scale(photo, (width, height))
     return StatedFocal(focal_px, _CALIBRATED_SIGMA, "CalibratedFocalLength", in_pixels=True)

@@ -95,6 +95,8 @@ def test_statements_that_disagree_are_told() -> None:
     assert stated.sigma > 0.04
     assert "2812 px by FocalPlaneXResolution, but 693 px by the 35 mm equivalent" in note
     assert stated_focal(replace(resized, focal_35mm=np.nan))[0].source == "FocalPlaneXResolution"
+    absurd = replace(PHOTO, calibrated_focal_px=1e300, calibrated_center_px=(1e308, 1e308))
+    assert stated_focal(absurd) == (None, "")
     for value in (0.0, 1e-9, 1e30, np.nan):
         assert stated_focal(replace(PHOTO, calibrated_focal_px=value)) == (None, "")
 
