@@ -92,7 +92,6 @@ class Target:
 def _photo(path: Path) -> None:
     telemetry_from_photos([read_photo(path)])
     read_headers([path]).focal(0)
-    read_headers([path])
     decode_photo(path)
     decode_photo_gray(path, max_width=640)
 
