@@ -227,6 +227,7 @@ def test_refinement_with_a_fuller_camera_keeps_a_perfect_model(
         positions={},
         camera_model="OPENCV",
         refine_principal_point=False,
+        held={},
         threads=1,
         log=tmp_path / "log",
     )
@@ -271,6 +272,7 @@ def test_a_wrong_match_beyond_the_rim_does_not_decide_the_lens(
         positions={},
         camera_model="RADIAL",
         refine_principal_point=False,
+        held={},
         threads=1,
         log=tmp_path / "log",
     )
