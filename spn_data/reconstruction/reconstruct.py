@@ -291,7 +291,6 @@ def _map(
     n = len(run.frames.names)
     with run.stopwatch.step("mapping"):
         database = run.work / (chance or attempt).database
-        held = held_cameras(database, run.frames)
         # Frames that are missing then get a second chance with all features.
         if attempt.thinned and chance is None:
             thinned = folder / "thinned.db"
@@ -309,7 +308,7 @@ def _map(
             snapshot_every=max(3, n // 10),
             min_model_size=10 if n >= 30 else 3,
             hold_intrinsics=attempt.hold_intrinsics,
-            held=tuple(held.items()),
+            held=tuple(held_cameras(database, run.frames).items()),
             start_from="" if snapshot is None else str(snapshot),
         )
         run.progress("mapping", 0 if snapshot is None else count_registered(snapshot), n)
