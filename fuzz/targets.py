@@ -98,7 +98,7 @@ class Target:
 
 def _photo(path: Path) -> None:
     telemetry_from_photos([read_photo(path)])
-    read_headers([path])
+    read_headers([path]).focal(0)
     decode_photo(path)
     decode_photo_gray(path, max_width=640)
 

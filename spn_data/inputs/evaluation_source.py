@@ -16,10 +16,10 @@ from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import camera_from_json
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.inputs.flight_telemetry import source_telemetry, with_time_offset
 from spn_data.inputs.frame_images import STORED
-from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.initial_cameras import start_lenses
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.split.groups import GROUPS
 from spn_data.telemetry.table import write_track
@@ -36,15 +36,14 @@ class SampledSequence:
     frames : Frames
         All candidate frames; the sampled ones have status "chosen".
     track : Telemetry or None
-    start : tuple of (Camera, bool)
-        Initial camera, and whether its focal length is known.
+    lens : InitialLens
     notes : list of str
         One sentence each.
     """
 
     frames: Frames
     track: Telemetry | None
-    start: tuple[Camera, bool]
+    lens: InitialLens
     notes: list[str]
 
 
@@ -111,6 +110,7 @@ def sample_frames(
     *,
     rate_hz: float,
     fov_deg: float | None,
+    fixed_lens: bool,
     any_telemetry: bool,
     time_offset_s: float | None,
 ) -> SampledSequence:
@@ -128,6 +128,8 @@ def sample_frames(
         Frames per second to sample from a video; all photos are used.
     fov_deg : float or None
         Horizontal field of view, if known.
+    fixed_lens : bool
+        Whether to hold the lens that is given.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
     time_offset_s : float or None
@@ -177,7 +179,7 @@ def sample_frames(
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
     cameras = {} if given is None else {"*": given}
-    starts = start_cameras(frames, candidates.photos, fov, cameras, track)
+    lenses, notes = start_lenses(frames, candidates.photos, fov, cameras, track, fixed=fixed_lens)
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)
@@ -187,13 +189,7 @@ def sample_frames(
         folder / STORED / source.sequence,
         progress=lambda done: progress("frames", done, int(frames.chosen.sum())),
     )
-    start = starts[keys[0]]
-    return SampledSequence(
-        frames,
-        track,
-        (camera_from_json(start), bool(start["focal_is_known"])),
-        list(candidates.notes),
-    )
+    return SampledSequence(frames, track, lenses[keys[0]], [*candidates.notes, *notes])
 
 
 def _sampled(

@@ -15,6 +15,7 @@ from spn_data.errors import InputError
 from spn_data.inputs.telemetry_clocks import ImageClock, check_overlap, on_image_clock
 from spn_data.telemetry.embedded import read_embedded
 from spn_data.telemetry.mrk import read_mrk, with_exposures
+from spn_data.telemetry.photo_table import with_photo_table
 from spn_data.telemetry.read import read_telemetry
 from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.track import Telemetry
@@ -215,6 +216,11 @@ def _photo_telemetry(
     elif own is not None and events:
         names = [path.name for path in source.parts]
         own = with_exposures(own, names, [read_mrk(path) for path in events])
+    if own is not None and not accept:
+        for path in source.telemetry:
+            named = None if path in events else with_photo_table(own, source.parts, path)
+            if named is not None:
+                return named
     if own is not None and own.has_fix.any():
         return own
     for path in source.telemetry:

@@ -1,35 +1,47 @@
-"""Initial intrinsics of the cameras of a source."""
+"""Initial lenses of the cameras of a source."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.capture.photos import PhotoHeaders
+from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length, camera_to_json
+from spn_data.geometry.camera_file import camera_at_size, camera_from_focal_length
+from spn_data.geometry.initial_lens import GUESS_SIGMA, Hold, InitialLens
 from spn_data.telemetry import misb_klv
 from spn_data.telemetry.track import Telemetry
 
 # Focal length over the longer image side: 71 degrees, as most drones have. It is estimated in any case.
 _GUESSED_FOCAL_SHARE = 0.7
+# Relative standard deviations of focal lengths: of a calibration, and of a field of view, which makers round
+# and often state for the diagonal or before a crop.
+_GIVEN_SIGMA, _FOV_SIGMA = 0.005, 0.05
+_VIDEO_SIGMA = 0.03  # of the field of view that a gimbal writes into its video
+# Focal length in image widths above which it is held. On an orbit of 12 images with exact matches and 0.3 px
+# of noise, 14 are still estimated to 0.7 %; at 20, 4 images register unless the lens is held.
+_TELEPHOTO = 10.0
 
 
-def start_cameras(
+def start_lenses(
     frames: Frames,
     photos: PhotoHeaders | None,
     fov_deg: Mapping[str, float],
     given: Mapping[str, Camera],
     track: Telemetry | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Return the initial intrinsics of each camera of one source: given, stated, or a guess.
+    *,
+    fixed: bool = False,
+) -> tuple[dict[str, InitialLens], list[str]]:
+    """Return the initial lens of each camera of one source: given, stated by metadata, or a guess.
 
-    Stated is the focal length in photo metadata, or the median field of view in MISB metadata of a video.
+    Metadata are those of a photo, or the median field of view in MISB metadata of a video.
 
     What the user gives applies only to the first camera of the source, because another zoom is another lens.
+    The lens of a stated telephoto is held in any case: its focal length hardly changes the perspective.
 
     Parameters
     ----------
@@ -43,46 +55,64 @@ def start_cameras(
         Calibrated cameras by sequence; "*" for all.
     track : Telemetry or None
         Telemetry of the source.
+    fixed : bool
+        Whether to hold given cameras, and focal lengths that are stated otherwise.
 
     Returns
     -------
-    dict of str to dict
-        Camera as JSON by camera key, with "focal_is_known" and "source".
+    lenses : dict of str to InitialLens
+        By camera key.
+    notes : list of str
+        One sentence each: what contradicts, and which lenses are held without being asked for.
 
     Raises
     ------
     InputError
-        If a given camera has another image shape than the frames.
+        If a given camera has another image shape than the frames, or nothing states a focal length that is to
+        be held.
     """
-    cameras = {}
+    lenses, notes = {}, []
     sequence = str(frames.sequences[0])
     for key in np.unique(frames.cameras[frames.width > 0]).tolist():
         row = int(np.flatnonzero((frames.cameras == key) & (frames.width > 0))[0])
-        width, height = int(frames.width[row]), int(frames.height[row])
+        size = int(frames.width[row]), int(frames.height[row])
         fov = camera = None
         if key == sequence:
             fov = fov_deg.get(sequence, fov_deg.get("*"))
             camera = given.get(sequence, given.get("*"))
-        focal_px = None if photos is None else photos.focal_px(row)
         if camera is not None:
-            camera, source = camera_at_size(camera, width, height, sequence), "given"
+            lens = InitialLens(camera_at_size(camera, *size, sequence), _GIVEN_SIGMA, "given")
         elif fov is not None:
-            camera = Camera.from_horizontal_fov(width, height, fov, (0.0,))
-            source = f"horizontal field of view of {fov:g} deg, as given"
-        elif focal_px is not None:
-            camera, source = camera_from_focal_length(focal_px, width, height), "photo metadata"
-        elif (share := _stated_share(track, frames.time_s[frames.cameras == key])) is not None:
-            camera = camera_from_focal_length(share * width, width, height)
-            source = "field of view in the video's metadata"
+            lens = InitialLens(
+                Camera.from_horizontal_fov(*size, fov, (0.0,)),
+                _FOV_SIGMA,
+                f"horizontal field of view of {fov:g} deg, as given",
+            )
         else:
-            guess = _GUESSED_FOCAL_SHARE * max(width, height)
-            camera, source = camera_from_focal_length(guess, width, height), "guess"
-        cameras[key] = {
-            **camera_to_json(camera),
-            "focal_is_known": source != "guess",
-            "source": source,
-        }
-    return cameras
+            share = _stated_share(track, frames.time_s[frames.cameras == key])
+            lens, doubt = _unasked(photos, row, size, share)
+            notes += [f"{key}: {doubt}"] if doubt else []
+        lenses[key], held = _held(key, lens, fixed=fixed, whole=camera is not None)
+        notes += held
+    return lenses, notes
+
+
+def _unasked(
+    photos: PhotoHeaders | None, row: int, size: tuple[int, int], share: float | None
+) -> tuple[InitialLens, str]:
+    """Return the lens by the metadata of a photo or video, or a guess; and a note if metadata contradict.
+
+    `share` is the focal length over the image width that the metadata of a video state.
+    """
+    stated, doubt = (None, "") if photos is None else photos.focal(row)
+    if stated is not None:
+        camera = camera_from_focal_length(stated.focal_px, *size)
+        return InitialLens(camera, stated.sigma, stated.source), doubt
+    if share is not None:
+        camera = camera_from_focal_length(share * size[0], *size)
+        return InitialLens(camera, _VIDEO_SIGMA, "field of view in the video's metadata"), doubt
+    guess = camera_from_focal_length(_GUESSED_FOCAL_SHARE * max(size), *size)
+    return InitialLens(guess, GUESS_SIGMA, "guess"), doubt
 
 
 def _stated_share(track: Telemetry | None, time_s: np.ndarray) -> float | None:
@@ -92,3 +122,24 @@ def _stated_share(track: Telemetry | None, time_s: np.ndarray) -> float | None:
     shares = track.at(time_s).zoom
     shares = shares[np.isfinite(shares)]
     return float(np.median(shares)) if len(shares) else None
+
+
+def _held(
+    key: str, lens: InitialLens, *, fixed: bool, whole: bool
+) -> tuple[InitialLens, list[str]]:
+    """Return a lens with what is held of it, and a note if that was not asked for."""
+    focal_px = lens.camera.focal_px[0]
+    widths = focal_px / max(lens.camera.width, lens.camera.height)
+    if lens.focal_is_known and widths > _TELEPHOTO:
+        return replace(lens, hold=Hold.LENS), [
+            f"{key}: the focal length of {focal_px:.0f} px is {widths:.0f} image widths; images hardly "
+            f"determine that of a telephoto, so it is held as stated ({lens.source})"
+        ]
+    if not fixed:
+        return lens, []
+    if not lens.focal_is_known:
+        raise InputError(
+            f"nothing states the focal length of camera {key!r}, so --fixed-lens has nothing to hold: give "
+            "--camera or --fov, or leave out --fixed-lens"
+        )
+    return replace(lens, hold=Hold.LENS if whole else Hold.FOCAL), []

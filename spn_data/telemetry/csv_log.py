@@ -51,6 +51,13 @@ def read_csv_log(path: Path | str) -> Telemetry:
         if len(body) == MAX_RECORDS:
             raise InputError(f"has more than {MAX_RECORDS:,} rows", path=path, line=line)
         body.append((line, row))
+    return log_of_rows(body, header, header_line, path)
+
+
+def log_of_rows(
+    body: list[tuple[int, list[str]]], header: list[str], header_line: int, path: Path | str
+) -> Telemetry:
+    """Return the log of rows that were read with their lines; raise InputError naming file and line."""
     columns, notes = _choose_columns(header, header_line, body, path)
     columns, unit_notes = with_consistent_units(columns, body)
     notes += unit_notes

@@ -21,7 +21,7 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.inputs.flight_telemetry import source_telemetry, unread_tracks
-from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.initial_cameras import start_lenses
 from spn_data.media.container import open_container
 from spn_data.telemetry.camm import read_camm
 from spn_data.telemetry.data_tracks import DataPacket, DataTrack, TrackFormat, read_data_tracks
@@ -293,10 +293,10 @@ def test_a_transport_stream_gives_positions_angles_and_the_focal_length(tmp_path
     assert "read from its KLV track (MISB ST 0601)" in track.notes
     (choice,) = choose_all([(candidates.measured, None)], SelectionOptions())
     frames = build_frames(candidates, choice, focal=track.at(candidates.measured.time_s).zoom)
-    start = start_cameras(frames, None, {}, {}, track)["day"]
+    start = start_lenses(frames, None, {}, {}, track)[0]["day"]
     assert start["source"] == "field of view in the video's metadata"
     assert start["params"][0] == pytest.approx(32 / np.tan(np.radians(4.0)), rel=1e-3)
-    assert start_cameras(frames, None, {}, {})["day"]["source"] == "guess"
+    assert start_lenses(frames, None, {}, {})[0]["day"].source == "guess"
 
 
 def test_a_gopro_track_without_the_package_is_named_with_the_remedy(
