@@ -180,7 +180,15 @@ def accept_poses(
             break
         solution = adjust_inliers(sequence, remove_frames(solution, failing), options)
     return _registered(
-        sequence, solution, reason, inliers, coverage, covariance, covariances, map_covariance, points
+        sequence,
+        solution,
+        reason,
+        inliers,
+        coverage,
+        covariance,
+        covariances,
+        map_covariance,
+        points,
     )
 
 
