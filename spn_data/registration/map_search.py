@@ -117,8 +117,8 @@ def search_map(
         distance_sq.append(inside_sq[good])
     matches = np.column_stack([np.concatenate(feature), np.concatenate(found)])
     order = np.argsort(np.concatenate(distance_sq), kind="stable")
-    for column in (1, 0):  # the nearest descriptor of each point, then of each feature
-        _, first = np.unique(matches[order, column], return_index=True)
+    for side in (1, 0):  # the nearest descriptor of each point, then of each feature
+        _, first = np.unique(matches[order, side], return_index=True)
         order = order[np.sort(first)]
     matches = matches[order]
     pixels = keypoints[matches[:, 0]]
