@@ -40,7 +40,7 @@ def carry_failed_frames(
     frozen: FrozenMap,
     describe: Callable[[int], np.ndarray],
     options: RegisterOptions,
-) -> tuple[UnsolvedSequence, SequenceSolution]:
+) -> tuple[UnsolvedSequence, SequenceSolution] | None:
     """Pose failed frames by what they share with accepted ones, and keep those that the map confirms.
 
     Parameters
@@ -55,11 +55,10 @@ def carry_failed_frames(
 
     Returns
     -------
-    sequence : UnsolvedSequence
-        With the map points found in the carried frames instead of their first matches, and only the tracks
-        of frames with a pose.
-    solution : SequenceSolution
-        All accepted and carried frames, adjusted together.
+    (UnsolvedSequence, SequenceSolution) or None
+        The sequence has the map points found in the carried frames instead of their first matches, and only
+        the tracks of frames with a pose. The solution holds all accepted and carried frames, adjusted
+        together. None if the map confirms no frame.
     """
     accepted = solution.posed
     putative = [
@@ -67,7 +66,10 @@ def carry_failed_frames(
         for row, matches in enumerate(sequence.putative)
     ]
     sequence = replace(sequence, putative=putative)
-    carried = _grow(sequence, solution, options)
+    resections, links = _links(sequence, solution, options)
+    if len(resections) == np.count_nonzero(accepted):
+        return None
+    carried = adjust_sequence(sequence, resections, solution.camera, *links, options)
     unconfirmed = np.zeros(len(accepted), bool)
     for row in np.flatnonzero(carried.posed & ~accepted).tolist():
         search = search_map(
@@ -84,26 +86,30 @@ def carry_failed_frames(
             putative[row] = search.matches[search.away_px <= 2 * AGREE_PX]
     # Frames that the map does not confirm share nothing from here on, and so stay without a pose.
     known = carried.posed & ~unconfirmed
+    if not (known & ~accepted).any():
+        return None
     sequence = replace(sequence, tracks=sequence.tracks.of_frames(known))
-    return sequence, _grow(sequence, remove_frames(carried, unconfirmed), options)
+    resections, links = _links(sequence, remove_frames(carried, unconfirmed), options)
+    return sequence, adjust_sequence(sequence, resections, carried.camera, *links, options)
 
 
-def _grow(
+def _links(
     sequence: UnsolvedSequence, solution: SequenceSolution, options: RegisterOptions
-) -> SequenceSolution:
-    """Extend a solution to the frames that share enough with it, and adjust all."""
-    rows = np.flatnonzero(solution.posed).tolist()
+) -> tuple[dict[int, Resection], tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
+    """Extend the poses of a solution to frames that share enough with it.
+
+    Returns the poses by frame, and putative matches, measurements of own points, and own points.
+    """
     resections = {
         row: Resection(
             solution.poses[row : row + 1],
             np.ones(len(solution.inliers(row)[0]), bool),
             solution.camera,
         )
-        for row in rows
+        for row in np.flatnonzero(solution.posed).tolist()
     }
-    camera = solution.camera
-    putative, own_points, own = propagate_poses(sequence, resections, camera, options)
-    return adjust_sequence(sequence, resections, camera, putative, own, own_points, options)
+    putative, own_points, own = propagate_poses(sequence, resections, solution.camera, options)
+    return resections, (putative, own, own_points)
 
 
 def check_carried(

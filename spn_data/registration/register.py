@@ -208,7 +208,10 @@ def recover_frames(
     accepted = first.solution.posed
     if accepted.all() or not accepted.any():
         return first
-    sequence, solution = carry_failed_frames(sequence, first.solution, frozen, describe, options)
+    carried = carry_failed_frames(sequence, first.solution, frozen, describe, options)
+    if carried is None:
+        return first
+    sequence, solution = carried
     while True:
         if not (solution.posed & ~accepted).any() or not solution.posed[accepted].all():
             return first

@@ -106,13 +106,15 @@ def test_a_carried_frame_needs_two_neighbours_a_majority_and_certainty(
     """Two of three voting neighbours carry a frame; one of three does not, nor do two with a large sigma."""
     sequence, first = failed
     frozen = FacadeMap(made)
-    sequence, solution = carry_failed_frames(
+    carried = carry_failed_frames(
         sequence,
         first.solution,
         cast(Any, frozen),
         lambda row: frozen.descriptors(made.shows[row]),
         OPTIONS,
     )
+    assert carried is not None
+    sequence, solution = carried
     covariances = np.tile(1e-6 * np.eye(6), (10, 1, 1))
     found = gather_evidence(sequence, solution, covariances, made.pairs, OPTIONS, find_rivals=False)
     assert not found.rival.any()
