@@ -72,11 +72,13 @@ def gather_evidence(
     covariances: np.ndarray,
     pairs: dict[tuple[int, int], np.ndarray],
     options: RegisterOptions,
+    *,
+    find_rivals: bool = True,
 ) -> Evidence:
     """Collect the evidence for the poses of a solution.
 
     The covariances (N, 6, 6) are NaN for frames without a pose; `pairs` holds the verified matches (K, 2) of
-    neighbours.
+    neighbours. Without `find_rivals`, which takes most of the time, no frame has a rival.
     """
     n = len(solution.posed)
     direct, inliers, rival = (np.zeros(n, np.int64) for _ in range(3))
@@ -93,7 +95,8 @@ def gather_evidence(
             coverage[row] = covered_share(pixels, camera.width, camera.height)
             away = sequence.map_xyz[point] - solution.poses.centers[row]
             depth[row] = np.median(np.linalg.norm(away, axis=1))
-            rival[row] = _rival_inliers(sequence, solution, row, depth[row], options)
+            if find_rivals:
+                rival[row] = _rival_inliers(sequence, solution, row, depth[row], options)
     shown = [_points_of_features(sequence, solution, row) for row in range(n)]
     sigma, sigma_deg = pose_sigmas(covariances)
     keys = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
@@ -233,7 +236,7 @@ def check_poses(posed: np.ndarray, evidence: Evidence, options: CheckOptions) ->
     for k in np.flatnonzero(posed).tolist():
         reason[k] = _rejection_reason(evidence, k, options)
         possible[k] = not reason[k]
-    agrees, contradicts = _neighbour_votes(evidence, possible, options)
+    agrees, contradicts = neighbour_votes(evidence, possible, options)
     for k in np.flatnonzero(possible).tolist():
         if len(contradicts[k]) > 0 and len(contradicts[k]) >= len(agrees[k]):
             possible[k] = False
@@ -290,10 +293,10 @@ def _doubt(evidence: Evidence, k: int, options: CheckOptions) -> str:
     return ""
 
 
-def _neighbour_votes(
+def neighbour_votes(
     evidence: Evidence, possible: np.ndarray, options: CheckOptions
 ) -> tuple[list[list[int]], list[list[int]]]:
-    """Return for each frame the neighbours that agree with it and those that contradict it."""
+    """Return for each frame the possible neighbours that agree with it and those that contradict it."""
     agrees: list[list[int]] = [[] for _ in possible]
     contradicts: list[list[int]] = [[] for _ in possible]
     for (i, j), matches, share in zip(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from spn_data.registration.checks import check_poses, gather_evidence
 from spn_data.registration.covariance import SequenceCovariance, sequence_covariance
 from spn_data.registration.frozen_map import FrozenMap
 from spn_data.registration.map_matching import match_missing_to_map
+from spn_data.registration.recovery import carry_failed_frames, check_carried
 from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import (
     SequenceSolution,
@@ -124,20 +126,31 @@ def register_sequence(
                 putative = match_missing_to_map(
                     names, database, frozen, folder / _MATCHES, options, dispatch, progress
                 )
-            scene, observations, points = frozen.scene, frozen.observations, frozen.points
-        pixels = [
-            database.read_features(name).keypoints[:, :2].astype(np.float64) for name in names
-        ]
-        pairs = {(i, j): database.read_inliers(names[i], names[j]) for i, j in neighbours}
-    progress("poses", 0, len(names))
-    with stopwatch.step("poses"):
-        tracks = find_tracks(pairs, [len(p) for p in pixels])
-        sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
-        (lens,) = to_match.lenses.values()
-        solution = solve(sequence, lens.camera, lens.focal_is_known, options)
-        registered = accept_poses(
-            sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
-        )
+            progress("poses", 0, len(names))
+            with stopwatch.step("poses"):
+                pixels = [
+                    database.read_features(name).keypoints[:, :2].astype(np.float64)
+                    for name in names
+                ]
+                pairs = {(i, j): database.read_inliers(names[i], names[j]) for i, j in neighbours}
+                tracks = find_tracks(pairs, [len(p) for p in pixels])
+                matches = [putative[name] for name in names]
+                sequence = UnsolvedSequence(pixels, matches, tracks, frozen.points.xyz)
+                (lens,) = to_match.lenses.values()
+                solution = solve(sequence, lens.camera, lens.focal_is_known, options)
+                covariance = MapCovariance.of(frozen.scene, frozen.observations)
+                registered = accept_poses(
+                    sequence, solution, pairs, covariance, frozen.points, options
+                )
+                registered = recover_frames(
+                    sequence,
+                    registered,
+                    pairs,
+                    covariance,
+                    frozen,
+                    lambda row: database.read_features(names[row]).descriptors,
+                    options,
+                )
     progress("poses", len(names), len(names))
     return registered
 
@@ -166,6 +179,76 @@ def accept_poses(
         if not failing.any():
             break
         solution = adjust_inliers(sequence, remove_frames(solution, failing), options)
+    return _registered(
+        sequence,
+        solution,
+        reason,
+        inliers,
+        coverage,
+        covariance,
+        covariances,
+        map_covariance,
+        points,
+    )
+
+
+def recover_frames(
+    sequence: UnsolvedSequence,
+    first: RegisteredSequence,
+    pairs: dict[tuple[int, int], np.ndarray],
+    map_covariance: MapCovariance,
+    frozen: FrozenMap,
+    describe: Callable[[int], np.ndarray],
+    options: RegisterOptions,
+) -> RegisteredSequence:
+    """Try again with the frames that failed, from the accepted ones, which stay accepted.
+
+    `describe` returns the descriptors (K, 128) of a frame. Frames that fail again keep their reasons.
+    """
+    accepted = first.solution.posed
+    if accepted.all() or not accepted.any():
+        return first
+    carried = carry_failed_frames(sequence, first.solution, frozen, describe, options)
+    if carried is None:
+        return first
+    sequence, solution = carried
+    while True:
+        if not (solution.posed & ~accepted).any() or not solution.posed[accepted].all():
+            return first
+        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
+        evidence = gather_evidence(
+            sequence, solution, covariances, pairs, options, find_rivals=False
+        )
+        stands = check_carried(sequence, solution, accepted, evidence, options.checks)
+        failing = solution.posed & ~stands
+        if not failing.any():
+            break
+        solution = adjust_inliers(sequence, remove_frames(solution, failing), options)
+    posed = solution.posed
+    return _registered(
+        sequence,
+        solution,
+        np.where(posed, "", first.reason).tolist(),
+        np.where(posed, evidence.inliers, first.inliers),
+        np.where(posed, evidence.coverage, first.coverage),
+        covariance,
+        covariances,
+        map_covariance,
+        frozen.points,
+    )
+
+
+def _registered(
+    sequence: UnsolvedSequence,
+    solution: SequenceSolution,
+    reason: list[str],
+    inliers: np.ndarray,
+    coverage: np.ndarray,
+    covariance: SequenceCovariance | None,
+    covariances: np.ndarray,
+    map_covariance: MapCovariance,
+    points: MapPoints,
+) -> RegisteredSequence:
     of_map = np.flatnonzero(solution.point_row >= 0)
     seen = LabelObservations(
         solution.frame[of_map],

@@ -31,6 +31,11 @@ class Tracks:
         """Number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
+    def of_frames(self, kept: np.ndarray) -> Tracks:
+        """Return the members in some of the frames (N,) bool; tracks keep their numbers."""
+        mine = kept[self.frame]
+        return Tracks(self.frame[mine], self.feature[mine], self.track[mine])
+
 
 def find_tracks(pairs: dict[tuple[int, int], np.ndarray], features: list[int]) -> Tracks:
     """Build tracks from the verified matches (K, 2) of pairs of frames.

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_angles
+from spn_data.labels.map_points import MapPoints
+from spn_data.registration.frozen_map import MapFrame
 from spn_data.registration.solution import UnsolvedSequence
 from spn_data.registration.tracks import find_tracks
 
@@ -69,3 +72,45 @@ def flight(frames: int = 8, *, noise_px: float = 0.3, seed: int = 5) -> Flight:
         shows.append(np.flatnonzero(inside))
         pixels.append(seen[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2)))
     return Flight(poses, points, pixels, shows)
+
+
+class FacadeMap:
+    """Stand-in for FrozenMap: every point has its own descriptor, seen half a metre beside each frame."""
+
+    def __init__(self, made: Flight, seed: int = 7):
+        p, n = len(made.points), len(made.poses)
+        rng = np.random.default_rng(seed)
+        self._of_point = (512 * np.sqrt(rng.dirichlet(np.full(128, 0.3), p))).clip(0, 255)
+        self._shows = dict(zip(self._names(n), made.shows, strict=True))
+        self.points = MapPoints(
+            np.arange(100, 100 + p), made.points, np.zeros((p, 3), np.uint8), np.full(p, 5)
+        )
+        beside = replace(made.poses, centers=made.poses.centers + np.array([0.5, 0, 0]))
+        names = tuple(self._names(n))
+        lens = {1: LENS}
+        self.scene = Scene(names, beside, np.ones(n, int), lens, made.points, np.full(p, 5))
+        seen = np.concatenate(made.shows)
+        pixels = np.zeros((len(seen), 2))
+        frame = np.repeat(np.arange(n), [len(shows) for shows in made.shows])
+        self.observations = MapObservations(frame, seen, pixels, pixels)
+
+    @staticmethod
+    def _names(count: int) -> list[str]:
+        return [f"map/{k}.jpg" for k in range(count)]
+
+    def descriptors(self, points: np.ndarray) -> np.ndarray:
+        """Return descriptors (K, 128) of features that show these points."""
+        return self._of_point[points].astype(np.uint8)
+
+    def frame(self, name: str) -> MapFrame:
+        """Return a map frame."""
+        return MapFrame(self.descriptors(self._shows[name]), self._shows[name])
+
+
+class PerfectMap:
+    """Covariance of a map without errors."""
+
+    sigma_px = 0.3
+
+    def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
+        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]

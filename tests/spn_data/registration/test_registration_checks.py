@@ -26,7 +26,7 @@ from spn_data.registration.solution import (
     remove_frames,
 )
 from spn_data.registration.solve import solve
-from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, flight
+from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, PerfectMap, flight
 
 OPTIONS = RegisterOptions()
 
@@ -332,15 +332,6 @@ def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatc
     assert found.solution.posed.tolist() == [k not in (3, 5) for k in range(8)]
 
 
-class _Perfect:
-    """Map without errors."""
-
-    sigma_px = 0.3
-
-    def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
-        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
-
-
 def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyped-def]
     sequence = made.sequence(putative)
     solution = solve(sequence, LENS, True, OPTIONS)
@@ -350,7 +341,7 @@ def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyp
         np.zeros((len(made.points), 3), np.uint8),
         np.full(len(made.points), 5),
     )
-    return accept_poses(sequence, solution, made.pairs, _Perfect(), points, OPTIONS)  # type: ignore[arg-type]
+    return accept_poses(sequence, solution, made.pairs, PerfectMap(), points, OPTIONS)  # type: ignore[arg-type]
 
 
 def test_what_failed_pulls_at_nothing_that_stands() -> None:

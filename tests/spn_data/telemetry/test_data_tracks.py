@@ -294,8 +294,8 @@ def test_a_transport_stream_gives_positions_angles_and_the_focal_length(tmp_path
     (choice,) = choose_all([(candidates.measured, None)], SelectionOptions())
     frames = build_frames(candidates, choice, focal=track.at(candidates.measured.time_s).zoom)
     start = start_lenses(frames, None, {}, {}, track)[0]["day"]
-    assert start["source"] == "field of view in the video's metadata"
-    assert start["params"][0] == pytest.approx(32 / np.tan(np.radians(4.0)), rel=1e-3)
+    assert start.source == "field of view in the video's metadata"
+    assert start.camera.params[0] == pytest.approx(32 / np.tan(np.radians(4.0)), rel=1e-3)
     assert start_lenses(frames, None, {}, {})[0]["day"].source == "guess"
 
 
