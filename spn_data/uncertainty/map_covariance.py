@@ -12,6 +12,10 @@ independent, and the covariance is the cluster-robust (sandwich) estimate S^+ M 
 clusters. A point's own error, for which its few residuals are not enough, is predicted by a model of the
 drift (`track_noise`).
 
+Some errors are shared by all measurements of a lens, and no number of measurements averages them out: the
+field that the camera model does not describe (`lens_errors`), and errors of intrinsics that were held
+(`shared_errors`). They are propagated to all unknowns, and add to the covariance.
+
 References
 ----------
 Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using generalized linear models".
@@ -19,8 +23,8 @@ Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
@@ -35,11 +39,20 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
+from spn_data.uncertainty.shared_errors import (
+    HeldInverse,
+    LensPrior,
+    LensScores,
+    PrincipalPoint,
+    held_columns,
+    shared_errors,
+)
 from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, whitened_point_covariances
 
 _FRAMES_AT_ONCE = 32
 _MEASUREMENTS_AT_ONCE = 200_000
 _SPOT_PX = 1.0  # keypoints of one spot differ in scale and orientation, not in position
+_HELD_RIDGE = 1e-9  # share of the diagonal, far below what the measurements say
 _NOISE_SAMPLE = 6000  # points, among which long tracks are selected
 
 
@@ -49,14 +62,17 @@ class MapCovarianceOptions:
 
     Attributes
     ----------
-    refine_principal_point : bool
-        Whether mapping estimated the principal points.
+    lenses : mapping of int to LensPrior
+        What is known of a lens from elsewhere, by camera id; `LensPrior()` for others.
     clustered : bool
         Whether only clusters of measurements are independent; False: every measurement is.
+    exact_lenses : bool
+        Whether lenses are exactly as modelled, and what was held is exact.
     """
 
-    refine_principal_point: bool = False
+    lenses: Mapping[int, LensPrior] = field(default_factory=dict)
     clustered: bool = True
+    exact_lenses: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +107,18 @@ class MapCovariance:
         Standard deviation of one residual component: root of the residual sum of squares over the redundancy.
     noise : TrackNoise or None
         Correlation of the errors along a track; None if all errors are taken as independent.
+    principal_points : mapping of int to PrincipalPoint
+        What the measurements say about the principal point of each lens, by camera id.
     """
 
     sigma_px: float
     noise: TrackNoise | None
+    principal_points: Mapping[int, PrincipalPoint]
     _unknowns: Unknowns
     _frames: int
-    _inverse: InnerConstraintInverse
+    _inverse: HeldInverse
     _meat: sparse.csr_matrix  # (n, n), M
+    _shared: np.ndarray  # (n, s), displacement of the unknowns by one sigma of each shared error
     _point_row: np.ndarray  # (P,) rows of scene points in the arrays below, -1 if unmeasured
     _whitening: np.ndarray  # (p, 3, 3), see LinearizedBundle
     _coupling: sparse.csr_matrix  # (3p, n), see LinearizedBundle
@@ -125,7 +145,7 @@ class MapCovariance:
             If the measurements do not determine the map up to a similarity.
         """
         options = options or MapCovarianceOptions()
-        unknowns = Unknowns.of(scene, refine_principal_point=options.refine_principal_point)
+        unknowns = Unknowns.of(scene)
         rows = np.flatnonzero(np.isfinite(seen.residuals_px).all(axis=1))
         cluster = _clusters_of_points(seen, rows, len(scene.points))
         rows = rows[np.lexsort((seen.point_idx[rows], cluster[seen.point_idx[rows]]))]
@@ -136,13 +156,18 @@ class MapCovariance:
             noise = fit_track_noise(linearize_bundle(scene, seen, unknowns, some))
         normal_matrix = sparse.csr_matrix((unknowns.count, unknowns.count))
         meat = sparse.csr_matrix((unknowns.count, unknowns.count))
+        gradient = np.zeros(unknowns.count)
+        lens_scores = LensScores(scene, unknowns)
         squares, parts = 0.0, []
         for part in _parts(rows, cluster[seen.point_idx[rows]]):
             bundle = linearize_bundle(scene, seen, unknowns, part)
             normal_matrix = normal_matrix + bundle.reduced_normal_matrix()
+            gradient += bundle.design.T @ bundle.residuals
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
                 meat = meat + _clustered_meat(bundle, cluster[bundle.points])
+            if not options.exact_lenses:
+                lens_scores.add(bundle, seen, part, cluster[bundle.points])
             parts.append(
                 (
                     bundle.points,
@@ -152,23 +177,37 @@ class MapCovariance:
                 )
             )
         points = np.concatenate([part[0] for part in parts])
+        held = held_columns(unknowns, scene, options.lenses)
         after_points = 2 * len(rows) - 3 * len(points)
-        redundancy = after_points - unknowns.count + GAUGE
+        redundancy = after_points - (unknowns.count - len(held)) + GAUGE
         if redundancy <= 0:
             raise GeometryError("the map has no more measurements than unknowns")
         variance = squares / redundancy
         own = np.concatenate([part[3] for part in parts])
         # Residuals are smaller than errors because poses and intrinsics absorbed a part of them.
         meat = after_points / redundancy * meat if options.clustered else variance * normal_matrix
+        # A scene that does not determine what is held anyway is no reason to fail.
+        ridge = np.zeros(unknowns.count)
+        ridge[held] = _HELD_RIDGE * normal_matrix.diagonal()[held]
+        free = InnerConstraintInverse.of(normal_matrix + sparse.diags(ridge), scene, unknowns)
+        inverse = HeldInverse.of(free, held)
+        shared, principal_points = np.zeros((unknowns.count, 0)), {}
+        if not options.exact_lenses:
+            fields = lens_scores.scaled(2 * len(rows) / after_points)
+            shared, principal_points = shared_errors(
+                scene, unknowns, inverse, meat, gradient, fields, options.lenses
+            )
         point_row = np.full(len(scene.points), -1)
         point_row[points] = np.arange(len(points))
         return cls(
             float(np.sqrt(variance)),
             noise,
+            principal_points,
             unknowns,
             len(scene.names),
-            InnerConstraintInverse.of(normal_matrix, scene, unknowns),
+            inverse,
             meat.tocsr(),
+            shared,
             point_row,
             np.concatenate([part[1] for part in parts]),
             sparse.vstack([part[2] for part in parts], format="csr"),
@@ -178,8 +217,8 @@ class MapCovariance:
     def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
         """Return the covariance of each functional.
 
-        It is the sum of two parts: the errors of poses and intrinsics, which all points share, and the own
-        error of each point.
+        It is the sum of three parts: the errors of poses and intrinsics, which all points share, the errors
+        that all measurements of a lens share, and the own error of each point.
 
         Parameters
         ----------
@@ -199,7 +238,8 @@ class MapCovariance:
         if not functionals:
             return []
         sides = [self._right_side(functional) for functional in functionals]
-        solved = self._inverse.solve(np.concatenate([right for _, right in sides], axis=1))
+        rights = np.concatenate([right for _, right in sides], axis=1)
+        solved, sides_shared = self._inverse.solve(rights), rights.T @ self._shared
         weighted = self._meat @ solved
         ends = np.cumsum([0] + [right.shape[1] for _, right in sides])
         covariances = []
@@ -209,7 +249,10 @@ class MapCovariance:
             errors = self._own[self._point_row[functional.point_idx]]
             each = np.einsum("rki,kij->rkj", by_own, errors)
             of_points = np.tensordot(each, by_own, axes=((1, 2), (1, 2)))
-            covariances.append(solved[:, a:b].T @ weighted[:, a:b] + of_points)
+            of_shared = sides_shared[a:b]
+            covariances.append(
+                solved[:, a:b].T @ weighted[:, a:b] + of_shared @ of_shared.T + of_points
+            )
         return covariances
 
     def pose_covariances(self, frames: np.ndarray | None = None) -> np.ndarray:
@@ -236,7 +279,10 @@ class MapCovariance:
             solved = self._inverse.solve(right)
             weighted = (self._meat @ solved).reshape(n, len(some), POSE)
             solved = solved.reshape(n, len(some), POSE)
-            found[first : first + len(some)] = np.einsum("nfi,nfj->fij", solved, weighted)
+            shared = self._shared[columns].reshape(len(some), POSE, -1)
+            found[first : first + len(some)] = np.einsum(
+                "nfi,nfj->fij", solved, weighted
+            ) + shared @ np.swapaxes(shared, 1, 2)
         return found
 
     def _right_side(self, functional: Functional) -> tuple[np.ndarray, np.ndarray]:

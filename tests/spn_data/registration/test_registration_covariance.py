@@ -101,7 +101,7 @@ def maps() -> list[tuple[Small, MapCovariance]]:
     found = []
     for _ in range(TRIALS):
         mapped = truth.noisy(rng.normal(0, NOISE_PX, truth.seen.pixels.shape))
-        options = MapCovarianceOptions(clustered=False)
+        options = MapCovarianceOptions(clustered=False, exact_lenses=True)
         found.append((mapped, MapCovariance.of(mapped.scene, mapped.seen, options)))
     return found
 

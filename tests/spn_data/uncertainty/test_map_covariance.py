@@ -29,9 +29,11 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.shared_errors import held_columns
 from tests.worlds.native_world import native_model
 
-INDEPENDENT = MapCovarianceOptions(clustered=False)
+EXACT = MapCovarianceOptions(exact_lenses=True)
+INDEPENDENT = MapCovarianceOptions(clustered=False, exact_lenses=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,7 @@ def scores(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 
 
 def linearized(scene: Scene, seen: MapObservations) -> tuple[Unknowns, LinearizedBundle]:
-    unknowns = Unknowns.of(scene, refine_principal_point=False)
+    unknowns = Unknowns.of(scene)
     rows = np.arange(len(seen.point_idx))
     return unknowns, linearize_bundle(scene, seen, unknowns, rows)
 
@@ -182,9 +184,13 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
 
 
 def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np.ndarray:
-    """Return the covariance of all unknowns, points last, under the seven inner constraints."""
+    """Return the covariance of all unknowns, points last, under the seven inner constraints.
+
+    Principal points are held: their rows and columns are zero.
+    """
     unknowns, bundle = linearized(scene, seen)
     n, p = bundle.design.shape[1], 3 * len(scene.points)
+    free = np.setdiff1d(np.arange(n + p + 7), held_columns(unknowns, scene, {}))
     by_point = np.zeros((bundle.design.shape[0], p))
     for row, (k, j) in enumerate(zip(seen.image_idx, seen.point_idx, strict=True)):
         camera = scene.cameras[int(scene.camera_ids[k])]
@@ -197,9 +203,13 @@ def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np
     frames = np.arange(POSE * len(scene.names)).reshape(-1, POSE)[:, :3].ravel()
     conditions[frames] = gauge[frames]
     bordered = np.block([[full.T @ full, conditions], [conditions.T, np.zeros((7, 7))]])
+    bordered = bordered[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(bordered)), 1e-6))
-    inverse = np.linalg.pinv(bordered * scale[:, None] * scale, rcond=1e-15)
-    return sigma_px**2 * (inverse * scale[:, None] * scale)[: n + p, : n + p]
+    inverse = np.zeros((n + p + 7, n + p + 7))
+    inverse[np.ix_(free, free)] = np.linalg.pinv(bordered * scale[:, None] * scale, rcond=1e-15)
+    inverse[free] *= scale[:, None]
+    inverse[:, free] *= scale
+    return sigma_px**2 * inverse[: n + p, : n + p]
 
 
 def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
@@ -235,15 +245,16 @@ def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
     rng = np.random.default_rng(6)
     whole = small(8, 60)
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
-    found = MapCovariance.of(made.scene, made.seen).pose_covariances()
-    _, bundle = linearized(made.scene, made.seen)
+    found = MapCovariance.of(made.scene, made.seen, EXACT).pose_covariances()
+    unknowns, bundle = linearized(made.scene, made.seen)
     design, residuals = bundle.design.toarray(), bundle.residuals
     n = design.shape[1]
     pulls = np.zeros((60, n))
     for row, point in enumerate(np.repeat(bundle.point, 2)):
         pulls[point] += design[row] * residuals[row]
     freedom = len(residuals) - 180
-    pull = pulls.T @ pulls * freedom / (freedom - n + 7)
+    estimated = n - len(held_columns(unknowns, made.scene, {}))
+    pull = pulls.T @ pulls * freedom / (freedom - estimated + 7)
     covariance = MapCovariance.of(made.scene, made.seen, INDEPENDENT)
     inverse = dense_covariance(made.scene, made.seen, 1.0)[:n, :n]
     expected = inverse @ pull @ inverse
@@ -271,7 +282,7 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
             noise = drifting(rng, whole.seen, 0.3)
         made = whole.noisy(noise)
         pose_errors, point_errors = errors_of(made.scene, whole.scene)
-        covariance = MapCovariance.of(made.scene, made.seen)
+        covariance = MapCovariance.of(made.scene, made.seen, EXACT)
         told["poses"].append(scores(pose_errors, covariance.pose_covariances()))
         independent = MapCovariance.of(made.scene, made.seen, INDEPENDENT).pose_covariances()
         told["poses if independent"].append(scores(pose_errors, independent))
