@@ -71,7 +71,7 @@ def run_pycolmap(
     names = np.array(frames.names)
     with stopwatch.step("features"):
         with pycolmap.Database.open(database) as native:
-            camera_ids = {key: _add_camera(native, frames, key) for key in frames.start_cameras}
+            camera_ids = {key: _add_camera(native, frames, key) for key in frames.lenses}
         extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads)
         for key, camera_id in camera_ids.items():
             for sequence in np.unique(frames.sequences[frames.cameras == key]).tolist():
@@ -123,8 +123,8 @@ def run_pycolmap(
 def _add_camera(native: object, frames: FramesToMap, key: str) -> int:
     from spn_data.colmap.verify import native_camera
 
-    camera, focal_is_known = frames.start_cameras[key]
-    return int(native.write_camera(native_camera(camera, focal_is_known=focal_is_known)))  # type: ignore[attr-defined]
+    lens = frames.lenses[key]
+    return int(native.write_camera(native_camera(lens.camera, focal_is_known=lens.focal_is_known)))  # type: ignore[attr-defined]
 
 
 def _write_priors(database: Path, frames: FramesToMap, located: object) -> None:

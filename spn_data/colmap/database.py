@@ -6,7 +6,7 @@ Each write is committed at once, so that a killed run loses nothing it has writt
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.verify import VerifiedPair, native_camera
 from spn_data.errors import FormatError, StageError
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.matching.features import Features
 
 
@@ -89,16 +89,15 @@ class MapDatabase:
     def add_images(
         self,
         images: Sequence[DatabaseImage],
-        cameras: dict[str, tuple[Camera, bool]],
+        lenses: Mapping[str, InitialLens],
     ) -> None:
         """Insert the images that the database does not contain yet.
 
         Parameters
         ----------
         images : sequence of DatabaseImage
-        cameras : dict of str to (Camera, bool)
-            Initial intrinsics by camera key, and whether the focal length is known. One camera is inserted
-            per key.
+        lenses : mapping of str to InitialLens
+            By camera key. One camera is inserted per key.
         """
         camera_ids = {
             image.camera: self._native.read_image_with_name(image.name).camera_id
@@ -110,13 +109,13 @@ class MapDatabase:
                 if image.name in self.ids:
                     continue
                 if image.camera not in camera_ids:
-                    camera_ids[image.camera] = self._add_camera(*cameras[image.camera])
+                    camera_ids[image.camera] = self._add_camera(lenses[image.camera])
                 self.ids[image.name] = self._add_image(image.name, camera_ids[image.camera])
 
-    def _add_camera(self, camera: Camera, focal_is_known: bool) -> int:
+    def _add_camera(self, lens: InitialLens) -> int:
         camera_id = self._native.num_cameras() + 1
         self._write_camera(
-            native_camera(camera, camera_id=camera_id, focal_is_known=focal_is_known)
+            native_camera(lens.camera, camera_id=camera_id, focal_is_known=lens.focal_is_known)
         )
         return camera_id
 

@@ -16,10 +16,10 @@ from spn_data.capture.selection import FrameChoice
 from spn_data.capture.sources import Source, SourceKind, discover, safe_name
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import camera_from_json
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.inputs.flight_telemetry import source_telemetry, with_time_offset
 from spn_data.inputs.frame_images import STORED
-from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.initial_cameras import start_lenses
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.split.groups import GROUPS
 from spn_data.telemetry.table import write_track
@@ -36,15 +36,14 @@ class SampledSequence:
     frames : Frames
         All candidate frames; the sampled ones have status "chosen".
     track : Telemetry or None
-    start : tuple of (Camera, bool)
-        Initial camera, and whether its focal length is known.
+    lens : InitialLens
     notes : list of str
         One sentence each.
     """
 
     frames: Frames
     track: Telemetry | None
-    start: tuple[Camera, bool]
+    lens: InitialLens
     notes: list[str]
 
 
@@ -176,7 +175,7 @@ def sample_frames(
             path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
-    starts = start_cameras(frames, candidates.photos, fov, {} if given is None else {"*": given})
+    lenses = start_lenses(frames, candidates.photos, fov, {} if given is None else {"*": given})
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)
@@ -186,13 +185,7 @@ def sample_frames(
         folder / STORED / source.sequence,
         progress=lambda done: progress("frames", done, int(frames.chosen.sum())),
     )
-    start = starts[keys[0]]
-    return SampledSequence(
-        frames,
-        track,
-        (camera_from_json(start), bool(start["focal_is_known"])),
-        list(candidates.notes),
-    )
+    return SampledSequence(frames, track, lenses[keys[0]], list(candidates.notes))
 
 
 def _sampled(

@@ -13,7 +13,6 @@ from spn_data.area.area import Area, StageWork
 from spn_data.area.facts import Facts
 from spn_data.area.names import (
     CAMERA,
-    CAMERAS,
     EVALUATION,
     FRAMES,
     GEO,
@@ -27,11 +26,13 @@ from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.inputs.area_labels import read_geo, read_world_from_model
 from spn_data.inputs.evaluation_source import find_source, sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.inputs.lens_file import read_lenses
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.labels.labels import Labels, pose_sigmas, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
@@ -39,7 +40,7 @@ from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.registration.covariance import SequenceCovariance
 from spn_data.registration.register import RegisteredSequence, labels_of, register_sequence
 from spn_data.registration.register_options import RegisterOptions
-from spn_data.storage.json_files import VERSION, read_json, reporting_damage, write_json
+from spn_data.storage.json_files import VERSION, reporting_damage, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.track import Telemetry
 from spn_data.work.parallel import Dispatch
@@ -154,7 +155,7 @@ def _register(
         )
     chosen = sampled.frames.select(sampled.frames.chosen)
     found = register_sequence(
-        _frames_to_match(work.path / STORED, chosen, sampled.start),
+        _frames_to_match(work.path / STORED, chosen, sampled.lens),
         work.path,
         area.folder(MODEL),
         options.register,
@@ -166,7 +167,7 @@ def _register(
     with stopwatch.step("write"):
         write_labels(work.path / POSES, labels)
         write_label_observations(work.path / OBSERVATIONS, found.seen)
-        _write_camera(work.path / CAMERA, found, sampled.start)
+        _write_camera(work.path / CAMERA, found, sampled.lens)
         gnss = _gnss(area, labels, sampled.track, options.time_offset_s)
         after = _map_hashes(area)
         if after != before:
@@ -190,7 +191,7 @@ def _map_hashes(area: Area) -> dict[str, str]:
     return {stage: map_hash(area.folder(stage)) for stage in (MODEL, GEO) if area.has(stage)}
 
 
-def _frames_to_match(folder: Path, chosen: Frames, start: tuple[Camera, bool]) -> FramesToMap:
+def _frames_to_match(folder: Path, chosen: Frames, lens: InitialLens) -> FramesToMap:
     """Return the sampled frames of one sequence as input of matching, without positions."""
     return FramesToMap(
         folder=folder,
@@ -198,17 +199,17 @@ def _frames_to_match(folder: Path, chosen: Frames, start: tuple[Camera, bool]) -
         sequences=chosen.sequences,
         cameras=chosen.cameras,
         positions_m=np.full((len(chosen), 3), np.nan),
-        start_cameras={str(chosen.cameras[0]): start},
+        lenses={str(chosen.cameras[0]): lens},
         masks={},
     )
 
 
-def _write_camera(path: Path, found: RegisteredSequence, start: tuple[Camera, bool]) -> None:
+def _write_camera(path: Path, found: RegisteredSequence, lens: InitialLens) -> None:
     """Write the estimated camera with its covariance, and the one it started from."""
     covariance = found.covariance
-    lens = {} if covariance is None else _lens_json(covariance)
-    camera = {"version": VERSION, **camera_to_json(found.solution.camera), **lens}
-    write_json(path, {**camera, "start": _start_json(start)})
+    estimated = {} if covariance is None else _lens_json(covariance)
+    camera = {"version": VERSION, **camera_to_json(found.solution.camera), **estimated}
+    write_json(path, {**camera, "start": lens.to_json()})
 
 
 def _write_registration(
@@ -253,12 +254,16 @@ def _misfit_notes(found: RegisteredSequence) -> list[str]:
 
 def _mapping_lenses(area: Area) -> dict[str, Camera]:
     """Return the mapping cameras as estimated by the reconstruction, by key."""
-    path = area.folder(FRAMES) / CAMERAS
-    sizes, estimated = read_json(path), area.record(MODEL).counts["cameras"]
-    with reporting_damage(path, "a list of cameras"):
+    lenses, folder = read_lenses(area.folder(FRAMES)), area.folder(MODEL)
+    estimated = area.record(MODEL).counts["cameras"]
+    with reporting_damage(folder, "a model"):
         return {
             key: camera_from_json(
-                {**sizes["cameras"][key], "model": lens["model"], "params": lens["params"]}
+                {
+                    **camera_to_json(lenses[key].camera),
+                    "model": lens["model"],
+                    "params": lens["params"],
+                }
             )
             for key, lens in estimated.items()
         }
@@ -281,10 +286,6 @@ def lens_notes(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
 
 def _lens_json(covariance: SequenceCovariance) -> dict[str, Any]:
     return {"estimated": list(covariance.lens_names), "covariance": covariance.lens.tolist()}
-
-
-def _start_json(start: tuple[Camera, bool]) -> dict[str, Any]:
-    return {**camera_to_json(start[0]), "focal_is_known": start[1]}
 
 
 def _gnss(

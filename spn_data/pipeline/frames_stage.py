@@ -24,6 +24,7 @@ from spn_data.capture.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sou
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.geometry.geodesy import metres_from_first_fix
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.inputs.file_links import link_or_copy
 from spn_data.inputs.flight_telemetry import (
     check_telemetry,
@@ -31,11 +32,11 @@ from spn_data.inputs.flight_telemetry import (
     unread_tracks,
     with_time_offset,
 )
-from spn_data.inputs.initial_cameras import start_cameras
+from spn_data.inputs.initial_cameras import start_lenses
+from spn_data.inputs.lens_file import read_lenses, write_lenses
 from spn_data.inputs.sequence_masks import check_mask, find_masks, write_mask
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import read_json, reporting_damage, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.telemetry.table import write_track
 from spn_data.telemetry.track import Telemetry, TelemetrySummary, summarize
@@ -224,10 +225,10 @@ def choose_frames(
     stopwatch = Stopwatch()
     for name in (TELEMETRY, MASKS, ".analysis"):
         (work.path / name).mkdir(exist_ok=True)
-    cameras: dict[str, dict[str, object]] = {}
+    lenses: dict[str, InitialLens] = {}
     parts: list[Frames] = []
     if extend is not None:
-        parts, cameras = _reuse_frames(extend, work.path)
+        parts, lenses = _reuse_frames(extend, work.path)
     candidates, tracks, notes = _measure(
         found, work.path / ".analysis", options, progress, stopwatch, on_telemetry, offsets_s
     )
@@ -242,7 +243,7 @@ def choose_frames(
         frames = _frames_with_telemetry(one, track, choice)
         if stored is not None:
             write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", stored)
-        cameras.update(start_cameras(frames, one.photos, options.fov_deg, given))
+        lenses.update(start_lenses(frames, one.photos, options.fov_deg, given))
         if one.source.sequence in masks:
             write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:
@@ -258,7 +259,7 @@ def choose_frames(
         parts.append(frames)
     frames = Frames.concatenate(parts)
     write_frames(work.path / FRAMES_TABLE, frames)
-    write_json(work.path / CAMERAS, {"version": 1, "cameras": cameras})
+    write_lenses(work.path, lenses)
     return work.finish(
         counts=_counts(frames),
         seconds=stopwatch.seconds,
@@ -336,8 +337,8 @@ def _counts(frames: Frames) -> dict[str, int]:
     }
 
 
-def _reuse_frames(extend: Area, target: Path) -> tuple[list[Frames], dict[str, dict[str, object]]]:
-    """Link the frames, telemetry and masks of an area; return its frame table and cameras."""
+def _reuse_frames(extend: Area, target: Path) -> tuple[list[Frames], dict[str, InitialLens]]:
+    """Link the frames, telemetry and masks of an area; return its frame table and lenses."""
     folder = extend.folder(FRAMES)
     frames = read_frames(folder / FRAMES_TABLE)
     chosen = [folder / name for name in frames.names[frames.chosen].tolist()]
@@ -347,8 +348,7 @@ def _reuse_frames(extend: Area, target: Path) -> tuple[list[Frames], dict[str, d
         link.parent.mkdir(exist_ok=True)
         if not link.exists():
             link_or_copy(path, link)
-    with reporting_damage(folder / CAMERAS, "a list of cameras"):
-        return [frames], dict(read_json(folder / CAMERAS)["cameras"])
+    return [frames], read_lenses(folder)
 
 
 def _analyse(source: Source, folder: Path, cost: ExtractionCost, progress: Progress) -> Candidates:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,9 +22,8 @@ from spn_data.area.names import (
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene
 from spn_data.errors import FormatError, GeometryError
-from spn_data.geometry.camera import Camera
-from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
+from spn_data.inputs.lens_file import read_lenses
 from spn_data.labels.labels import write_label_observations, write_labels
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.contradiction import focal_changes
@@ -36,7 +33,6 @@ from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
-from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
 from spn_data.storage.stage_record import StageRecord
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -121,8 +117,10 @@ def _reuse_features(extend: Area, work: StageWork) -> tuple[str, ...]:
 def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
     """Collect the input of the reconstruction from stage 1-frames."""
     folder = area.folder(FRAMES)
-    with reporting_damage(folder / CAMERAS, "a list of cameras"):
-        start = dict(read_json(folder / CAMERAS)["cameras"])
+    lenses = read_lenses(folder)
+    missing = set(chosen.cameras.tolist()) - set(lenses)
+    if missing:
+        raise FormatError(f"{folder / CAMERAS}: camera {min(missing)!r} is missing")
     masks = {p.stem: p for p in sorted((folder / MASKS).glob("*.png"))}
     return FramesToMap(
         folder=folder,
@@ -130,18 +128,9 @@ def frames_to_map(area: Area, chosen: Frames) -> FramesToMap:
         sequences=chosen.sequences,
         cameras=chosen.cameras,
         positions_m=rough_positions(chosen),
-        start_cameras={
-            key: _start_camera(key, start) for key in np.unique(chosen.cameras).tolist()
-        },
+        lenses={key: lenses[key] for key in np.unique(chosen.cameras).tolist()},
         masks=masks,
     )
-
-
-def _start_camera(key: str, start: Mapping[str, dict[str, Any]]) -> tuple[Camera, bool]:
-    try:
-        return camera_from_json(start[key]), bool(start[key]["focal_is_known"])
-    except DAMAGE as error:
-        raise FormatError(f"{CAMERAS}: camera {key!r} is missing or damaged ({error})") from error
 
 
 def rough_positions(frames: Frames) -> np.ndarray:

@@ -116,8 +116,8 @@ def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[Focal
     lenses = {key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)}
     changes = []
     for key, camera_id in lenses.items():
-        start, known = frames.start_cameras[key]
-        change = FocalChange(key, start.focal_px[0], scene.cameras[camera_id].focal_px[0])
-        if known and change.ratio > ratio:
+        start = frames.lenses[key]
+        change = FocalChange(key, start.camera.focal_px[0], scene.cameras[camera_id].focal_px[0])
+        if start.focal_is_known and change.ratio > ratio:
             changes.append(change)
     return sorted(changes, key=lambda one: -one.ratio)

@@ -11,7 +11,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.matching.features import FeatureOptions, Features, extract_from_bytes
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_data.matching.putative import MatchOptions
@@ -33,8 +33,8 @@ class FramesToMap:
         Keys of sequences and cameras.
     positions_m : ndarray, shape (N, 3)
         ENU positions in metres; NaN if unknown.
-    start_cameras : dict of str to (Camera, bool)
-        Initial intrinsics by camera key, and whether the focal length is known.
+    lenses : dict of str to InitialLens
+        By camera key.
     masks : dict of str to Path
         Mask image by sequence.
     """
@@ -44,7 +44,7 @@ class FramesToMap:
     sequences: np.ndarray
     cameras: np.ndarray
     positions_m: np.ndarray
-    start_cameras: dict[str, tuple[Camera, bool]]
+    lenses: dict[str, InitialLens]
     masks: dict[str, Path]
 
 
@@ -137,8 +137,8 @@ def match_missing(
     cache: dict[int, Features] = {}
 
     def image(i: int) -> ImageForMatching:
-        camera, focal_is_known = frames.start_cameras[str(frames.cameras[i])]
-        return ImageForMatching(cache[i], camera, focal_is_known)
+        lens = frames.lenses[str(frames.cameras[i])]
+        return ImageForMatching(cache[i], lens.camera, lens.focal_is_known)
 
     def batches() -> Iterator[tuple[str, tuple[object, ...]]]:
         for start in range(0, len(missing), _PAIRS_PER_BATCH):

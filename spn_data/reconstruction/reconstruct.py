@@ -221,7 +221,7 @@ def _try(run: _Run, attempt: Attempt, notes: list[str]) -> _Candidate | None:
             DatabaseImage(name, str(key))
             for name, key in zip(frames.names, frames.cameras, strict=True)
         ]
-        database.add_images(images, frames.start_cameras)
+        database.add_images(images, frames.lenses)
         _extract(run, database, attempt.features)
         with stopwatch.step("pairs"):
             appearance = appearance_of(database, frames, attempt.pairs)

@@ -113,7 +113,7 @@ def register_sequence(
     with MapDatabase.open(folder / DATABASE) as database:
         database.add_images(
             [DatabaseImage(n, str(c)) for n, c in zip(names, to_match.cameras, strict=True)],
-            to_match.start_cameras,
+            to_match.lenses,
         )
         with stopwatch.step("features"):
             extract_missing(database, to_match, options.features, dispatch, progress)
@@ -133,8 +133,8 @@ def register_sequence(
     with stopwatch.step("poses"):
         tracks = find_tracks(pairs, [len(p) for p in pixels])
         sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
-        (start,) = to_match.start_cameras.values()
-        solution = solve(sequence, *start, options)
+        (lens,) = to_match.lenses.values()
+        solution = solve(sequence, lens.camera, lens.focal_is_known, options)
         registered = accept_poses(
             sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
         )

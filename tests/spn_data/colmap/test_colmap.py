@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from spn_data.colmap.model import (
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.errors import FormatError, StageError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
 from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.matching.features import Features
@@ -128,14 +130,14 @@ def test_a_death_of_the_mapper_is_told_with_the_end_of_its_log(tmp_path: Path) -
 def test_a_thinned_database_keeps_the_features_that_match_most(tmp_path: Path) -> None:
     """Thinning keeps features matched in two pairs first, then the strongest matched ones."""
     rng = np.random.default_rng(0)
-    camera = Camera.from_horizontal_fov(800, 600, 70)
+    lens = InitialLens(Camera.from_horizontal_fov(800, 600, 70), 0.05, "")
     matches = {
         (1, 2): np.stack([rng.permutation(500), rng.permutation(500)], axis=1)[:400],
         (2, 3): np.stack([np.arange(480, 500), np.arange(460, 480)], axis=1),  # few, and weak
     }
     with MapDatabase.open(tmp_path / "database.db") as database:
         images = [DatabaseImage(f"{k}.jpg", "a") for k in "123"]
-        database.add_images(images, {"a": (camera, True)})
+        database.add_images(images, {"a": lens})
         for image in images:
             points = rng.uniform(0, 600, (500, 4)).astype(np.float32)
             database.write_features(image.name, Features(points, np.zeros((500, 128), np.uint8)))
@@ -363,7 +365,7 @@ def features(n: int) -> Features:
 
 def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
     """Images, features, pairs and cameras written to the database are read back unchanged."""
-    camera = Camera.from_horizontal_fov(800, 600, 70, (0.0,))
+    lens = InitialLens(Camera.from_horizontal_fov(800, 600, 70, (0.0,)), 0.05, "")
     images = [
         DatabaseImage("a/1.jpg", "a"),
         DatabaseImage("a/2.jpg", "a"),
@@ -372,14 +374,14 @@ def test_the_database_gives_back_what_was_written(tmp_path: Path) -> None:
     none = np.zeros((0, 2), np.uint32)
     matches = np.array([[0, 1], [2, 3]], np.uint32)
     with MapDatabase.open(tmp_path / "db") as database:
-        database.add_images(images[:2], {"a": (camera, True)})
+        database.add_images(images[:2], {"a": lens})
         database.write_features("a/1.jpg", features(10))
         database.write_pair(
             VerifiedPair((1, 2), matches, matches[:1], 2, np.eye(3), np.eye(3), None)
         )
     with MapDatabase.open(tmp_path / "db") as database:
         # Existing images keep their ids; new ones are appended with their own camera.
-        database.add_images(images, {"a": (camera, True), "b": (camera, False)})
+        database.add_images(images, {"a": lens, "b": replace(lens, focal_sigma=GUESS_SIGMA)})
         database.write_pair(VerifiedPair((1, 3), none, none, 1, None, None, None))
         assert database.ids == {"a/1.jpg": 1, "a/2.jpg": 2, "b/1.jpg": 3}
         assert [database.has_features(name) for name in database.ids] == [True, False, False]

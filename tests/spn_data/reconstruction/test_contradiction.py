@@ -12,6 +12,7 @@ from spn_data.colmap import pycolmap
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene, scene_of
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.reconstruction.contradiction import contradictions, focal_changes
@@ -93,9 +94,16 @@ def test_a_known_focal_length_that_comes_out_far_off_speaks_against_a_model(
     (camera,) = scene.cameras.values()
     start = Camera("SIMPLE_PINHOLE", 100, 100, np.array([camera.focal_px[0] / factor, 50, 50]))
     n = len(scene.names)
+    lens = InitialLens(start, 0.05 if known else GUESS_SIGMA, "")
     keys, nowhere = np.array(["lens"] * n), np.full((n, 3), np.nan)
     frames = FramesToMap(
-        Path(), tuple(scene.names), keys, keys, nowhere, {"lens": (start, known)}, {}
+        Path(),
+        tuple(scene.names),
+        keys,
+        keys,
+        nowhere,
+        {"lens": lens},
+        {},
     )
     changes = focal_changes(scene, frames, 1.5)
     assert len(changes) == told

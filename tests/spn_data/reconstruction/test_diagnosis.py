@@ -12,6 +12,7 @@ from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.model import read_map, write_native
 from spn_data.colmap.verify import VerifiedPair
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.matching.features import Features
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose, missing_passages
@@ -47,7 +48,8 @@ def registrations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FrameRe
     inliers = np.stack([np.arange(30), np.arange(30)], axis=1).astype(np.uint32)
     with MapDatabase.open(folder / "database.db") as database:
         database.add_images(
-            [DatabaseImage(name, "other") for name in more], {"other": (CAMERA, True)}
+            [DatabaseImage(name, "other") for name in more],
+            {"other": InitialLens(CAMERA, 0.05, "")},
         )
         for name in more:
             database.write_features(name, features(40 if name == "few" else 400))
@@ -60,7 +62,7 @@ def registrations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FrameRe
             np.array(["a"] * len(every)),
             np.array(["a"] * len(every)),
             np.full((len(every), 3), np.nan),
-            {"a": (CAMERA, True)},
+            {"a": InitialLens(CAMERA, 0.05, "")},
             {},
         )
         return {

@@ -1,0 +1,40 @@
+"""cameras.json of stage 1-frames: the lens from which each camera of the map starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from spn_data.area.names import CAMERAS
+from spn_data.geometry.initial_lens import InitialLens
+from spn_data.storage.json_files import VERSION, read_json, reporting_damage, write_json
+
+
+def write_lenses(folder: Path, lenses: Mapping[str, InitialLens]) -> None:
+    """Write the lenses of the cameras of stage 1-frames into its folder."""
+    cameras = {key: lens.to_json() for key, lens in lenses.items()}
+    write_json(folder / CAMERAS, {"version": VERSION, "cameras": cameras})
+
+
+def read_lenses(folder: Path) -> dict[str, InitialLens]:
+    """Read the lenses of the cameras of stage 1-frames from its folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the stage.
+
+    Returns
+    -------
+    dict of str to InitialLens
+        By camera key, as in column `camera` of frames.csv.
+
+    Raises
+    ------
+    FormatError
+        If the file is missing or damaged.
+    """
+    path = folder / CAMERAS
+    with reporting_damage(path, "a list of cameras"):
+        cameras = read_json(path)["cameras"]
+        return {str(key): InitialLens.from_json(value) for key, value in cameras.items()}
