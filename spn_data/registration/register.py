@@ -134,7 +134,7 @@ def register_sequence(
         tracks = find_tracks(pairs, [len(p) for p in pixels])
         sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
         (lens,) = to_match.lenses.values()
-        solution = solve(sequence, lens.camera, lens.focal_is_known, options)
+        solution = solve(sequence, lens, options)
         registered = accept_poses(
             sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
         )
@@ -155,8 +155,9 @@ def accept_poses(
     reason, inliers, coverage = [""] * n, np.zeros(n, np.int64), np.zeros(n)
     settled = np.zeros(n, bool)  # a rejected frame keeps the reason and figures from when it failed
     while True:
-        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
-        evidence = gather_evidence(sequence, solution, covariances, pairs, options)
+        covariance = _covariance(sequence, solution, map_covariance, options)
+        measured = _of_all_frames(solution, None if covariance is None else covariance.measured)
+        evidence = gather_evidence(sequence, solution, measured, pairs, options)
         verdict = check_poses(solution.posed, evidence, options.checks)
         for row in np.flatnonzero(~settled):
             reason[row] = verdict.reason[row]
@@ -178,32 +179,37 @@ def accept_poses(
         inliers=inliers,
         coverage=coverage,
         covariance=covariance,
-        covariances=covariances,
+        covariances=_of_all_frames(solution, None if covariance is None else covariance.poses),
         seen=seen,
         map_sigma_px=map_covariance.sigma_px,
     )
 
 
-def _covariances(
+def _covariance(
     sequence: UnsolvedSequence,
     solution: SequenceSolution,
     map_covariance: MapCovariance,
     options: RegisterOptions,
-) -> tuple[SequenceCovariance | None, np.ndarray]:
-    """Return the covariance of the posed frames, and (N, 6, 6) of all frames, NaN without a pose."""
-    covariances = np.full((len(solution.posed), 6, 6), np.nan)
+) -> SequenceCovariance | None:
+    """Return the covariance of the posed frames, None if there is none."""
     if not solution.posed.any():
-        return None, covariances
+        return None
     state, observations = solution.least_squares(sequence)
-    covariance = sequence_covariance(
+    return sequence_covariance(
         state,
         observations,
         solution.point_row,
         map_covariance,
         estimated_intrinsics(solution.camera, len(state.poses), options),
     )
-    covariances[solution.posed] = covariance.poses
-    return covariance, covariances
+
+
+def _of_all_frames(solution: SequenceSolution, of_posed: np.ndarray | None) -> np.ndarray:
+    """Return covariances (N, 6, 6) of all frames from those of the posed ones, NaN without a pose."""
+    covariances = np.full((len(solution.posed), 6, 6), np.nan)
+    if of_posed is not None:
+        covariances[solution.posed] = of_posed
+    return covariances
 
 
 def labels_of(chosen: Frames, registered: RegisteredSequence) -> Labels:

@@ -37,7 +37,7 @@ class Unknowns:
     count : int
         Number of columns n.
     lens_columns : dict of int to ndarray, shape (L,)
-        Columns of the intrinsics, in the order of the camera model, by camera id.
+        Columns of the intrinsics in the order of `estimated_names`, by camera id.
     lens_jacobian : dict of int to ndarray, shape (8, L)
         Derivatives of fx, fy, cx, cy, k1, k2, p1, p2 by the L intrinsics, by camera id.
     """
@@ -48,15 +48,20 @@ class Unknowns:
 
     @classmethod
     def of(cls, scene: Scene) -> Unknowns:
-        """Return the unknowns of a map: all poses and all intrinsics."""
+        """Return the unknowns of a map: all poses, and all intrinsics but the principal points."""
         columns, mixing = {}, {}
         count = POSE * len(scene.names)
         for camera_id in np.unique(scene.camera_ids).tolist():
             camera = scene.cameras[camera_id]
-            mixing[camera_id] = lens_parameter_jacobian(MODELS[camera.model])
+            mixing[camera_id] = lens_parameter_jacobian(estimated_names(camera))
             columns[camera_id] = count + np.arange(mixing[camera_id].shape[1])
             count += mixing[camera_id].shape[1]
         return cls(count, columns, mixing)
+
+
+def estimated_names(camera: Camera) -> list[str]:
+    """Return the names of the intrinsics that are unknowns; a principal point is a field of its lens."""
+    return [name for name in MODELS[camera.model] if name not in ("cx", "cy")]
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ from spn_data.uncertainty.shared_errors import (
     HeldInverse,
     LensPrior,
     LensScores,
-    PrincipalPoint,
+    SharedErrors,
     held_columns,
     shared_errors,
 )
@@ -52,7 +52,6 @@ from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, whiten
 _FRAMES_AT_ONCE = 32
 _MEASUREMENTS_AT_ONCE = 200_000
 _SPOT_PX = 1.0  # keypoints of one spot differ in scale and orientation, not in position
-_HELD_RIDGE = 1e-9  # share of the diagonal, far below what the measurements say
 _NOISE_SAMPLE = 6000  # points, among which long tracks are selected
 
 
@@ -89,12 +88,31 @@ class Functional:
         The lens; None if the function depends on none.
     by_lens : ndarray, shape (r, 8), or None
         Derivatives by fx, fy, cx, cy, k1, k2, p1, p2 of this lens.
+    by_field : ndarray, shape (r, TERMS), or None
+        Derivatives by the coefficients of the fields of this lens.
     """
 
     point_idx: np.ndarray
     by_points: np.ndarray
     camera_id: int | None = None
     by_lens: np.ndarray | None = None
+    by_field: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionalCovariance:
+    """Covariance of a functional with r values.
+
+    Attributes
+    ----------
+    measured : ndarray, shape (r, r)
+        Due to errors of measurements.
+    shared : ndarray, shape (r, r)
+        Due to errors that all measurements of a lens share.
+    """
+
+    measured: np.ndarray
+    shared: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,18 +125,17 @@ class MapCovariance:
         Standard deviation of one residual component: root of the residual sum of squares over the redundancy.
     noise : TrackNoise or None
         Correlation of the errors along a track; None if all errors are taken as independent.
-    principal_points : mapping of int to PrincipalPoint
-        What the measurements say about the principal point of each lens, by camera id.
+    shared : SharedErrors
+        Errors that all measurements of a lens share.
     """
 
     sigma_px: float
     noise: TrackNoise | None
-    principal_points: Mapping[int, PrincipalPoint]
+    shared: SharedErrors
     _unknowns: Unknowns
     _frames: int
     _inverse: HeldInverse
     _meat: sparse.csr_matrix  # (n, n), M
-    _shared: np.ndarray  # (n, s), displacement of the unknowns by one sigma of each shared error
     _point_row: np.ndarray  # (P,) rows of scene points in the arrays below, -1 if unmeasured
     _whitening: np.ndarray  # (p, 3, 3), see LinearizedBundle
     _coupling: sparse.csr_matrix  # (3p, n), see LinearizedBundle
@@ -165,9 +182,10 @@ class MapCovariance:
             gradient += bundle.design.T @ bundle.residuals
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
-                meat = meat + _clustered_meat(bundle, cluster[bundle.points])
-            if not options.exact_lenses:
-                lens_scores.add(bundle, seen, part, cluster[bundle.points])
+                scores, of_measurement = _clustered_scores(bundle, cluster[bundle.points])
+                meat = meat + scores.T @ scores
+                if not options.exact_lenses:
+                    lens_scores.add(bundle, seen, part, of_measurement, scores)
             parts.append(
                 (
                     bundle.points,
@@ -177,7 +195,7 @@ class MapCovariance:
                 )
             )
         points = np.concatenate([part[0] for part in parts])
-        held = held_columns(unknowns, scene, options.lenses)
+        held = held_columns(unknowns, options.lenses)
         after_points = 2 * len(rows) - 3 * len(points)
         redundancy = after_points - (unknowns.count - len(held)) + GAUGE
         if redundancy <= 0:
@@ -186,39 +204,36 @@ class MapCovariance:
         own = np.concatenate([part[3] for part in parts])
         # Residuals are smaller than errors because poses and intrinsics absorbed a part of them.
         meat = after_points / redundancy * meat if options.clustered else variance * normal_matrix
-        # A scene that does not determine what is held anyway is no reason to fail.
-        ridge = np.zeros(unknowns.count)
-        ridge[held] = _HELD_RIDGE * normal_matrix.diagonal()[held]
-        free = InnerConstraintInverse.of(normal_matrix + sparse.diags(ridge), scene, unknowns)
-        inverse = HeldInverse.of(free, held)
-        shared, principal_points = np.zeros((unknowns.count, 0)), {}
-        if not options.exact_lenses:
-            fields = lens_scores.scaled(2 * len(rows) / after_points)
-            shared, principal_points = shared_errors(
-                scene, unknowns, inverse, meat, gradient, fields, options.lenses
+        inverse = HeldInverse.of(InnerConstraintInverse.of(normal_matrix, scene, unknowns), held)
+        shared = SharedErrors(np.zeros((unknowns.count, 0)))
+        if options.clustered and not options.exact_lenses:
+            factor = after_points / redundancy
+            shared = shared_errors(
+                scene, unknowns, inverse, lens_scores, gradient, meat, factor, options.lenses
             )
         point_row = np.full(len(scene.points), -1)
         point_row[points] = np.arange(len(points))
         return cls(
             float(np.sqrt(variance)),
             noise,
-            principal_points,
+            shared,
             unknowns,
             len(scene.names),
             inverse,
             meat.tocsr(),
-            shared,
             point_row,
             np.concatenate([part[1] for part in parts]),
             sparse.vstack([part[2] for part in parts], format="csr"),
             own if options.clustered else variance * own,
         )
 
-    def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
+    def functional_covariances(
+        self, functionals: Sequence[Functional]
+    ) -> list[FunctionalCovariance]:
         """Return the covariance of each functional.
 
-        It is the sum of three parts: the errors of poses and intrinsics, which all points share, the errors
-        that all measurements of a lens share, and the own error of each point.
+        Errors of measurements act through poses and intrinsics, which all points share, and through the own
+        error of each point. Errors that all measurements of a lens share are kept apart.
 
         Parameters
         ----------
@@ -227,8 +242,8 @@ class MapCovariance:
 
         Returns
         -------
-        list of ndarray, shape (r, r)
-            One covariance per functional.
+        list of FunctionalCovariance
+            One per functional.
 
         Raises
         ------
@@ -239,7 +254,7 @@ class MapCovariance:
             return []
         sides = [self._right_side(functional) for functional in functionals]
         rights = np.concatenate([right for _, right in sides], axis=1)
-        solved, sides_shared = self._inverse.solve(rights), rights.T @ self._shared
+        solved, of_unknowns = self._inverse.solve(rights), rights.T @ self.shared.unknowns
         weighted = self._meat @ solved
         ends = np.cumsum([0] + [right.shape[1] for _, right in sides])
         covariances = []
@@ -249,9 +264,15 @@ class MapCovariance:
             errors = self._own[self._point_row[functional.point_idx]]
             each = np.einsum("rki,kij->rkj", by_own, errors)
             of_points = np.tensordot(each, by_own, axes=((1, 2), (1, 2)))
-            of_shared = sides_shared[a:b]
+            of_shared = of_unknowns[a:b]
+            if functional.by_field is not None and functional.camera_id in self.shared.fields:
+                of_shared = (
+                    of_shared + functional.by_field @ self.shared.fields[functional.camera_id]
+                )
             covariances.append(
-                solved[:, a:b].T @ weighted[:, a:b] + of_shared @ of_shared.T + of_points
+                FunctionalCovariance(
+                    solved[:, a:b].T @ weighted[:, a:b] + of_points, of_shared @ of_shared.T
+                )
             )
         return covariances
 
@@ -279,7 +300,7 @@ class MapCovariance:
             solved = self._inverse.solve(right)
             weighted = (self._meat @ solved).reshape(n, len(some), POSE)
             solved = solved.reshape(n, len(some), POSE)
-            shared = self._shared[columns].reshape(len(some), POSE, -1)
+            shared = self.shared.unknowns[columns].reshape(len(some), POSE, -1)
             found[first : first + len(some)] = np.einsum(
                 "nfi,nfj->fij", solved, weighted
             ) + shared @ np.swapaxes(shared, 1, 2)
@@ -329,8 +350,12 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
         first = last
 
 
-def _clustered_meat(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
-    """Return the meat (n, n) of the sandwich: the sum over clusters of the outer products of their scores."""
-    cluster = np.unique(cluster_of_point, return_inverse=True)[1]
-    scores = cluster_scores(bundle.residuals, cluster[bundle.point], bundle.design)
-    return (scores.T @ scores).tocsr()
+def _clustered_scores(
+    bundle: LinearizedBundle, cluster_of_point: np.ndarray
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Return the scores (C, n) of clusters, and the cluster (M,) of each measurement, 0..C-1.
+
+    The meat of the sandwich is the sum over clusters of the outer products of their scores.
+    """
+    cluster = np.unique(cluster_of_point, return_inverse=True)[1][bundle.point]
+    return cluster_scores(bundle.residuals, cluster, bundle.design), cluster

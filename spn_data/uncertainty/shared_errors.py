@@ -1,26 +1,26 @@
 """Errors that all measurements of a lens share, propagated to poses, intrinsics and points of a map.
 
-Three kinds: the field that the camera model does not describe, intrinsics that were held (every principal
-point at first, and all intrinsics of a held lens), and what is doubtful about an estimated focal length
-although the residuals do not show it.
+Fields that the camera model does not describe, principal points among them (`lens_errors`), held intrinsics,
+and what is doubtful about an estimated focal length although the residuals do not show it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
 
 from spn_data.colmap.model import MapObservations, Scene
-from spn_data.geometry.camera import MODELS
-from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns
+from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, estimated_names
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
-from spn_data.uncertainty.lens_errors import field_px, field_values
-
-PRINCIPAL_POINT_SIGMA = 0.01  # of the image width: usual distance from the centre of the image
-_PRINCIPAL_POINT = ("cx", "cy")
+from spn_data.uncertainty.lens_errors import (
+    CONSTANT,
+    TERMS,
+    estimate_field,
+    field_values,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class LensPrior:
     Attributes
     ----------
     held : bool
-        Whether mapping held its intrinsics.
+        Whether mapping held its focal length.
     focal_sigma_px : float
         Standard deviation of a held focal length; of an estimated one, what is doubtful about it beyond its
         residuals.
@@ -40,34 +40,42 @@ class LensPrior:
     focal_sigma_px: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PrincipalPoint:
     """What the measurements of a map say about the principal point of a lens.
 
     Attributes
     ----------
     shift_px : ndarray, shape (2,)
-        Its estimate minus its current value, by one Gauss-Newton step of all unknowns.
-    sigma_px : ndarray, shape (2,)
-        Standard deviation of that estimate, which includes the errors of the lens model.
+        Its expected value minus the current one.
+    covariance : ndarray, shape (2, 2)
     """
 
     shift_px: np.ndarray
-    sigma_px: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviations (2,)."""
+        return np.sqrt(np.diag(self.covariance))
 
 
-def held_columns(unknowns: Unknowns, scene: Scene, priors: Mapping[int, LensPrior]) -> np.ndarray:
-    """Return the columns (h,) of the unknowns that are taken as held: principal points, and held lenses."""
-    held = []
-    for camera_id, columns in unknowns.lens_columns.items():
-        names = MODELS[scene.cameras[camera_id].model]
-        whole = priors.get(camera_id, LensPrior()).held
-        held += [
-            c
-            for c, name in zip(columns.tolist(), names, strict=True)
-            if whole or name in _PRINCIPAL_POINT
-        ]
-    return np.array(held, dtype=np.int64)
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """t independent errors of unit variance, and what they change.
+
+    Attributes
+    ----------
+    unknowns : ndarray, shape (n, t)
+        Changes of the unknowns.
+    fields : dict of int to ndarray, shape (TERMS, t)
+        Coefficients of the fields of each lens, by camera id.
+    principal_points : dict of int to PrincipalPoint
+    """
+
+    unknowns: np.ndarray
+    fields: dict[int, np.ndarray] = field(default_factory=dict)
+    principal_points: dict[int, PrincipalPoint] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,97 +88,126 @@ class HeldInverse:
         Inverse with all unknowns free.
     held : ndarray, shape (h,)
         Columns of the held unknowns.
+    columns : ndarray, shape (n, h)
+        Their columns of the free inverse.
     by_held : ndarray, shape (n, h)
         Change of all unknowns per unit of the held ones.
-    columns : ndarray, shape (n, h)
-        Columns of the free inverse.
     """
 
     free: InnerConstraintInverse
     held: np.ndarray
-    by_held: np.ndarray
     columns: np.ndarray
+    by_held: np.ndarray
 
     @classmethod
     def of(cls, free: InnerConstraintInverse, held: np.ndarray) -> HeldInverse:
         """Hold some unknowns (h,)."""
-        n = len(free.scale)
-        units = np.zeros((n, len(held)))
-        units[held, np.arange(len(held))] = 1.0
-        columns = free.solve(units)
-        return cls(free, held, np.linalg.solve(columns[held].T, columns.T).T, columns)
+        columns = free.solve(_units(len(free.scale), held))
+        return cls(free, held, columns, np.linalg.solve(columns[held].T, columns.T).T)
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         """Return the inverse times right_side (n, r), with zeros for the held unknowns."""
         return self.free.solve(right_side) - self.by_held @ (self.columns.T @ right_side)
 
+    def change_by(self, columns: np.ndarray) -> np.ndarray:
+        """Return the change (n, 1) of all unknowns if some of them (k,) are raised by 1 and held there."""
+        is_held = np.isin(self.held, columns)
+        if is_held.any():
+            return np.asarray(self.by_held[:, is_held].sum(axis=1, keepdims=True))
+        solved = self.solve(_units(len(self.free.scale), columns))
+        return np.asarray(solved @ np.linalg.solve(solved[columns], np.ones((len(columns), 1))))
+
+
+def _units(n: int, columns: np.ndarray) -> np.ndarray:
+    units = np.zeros((n, len(columns)))
+    units[columns, np.arange(len(columns))] = 1.0
+    return units
+
+
+def held_columns(unknowns: Unknowns, priors: Mapping[int, LensPrior]) -> np.ndarray:
+    """Return the columns (h,) of the intrinsics of the lenses that mapping held."""
+    held = [c for i, c in unknowns.lens_columns.items() if i in priors and priors[i].held]
+    return np.concatenate([np.zeros(0, np.int64), *held])
+
 
 class LensScores:
-    """Scores (J^T r) of the fields of each lens, summed over the measurements of a map."""
+    """Sums over the measurements of a map from which the fields of each lens are estimated.
+
+    F are the derivatives of the residuals by the coefficients of the fields, J those by the unknowns, both
+    with the points projected out; r are the residuals.
+    """
 
     def __init__(self, scene: Scene, unknowns: Unknowns):
         self._scene = scene
-        self._sums = {
-            camera_id: np.zeros((unknowns.count, 0)) for camera_id in unknowns.lens_columns
-        }
-        self._measured: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {
-            camera_id: [] for camera_id in unknowns.lens_columns
-        }
+        ids = sorted(unknowns.lens_columns)
+        self.cross = {i: np.zeros((unknowns.count, TERMS)) for i in ids}  # J^T F
+        self.information = {i: np.zeros((TERMS, TERMS)) for i in ids}  # F^T F
+        self.pull = {i: np.zeros(TERMS) for i in ids}  # -F^T r
+        self.noise = {i: np.zeros((TERMS, TERMS)) for i in ids}  # of the pull
+        self.noise_cross = {
+            i: np.zeros((unknowns.count, TERMS)) for i in ids
+        }  # of J^T r and the pull
 
     def add(
         self,
         bundle: LinearizedBundle,
         seen: MapObservations,
         rows: np.ndarray,
-        cluster_of_point: np.ndarray,
+        cluster: np.ndarray,
+        scores: sparse.csr_matrix,
     ) -> None:
-        """Add the linearized measurements of some rows (M,) of `seen`; cluster_of_point (P,)."""
+        """Add linearized measurements.
+
+        Parameters
+        ----------
+        bundle : LinearizedBundle
+        seen : MapObservations
+        rows : ndarray, shape (M,)
+            The linearized rows of `seen`.
+        cluster : ndarray, shape (M,)
+            Cluster of each measurement, 0..C-1.
+        scores : csr_matrix, shape (C, n)
+            Scores J^T r of the clusters.
+        """
         ids = self._scene.camera_ids[seen.image_idx[rows]]
         by_points = bundle.by_points()
-        residuals = bundle.residuals.reshape(-1, 2)
+        clusters = scores.shape[0]
         for camera_id in np.unique(ids).tolist():
             own = np.flatnonzero(ids == camera_id)
-            pixels = seen.pixels[rows[own]]
-            values = field_values(self._scene.cameras[camera_id], pixels)
-            scores = []
+            values = field_values(self._scene.cameras[camera_id], seen.pixels[rows[own]])
+            half = values.shape[1]
+            gather = sparse.csr_matrix(
+                (np.ones(len(own)), (cluster[own], np.arange(len(own)))), (clusters, len(own))
+            )
+            through, cross, pulls = [], [], []
             for component in (0, 1):
                 lines = 2 * own + component
-                through_points = by_points[lines].T @ values
-                scores.append(bundle.design[lines].T @ values - bundle.coupling.T @ through_points)
-            both = np.concatenate(scores, axis=1)
-            self._sums[camera_id] = both + (
-                self._sums[camera_id] if self._sums[camera_id].size else 0.0
-            )
-            self._measured[camera_id].append(
-                (pixels, residuals[own], cluster_of_point[bundle.point[own]])
-            )
-
-    def scaled(self, loss: float) -> np.ndarray:
-        """Return the scores (n, s) of one standard deviation of each field.
-
-        `loss` is the number of residuals over their redundancy after points: the points absorb the rest.
-        """
-        columns = []
-        for camera_id, sums in self._sums.items():
-            pixels, residuals, cluster = (
-                np.concatenate(part) for part in zip(*self._measured[camera_id], strict=True)
-            )
-            size_px = field_px(self._scene.cameras[camera_id], pixels, residuals, cluster)
-            # The square of the field's size is shared among its polynomials.
-            columns.append(sums * size_px * np.sqrt(loss / (sums.shape[1] / 2)))
-        return np.concatenate(columns, axis=1)
+                through.append(by_points[lines].T @ values)
+                cross.append(bundle.design[lines].T @ values)
+                pulls.append(gather @ (-values * bundle.residuals[lines][:, None]))
+            of_points = np.concatenate(through, axis=1)
+            of_clusters = np.concatenate(pulls, axis=1)
+            self.cross[camera_id] += np.concatenate(cross, axis=1) - bundle.coupling.T @ of_points
+            own_part = values.T @ values
+            self.information[camera_id][:half, :half] += own_part
+            self.information[camera_id][half:, half:] += own_part
+            self.information[camera_id] -= of_points.T @ of_points
+            self.pull[camera_id] += of_clusters.sum(axis=0)
+            self.noise[camera_id] += of_clusters.T @ of_clusters
+            self.noise_cross[camera_id] += scores.T @ of_clusters
 
 
 def shared_errors(
     scene: Scene,
     unknowns: Unknowns,
     inverse: HeldInverse,
-    meat: sparse.csr_matrix,
+    sums: LensScores,
     gradient: np.ndarray,
-    fields: np.ndarray,
+    meat: sparse.csr_matrix,
+    noise_factor: float,
     priors: Mapping[int, LensPrior],
-) -> tuple[np.ndarray, dict[int, PrincipalPoint]]:
-    """Propagate the shared errors to the unknowns.
+) -> SharedErrors:
+    """Estimate the errors that measurements of a lens share, and propagate them to the unknowns.
 
     Parameters
     ----------
@@ -178,57 +215,49 @@ def shared_errors(
     unknowns : Unknowns
         The n unknowns.
     inverse : HeldInverse
-    meat : csr_matrix, shape (n, n)
-        Covariance of the gradient by independent clusters of measurements.
+    sums : LensScores
     gradient : ndarray, shape (n,)
         J^T r at the solution.
-    fields : ndarray, shape (n, s)
-        Scores of one standard deviation of each field.
+    meat : csr_matrix, shape (n, n)
+        Covariance of the gradient.
+    noise_factor : float
+        Factor by which the clusters' scores in `sums` underestimate errors; `meat` contains it.
     priors : mapping of int to LensPrior
 
     Returns
     -------
-    effects : ndarray, shape (n, t)
-        Change of the unknowns by one standard deviation of each of t independent errors.
-    principal_points : dict of int to PrincipalPoint
+    SharedErrors
     """
-    columns, held = inverse.columns, inverse.held
-    step = -(columns.T @ gradient)
-    of_fields = columns.T @ fields
-    covariance = columns.T @ (meat @ columns) + of_fields @ of_fields.T
-    prior = np.zeros(len(held))
-    points = {}
-    effects = [inverse.solve(fields)]
-    for camera_id, own in unknowns.lens_columns.items():
-        camera, told = scene.cameras[camera_id], priors.get(camera_id, LensPrior())
-        for name, column in zip(MODELS[camera.model], own.tolist(), strict=True):
-            place = np.flatnonzero(held == column)
-            if name in _PRINCIPAL_POINT:
-                prior[place] = PRINCIPAL_POINT_SIGMA * camera.width
-            elif name[0] == "f" and len(place):
-                prior[place] = told.focal_sigma_px
-        point = [
-            int(np.flatnonzero(held == own[MODELS[camera.model].index(n)])[0])
-            for n in _PRINCIPAL_POINT
-        ]
-        points[camera_id] = PrincipalPoint(step[point], np.sqrt(np.diag(covariance)[point]))
-        if not told.held and told.focal_sigma_px > 0:
-            effects.append(told.focal_sigma_px * _by_focal(camera.model, own, unknowns, inverse))
-    variance = np.diag(prior**2)
-    gain = np.linalg.solve(variance + covariance, variance).T  # of the measurements over the prior
-    expected = gain @ step
-    second_moment = variance - gain @ variance + np.outer(expected, expected)
-    values, vectors = np.linalg.eigh(0.5 * (second_moment + second_moment.T))
-    effects.append(inverse.by_held @ (vectors * np.sqrt(np.maximum(values, 0.0))))
-    return np.concatenate(effects, axis=1), points
-
-
-def _by_focal(
-    model: str, columns: np.ndarray, unknowns: Unknowns, inverse: HeldInverse
-) -> np.ndarray:
-    """Return the change (n, 1) of all unknowns per pixel of a lens's focal length (fx and fy alike)."""
-    focal = [c for c, name in zip(columns.tolist(), MODELS[model], strict=True) if name[0] == "f"]
-    units = np.zeros((unknowns.count, len(focal)))
-    units[focal, np.arange(len(focal))] = 1.0
-    solved = inverse.solve(units)
-    return np.asarray(solved @ np.linalg.solve(solved[focal], np.ones((len(focal), 1))))
+    effects: list[np.ndarray] = []
+    roots: dict[int, np.ndarray] = {}
+    points: dict[int, PrincipalPoint] = {}
+    for camera_id in unknowns.lens_columns:
+        # Minus the change of the unknowns per unit of each coefficient.
+        response = inverse.solve(sums.cross[camera_id])
+        mixed = response.T @ sums.noise_cross[camera_id]
+        noise = noise_factor * (sums.noise[camera_id] + mixed + mixed.T)
+        estimate = estimate_field(
+            scene.cameras[camera_id],
+            sums.information[camera_id] - sums.cross[camera_id].T @ response,
+            sums.pull[camera_id] + response.T @ gradient,
+            noise + response.T @ (meat @ response),
+        )
+        constant = list(CONSTANT)
+        points[camera_id] = PrincipalPoint(
+            estimate.coefficients_px[constant], estimate.covariance[np.ix_(constant, constant)]
+        )
+        roots[camera_id] = estimate.root
+        effects.append(-response @ estimate.root)
+    for camera_id, prior in priors.items():
+        if prior.focal_sigma_px > 0 and camera_id in unknowns.lens_columns:
+            names = estimated_names(scene.cameras[camera_id])
+            columns = unknowns.lens_columns[camera_id]
+            focal = [c for c, name in zip(columns.tolist(), names, strict=True) if name[0] == "f"]
+            effects.append(prior.focal_sigma_px * inverse.change_by(np.array(focal)))
+    together = np.concatenate(effects, axis=1)
+    fields, first = {}, 0
+    for camera_id, root in roots.items():
+        fields[camera_id] = np.zeros((TERMS, together.shape[1]))
+        fields[camera_id][:, first : first + root.shape[1]] = root
+        first += root.shape[1]
+    return SharedErrors(together, fields, points)

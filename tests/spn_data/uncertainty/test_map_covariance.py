@@ -29,7 +29,6 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance, MapCovarianceOptions
-from spn_data.uncertainty.shared_errors import held_columns
 from tests.worlds.native_world import native_model
 
 EXACT = MapCovarianceOptions(exact_lenses=True)
@@ -184,13 +183,9 @@ def test_moving_turning_and_scaling_the_world_changes_no_residual() -> None:
 
 
 def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np.ndarray:
-    """Return the covariance of all unknowns, points last, under the seven inner constraints.
-
-    Principal points are held: their rows and columns are zero.
-    """
+    """Return the covariance of all unknowns, points last, under the seven inner constraints."""
     unknowns, bundle = linearized(scene, seen)
     n, p = bundle.design.shape[1], 3 * len(scene.points)
-    free = np.setdiff1d(np.arange(n + p + 7), held_columns(unknowns, scene, {}))
     by_point = np.zeros((bundle.design.shape[0], p))
     for row, (k, j) in enumerate(zip(seen.image_idx, seen.point_idx, strict=True)):
         camera = scene.cameras[int(scene.camera_ids[k])]
@@ -203,13 +198,9 @@ def dense_covariance(scene: Scene, seen: MapObservations, sigma_px: float) -> np
     frames = np.arange(POSE * len(scene.names)).reshape(-1, POSE)[:, :3].ravel()
     conditions[frames] = gauge[frames]
     bordered = np.block([[full.T @ full, conditions], [conditions.T, np.zeros((7, 7))]])
-    bordered = bordered[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(bordered)), 1e-6))
-    inverse = np.zeros((n + p + 7, n + p + 7))
-    inverse[np.ix_(free, free)] = np.linalg.pinv(bordered * scale[:, None] * scale, rcond=1e-15)
-    inverse[free] *= scale[:, None]
-    inverse[:, free] *= scale
-    return sigma_px**2 * inverse[: n + p, : n + p]
+    inverse = np.linalg.pinv(bordered * scale[:, None] * scale, rcond=1e-15)
+    return sigma_px**2 * (inverse * scale[:, None] * scale)[: n + p, : n + p]
 
 
 def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
@@ -236,7 +227,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
                 wanted.by_lens @ unknowns.lens_jacobian[camera_id]
             )
         expected = row @ dense @ row.T
-        found = covariance.functional_covariances([wanted])[0]
+        found = covariance.functional_covariances([wanted])[0].measured
         assert np.allclose(found, expected, rtol=0, atol=1e-4 * np.trace(expected))
 
 
@@ -246,15 +237,14 @@ def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
     whole = small(8, 60)
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
     found = MapCovariance.of(made.scene, made.seen, EXACT).pose_covariances()
-    unknowns, bundle = linearized(made.scene, made.seen)
+    _, bundle = linearized(made.scene, made.seen)
     design, residuals = bundle.design.toarray(), bundle.residuals
     n = design.shape[1]
     pulls = np.zeros((60, n))
     for row, point in enumerate(np.repeat(bundle.point, 2)):
         pulls[point] += design[row] * residuals[row]
     freedom = len(residuals) - 180
-    estimated = n - len(held_columns(unknowns, made.scene, {}))
-    pull = pulls.T @ pulls * freedom / (freedom - estimated + 7)
+    pull = pulls.T @ pulls * freedom / (freedom - n + 7)
     covariance = MapCovariance.of(made.scene, made.seen, INDEPENDENT)
     inverse = dense_covariance(made.scene, made.seen, 1.0)[:n, :n]
     expected = inverse @ pull @ inverse
@@ -289,7 +279,7 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
         for seed in range(8):
             wanted = some_functional(made.scene, seed=seed)
             value = np.einsum("rki,ki->r", wanted.by_points, point_errors[wanted.point_idx])
-            spread = covariance.functional_covariances([wanted])[0]
+            spread = covariance.functional_covariances([wanted])[0].measured
             told["points"].append(scores(value[None], spread[None]))
     mean = {name: float(np.mean(values)) for name, values in told.items()}
     assert mean["poses"] / 6 == pytest.approx(1, abs=0.35)
@@ -322,8 +312,8 @@ def test_a_similarity_moves_covariances_with_the_map() -> None:
     assert wanted.by_lens is not None
     same = replace(wanted, by_points=wanted.by_points @ turn.T / 7)
     assert np.allclose(
-        after.functional_covariances([same])[0],
-        before.functional_covariances([wanted])[0],
+        after.functional_covariances([same])[0].measured,
+        before.functional_covariances([wanted])[0].measured,
         rtol=1e-5,
     )
     assert after.sigma_px == pytest.approx(before.sigma_px, rel=1e-6)
@@ -340,8 +330,8 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
     assert np.allclose(in_pieces.pose_covariances(), at_once.pose_covariances(), rtol=1e-6)
     wanted = some_functional(made.scene, 1)
     assert np.allclose(
-        in_pieces.functional_covariances([wanted])[0],
-        at_once.functional_covariances([wanted])[0],
+        in_pieces.functional_covariances([wanted])[0].measured,
+        at_once.functional_covariances([wanted])[0].measured,
         rtol=1e-6,
     )
 
