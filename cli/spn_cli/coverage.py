@@ -35,7 +35,7 @@ _SHOWN_STOPS = 20
 @click.option(
     "--fov",
     "fov_deg",
-    type=options.Finite(5, 170),
+    type=options.FieldOfView(),
     metavar="DEG",
     help="Horizontal field of view in degrees, instead of --camera.",
 )

@@ -34,6 +34,7 @@ def main(verbose: bool) -> None:
 @options.overwrite
 @options.fov
 @options.camera
+@options.fixed_lens
 @click.option(
     "--frames",
     "target_count",

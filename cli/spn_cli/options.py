@@ -61,13 +61,37 @@ class Finite(click.FloatRange):
         return number
 
 
+_WIDEST_DEG = 170.0
+
+
+class FieldOfView(Finite):
+    """Horizontal field of view in degrees, from a telephoto lens to the widest without a fisheye model."""
+
+    def __init__(self) -> None:
+        super().__init__(0.2)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the angle; fail if it is out of bounds, with what to do about a fisheye lens."""
+        angle = super().convert(value, param, ctx)
+        if angle > _WIDEST_DEG:
+            self.fail(
+                f"{angle:g} is above {_WIDEST_DEG:g} degrees, which needs a fisheye model; --camera takes "
+                "none either: render the images as those of a pinhole first",
+                param,
+                ctx,
+            )
+        return angle
+
+
 class PerSequence(click.ParamType[tuple[str, float]]):
     """Number for all sequences (`VALUE`) or one (`SEQUENCE=VALUE`), as ("*" or the sequence, value)."""
 
     name = "[SEQUENCE=]VALUE"
 
-    def __init__(self, low: float, high: float):
-        self._low, self._high = low, high
+    def __init__(self, number: Finite):
+        self._number = number
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -77,12 +101,10 @@ class PerSequence(click.ParamType[tuple[str, float]]):
             return value
         sequence, _, number = str(value).rpartition("=")
         try:
-            parsed = float(number)
+            float(number)
         except ValueError:
             self.fail(f"{number!r} is not a number", param, ctx)
-        if not self._low <= parsed <= self._high:
-            self.fail(f"{parsed:g} is not between {self._low:g} and {self._high:g}", param, ctx)
-        return sequence or "*", parsed
+        return sequence or "*", self._number.convert(number, param, ctx)
 
 
 class FilePerSequence(click.ParamType[tuple[str, str]]):
@@ -112,9 +134,14 @@ camera = click.option(
 fov = click.option(
     "--fov",
     "fov_deg",
-    type=PerSequence(5, 170),
+    type=PerSequence(FieldOfView()),
     multiple=True,
     help="Horizontal field of view in degrees, as initial value.",
+)
+fixed_lens = click.option(
+    "--fixed-lens",
+    is_flag=True,
+    help="Hold the lens of --camera, and focal lengths of --fov or photo metadata.",
 )
 
 
@@ -143,7 +170,7 @@ _GEOREGISTRATION = (
     click.option(
         "--time-offset",
         "time_offset_s",
-        type=PerSequence(-4e8, 4e8),
+        type=PerSequence(Finite(-4e8, 4e8)),
         multiple=True,
         help="Seconds to add to telemetry times.  [default: estimated]",
     ),

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @click.option(
     "--fov",
     "fov_deg",
-    type=options.Finite(5, 170),
+    type=options.FieldOfView(),
     help="Horizontal field of view in degrees, as initial value.",
 )
 @click.option(

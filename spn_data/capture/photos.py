@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from spn_data.capture.photo_lens import StatedFocal, stated_focal
 from spn_data.errors import InputError
 from spn_data.media.photo_file import DAMAGE, develop, is_raw, open_photo
 from spn_data.telemetry.exif import PhotoMetadata, read_photo
@@ -20,7 +21,6 @@ from spn_data.telemetry.exif import PhotoMetadata, read_photo
 _MIN_RANGE_16 = 64 * 256  # of 16-bit values: a quarter of the grey levels
 _MAX_ASPECT_ERROR = 0.01  # tolerated relative difference between aspect ratios of mask and image
 _ORIENTATION = 0x0112
-_DIAGONAL_35MM = 43.267
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -72,15 +72,10 @@ class PhotoHeaders:
             for m in self.metadata
         )
 
-    def focal_px(self, row: int) -> float | None:
-        """Return the focal length of the upright photo in pixels, or None if the EXIF states none.
-
-        Derived from the 35 mm equivalent, which compares diagonals (CIPA DCG-001).
-        """
+    def focal(self, row: int) -> tuple[StatedFocal | None, str]:
+        """Return the focal length that the metadata of a photo state, and a note if they contradict."""
         metadata = self.metadata[row]
-        if metadata is None or not metadata.focal_35mm > 0:
-            return None
-        return float(metadata.focal_35mm / _DIAGONAL_35MM * np.hypot(*self.sizes[row]))
+        return (None, "") if metadata is None else stated_focal(metadata)
 
 
 def read_headers(paths: Sequence[Path]) -> PhotoHeaders:

@@ -6,8 +6,11 @@ expensive iterations over all measurements start close to the solution.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from spn_data.colmap import pycolmap
 from spn_data.colmap.clean import drop_out_of_view, drop_outliers, residual_sigma_px
+from spn_data.geometry.initial_lens import Hold
 
 _LONG_TRACKS = 100  # per image, used to adjust the cameras first
 # Ceres starts with a radius of 1e4. With that damping, the doming of a model hardly changes per iteration: a
@@ -33,7 +36,13 @@ _CONVERGED_POINTS = 1e-2  # points alone: good enough to detect outliers
 _CONVERGED_ALL = 3e-5  # all measurements
 
 
-def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, threads: int) -> int:
+def adjust(
+    native: pycolmap.Reconstruction,
+    *,
+    refine_principal_point: bool,
+    threads: int,
+    held: Mapping[int, Hold] | None = None,
+) -> int:
     """Refine cameras, poses and points in place.
 
     Parameters
@@ -43,6 +52,8 @@ def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, thr
         Whether to estimate the principal points too.
     threads : int
         Number of solver threads.
+    held : mapping of int to Hold, optional
+        What is not changed of a camera, by COLMAP's id.
 
     Returns
     -------
@@ -50,12 +61,14 @@ def adjust(native: pycolmap.Reconstruction, *, refine_principal_point: bool, thr
         Number of measurements that were deleted as outliers.
     """
     dropped = drop_out_of_view(native)
-    adjust_long_tracks(native, threads=threads, refine_principal_point=refine_principal_point)
+    adjust_long_tracks(
+        native, threads=threads, refine_principal_point=refine_principal_point, held=held
+    )
     dropped += drop_out_of_view(native) + drop_outliers(native)
     # Keep the remaining outliers from bending the model.
     options = _options(threads, _CAUCHY * residual_sigma_px(native), _CONVERGED_ALL)
     options.refine_principal_point = refine_principal_point
-    pycolmap.bundle_adjustment(native, options)
+    _solve(native, options, held or {})
     return dropped
 
 
@@ -66,6 +79,7 @@ def adjust_long_tracks(
     refine_intrinsics: bool = True,
     refine_principal_point: bool = False,
     cost_tolerance: float = _CONVERGED,
+    held: Mapping[int, Hold] | None = None,
 ) -> None:
     """Refine cameras and poses in place from the longest tracks only, then adjust the points.
 
@@ -78,6 +92,8 @@ def adjust_long_tracks(
         Which intrinsics to estimate: focal length and distortion, principal point.
     cost_tolerance : float
         Relative decrease of the cost at which the adjustment of the cameras stops.
+    held : mapping of int to Hold, optional
+        What is not changed of a camera, by COLMAP's id.
     """
     for radius in (_LARGE_RADIUS, _SMALL_RADIUS):
         few = _with_long_tracks(native)
@@ -85,13 +101,50 @@ def adjust_long_tracks(
         options.ceres.solver_options.initial_trust_region_radius = radius
         options.refine_focal_length = options.refine_extra_params = refine_intrinsics
         options.refine_principal_point = refine_principal_point
-        pycolmap.bundle_adjustment(few, options)
+        _solve(few, options, held or {})
         # Points behind a camera do not contribute to the cost: too long a step may move all of them there.
         if drop_out_of_view(few) < _MAX_OUT_OF_VIEW * few.compute_num_observations():
             _copy_cameras(few, native)
             break
     del few
     _adjust_points(native, threads)
+
+
+def _solve(
+    native: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    held: Mapping[int, Hold],
+) -> None:
+    """Run one bundle adjustment that keeps what is held.
+
+    COLMAP holds the focal length of all cameras or of none. If some are free, distortion of those whose focal
+    length is held is estimated first, with all focal lengths held.
+    """
+    focal = {i for i, hold in held.items() if hold is Hold.FOCAL}
+    lens = {i for i, hold in held.items() if hold is Hold.LENS}
+    if focal and options.refine_focal_length:
+        options.refine_focal_length = False
+        _run(native, options, lens)
+        options.refine_focal_length = True
+        if not set(native.cameras) - held.keys():
+            return
+    _run(native, options, lens | focal)
+
+
+def _run(
+    native: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions, constant: set[int]
+) -> None:
+    """Run one bundle adjustment in which the intrinsics of some cameras are constant."""
+    if not constant:
+        pycolmap.bundle_adjustment(native, options)
+        return
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in native.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant & set(native.cameras):
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, native).solve()
 
 
 def _options(

@@ -134,6 +134,13 @@ class MapDatabase:
         self._native.write_frame(frame, use_frame_id=True)
         return image_id
 
+    def cameras_of(self, keys: Mapping[str, str]) -> dict[str, int]:
+        """Return COLMAP's id of each camera, given the keys of the cameras by image name."""
+        return {
+            key: int(self._native.read_image_with_name(name).camera_id)
+            for key, name in {key: name for name, key in keys.items()}.items()
+        }
+
     def has_features(self, name: str) -> bool:
         """Return whether features of an image are stored."""
         # Descriptors are written after the keypoints.

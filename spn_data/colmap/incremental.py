@@ -11,6 +11,8 @@ import contextlib
 from spn_data.colmap import pycolmap
 from spn_data.colmap.adjust import adjust_long_tracks
 from spn_data.colmap.job import MappingJob
+from spn_data.colmap.lens_limits import fit_to_lenses
+from spn_data.geometry.initial_lens import Hold
 from spn_data.work import child
 
 _MAX_IMAGES_COLMAP = 1000  # up to which COLMAP's own bundle adjustment uses a direct solver
@@ -24,6 +26,11 @@ def map_incrementally(job: MappingJob) -> dict[int, pycolmap.Reconstruction]:
     options = _pipeline_options(job)
     with contextlib.closing(pycolmap.Database.open(job.database)) as database:
         images = database.num_images()
+        cameras = database.read_all_cameras()
+    fit_to_lenses(options, cameras)
+    fit_to_lenses(options.mapper, cameras)
+    fit_to_lenses(options.triangulation, cameras)
+    _hold(options, dict(job.held), {camera.camera_id for camera in cameras})
     run = _map_small if images <= _MAX_IMAGES_COLMAP else _map_large
     return run(job, options)
 
@@ -37,9 +44,6 @@ def _pipeline_options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     )
     options.min_model_size = job.min_model_size
     options.extract_colors = False  # `refine` extracts them once
-    # A field of view of 127 degrees: shorter focal lengths only fit the noise of a weak geometry.
-    for part in (options, options.mapper, options.triangulation):
-        part.min_focal_length_ratio = 0.25
     if job.hold_intrinsics:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = False
@@ -53,27 +57,40 @@ def _pipeline_options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
+def _hold(
+    options: pycolmap.IncrementalPipelineOptions, held: dict[int, Hold], cameras: set[int]
+) -> None:
+    """Keep held lenses, and the focal lengths if all cameras hold theirs; else distortion has to wait too."""
+    if held.keys() == cameras:
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+        constant = {i for i, hold in held.items() if hold == Hold.LENS}
+    else:
+        constant = set(held)
+    options.constant_cameras = options.mapper.constant_cameras = constant
+
+
 class _ProgressCounter:
-    """Number of registered images, reported to the parent process."""
+    """Number of images in the largest sub-model so far, reported to the parent process."""
 
     def __init__(self, job: MappingJob):
-        # The mapper announces an initial pair even if it continues from a model.
-        self._initial = 0 if job.start_from else 2
-        self._registered = 0
+        self._continued = 0  # images of the model from which the mapper continues
         if job.start_from:
-            self._registered = pycolmap.Reconstruction(job.start_from).num_reg_images()
+            self._continued = pycolmap.Reconstruction(job.start_from).num_reg_images()
+        self._current = self._largest = 0
 
     def initial(self) -> None:
-        """Count the initial pair."""
-        self._report(self._initial)
+        """Count the initial pair of a sub-model; the mapper announces one for a continued model too."""
+        self._current, self._continued = self._continued or 2, 0
+        self._report()
 
     def next(self) -> None:
         """Count one more image."""
-        self._report(1)
+        self._current += 1
+        self._report()
 
-    def _report(self, new: int) -> None:
-        self._registered += new
-        child.send({"registered": self._registered})
+    def _report(self) -> None:
+        self._largest = max(self._largest, self._current)
+        child.send({"registered": self._largest})
 
 
 def _map_small(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from spn_data.geometry.initial_lens import Hold
+
 
 @dataclass(frozen=True, kw_only=True)
 class MappingJob:
@@ -31,6 +33,8 @@ class MappingJob:
         Sub-models with fewer images are dropped.
     hold_intrinsics : bool
         Keep intrinsics fixed and leave their refinement to the final bundle adjustment.
+    held : tuple of (int, Hold)
+        Cameras whose focal length or lens is never changed, by COLMAP's id.
     start_from : str
         Folder of a model to continue from; empty to start from scratch.
     """
@@ -45,4 +49,5 @@ class MappingJob:
     snapshot_every: int = 20
     min_model_size: int = 10
     hold_intrinsics: bool = False
+    held: tuple[tuple[int, Hold], ...] = ()
     start_from: str = ""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.colmap.job import MappingJob
+from spn_data.geometry.initial_lens import Hold
 from spn_data.work import child
 
 
@@ -24,7 +25,7 @@ def run_mapping(job: MappingJob, *, log: Path, progress: Callable[[int], None]) 
     log : Path
         Log file of the child process.
     progress : callable
-        Called with the number of registered images.
+        Called with the number of images in the largest sub-model so far.
 
     Returns
     -------
@@ -98,6 +99,7 @@ def refine(
     positions: Mapping[str, Sequence[float]],
     camera_model: str,
     refine_principal_point: bool,
+    held: Mapping[int, Hold],
     threads: int,
     log: Path,
 ) -> dict[str, Any]:
@@ -114,6 +116,8 @@ def refine(
     camera_model : str
         COLMAP's camera model.
     refine_principal_point : bool
+    held : mapping of int to Hold
+        What is not changed of a camera, by COLMAP's id.
     threads : int
     log : Path
         Log file of the child process.
@@ -133,6 +137,7 @@ def refine(
         "positions": {name: list(position) for name, position in positions.items()},
         "camera_model": camera_model,
         "refine_principal_point": refine_principal_point,
+        "held": list(held.items()),
         "threads": threads,
     }
     child.run_child(__name__, job, log=log, on_event=result.update)
@@ -160,11 +165,7 @@ def _map(job: MappingJob) -> None:
 
     pycolmap.set_random_seed(job.seed)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.INFO.value
-    if job.engine == "global":
-        options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=job.seed)
-        models = pycolmap.global_mapping(job.database, job.images, job.output, options)
-    else:
-        models = map_incrementally(job)
+    models = _map_globally(job) if job.engine == "global" else map_incrementally(job)
     # The mapper's own names depend on whether it continued from a model.
     folders = []
     for rank, i in enumerate(sorted(models, key=lambda i: (-models[i].num_reg_images(), i))):
@@ -174,8 +175,27 @@ def _map(job: MappingJob) -> None:
     child.send({"models": folders})
 
 
+def _map_globally(job: MappingJob) -> Any:
+    from spn_data.colmap import pycolmap
+    from spn_data.colmap.lens_limits import fit_to_lenses
+
+    options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=job.seed)
+    with contextlib.closing(pycolmap.Database.open(job.database)) as database:
+        cameras = database.read_all_cameras()
+    fit_to_lenses(options.mapper.retriangulation, cameras)
+    if (
+        job.held
+    ):  # the mapper knows only all cameras or none; what it holds too much is adjusted later
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = all(
+            hold == Hold.FOCAL for _, hold in job.held
+        )
+    return pycolmap.global_mapping(job.database, job.images, job.output, options)
+
+
 def _triangulate(source: str, target: str, database: str) -> None:
     from spn_data.colmap import pycolmap
+    from spn_data.colmap.lens_limits import fit_to_lenses
     from spn_data.colmap.model import write_native
 
     posed, model = pycolmap.Reconstruction(source), pycolmap.Reconstruction()
@@ -188,12 +208,17 @@ def _triangulate(source: str, target: str, database: str) -> None:
         model.frames[frame_id].rig_from_world = posed.frames[frame_id].rig_from_world
         model.register_frame(frame_id)
     mapper = pycolmap.IncrementalMapper(cache)
-    options = pycolmap.IncrementalTriangulatorOptions()
+    options, filtering = (
+        pycolmap.IncrementalTriangulatorOptions(),
+        pycolmap.IncrementalMapperOptions(),
+    )
+    for limited in (options, filtering):
+        fit_to_lenses(limited, model.cameras.values())
     mapper.begin_reconstruction(model)
     for image_id in sorted(model.reg_image_ids()):
         mapper.triangulate_image(options, image_id)
     mapper.complete_and_merge_tracks(options)
-    mapper.filter_points(pycolmap.IncrementalMapperOptions())
+    mapper.filter_points(filtering)
     mapper.end_reconstruction(False)
     write_native(model, Path(target))
 
@@ -205,6 +230,7 @@ def _refine(
     positions: dict[str, list[float]],
     camera_model: str,
     refine_principal_point: bool,
+    held: list[tuple[int, Hold]],
     threads: int,
 ) -> None:
     from spn_data.colmap import pycolmap
@@ -214,11 +240,15 @@ def _refine(
     from spn_data.colmap.model import upgrade_camera, write_native
 
     model = pycolmap.Reconstruction(source)
-    for camera in model.cameras.values():
-        upgrade_camera(camera, camera_model)
+    holds = {camera_id: Hold(hold) for camera_id, hold in held}
+    for camera_id, camera in model.cameras.items():
+        if holds.get(camera_id) is not Hold.LENS:
+            upgrade_camera(camera, camera_model)
     before = model.compute_mean_reprojection_error()
     bend_m = correct_doming(model, positions)
-    dropped = adjust(model, refine_principal_point=refine_principal_point, threads=threads)
+    dropped = adjust(
+        model, refine_principal_point=refine_principal_point, held=holds, threads=threads
+    )
     dropped += drop_without_depth(model)
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(images, threads)

@@ -110,6 +110,7 @@ def sample_frames(
     *,
     rate_hz: float,
     fov_deg: float | None,
+    fixed_lens: bool,
     any_telemetry: bool,
     time_offset_s: float | None,
 ) -> SampledSequence:
@@ -127,6 +128,8 @@ def sample_frames(
         Frames per second to sample from a video; all photos are used.
     fov_deg : float or None
         Horizontal field of view, if known.
+    fixed_lens : bool
+        Whether to hold the lens that is given.
     any_telemetry : bool
         Whether to accept telemetry whose duration does not match the video.
     time_offset_s : float or None
@@ -175,7 +178,8 @@ def sample_frames(
             path=source.parts[0].parent,
         )
     fov = {} if fov_deg is None else {"*": fov_deg}
-    lenses = start_lenses(frames, candidates.photos, fov, {} if given is None else {"*": given})
+    cameras = {} if given is None else {"*": given}
+    lenses, notes = start_lenses(frames, candidates.photos, fov, cameras, fixed=fixed_lens)
     # There is only one lens; its key is the name of the sequence.
     frames = replace(frames, cameras=frames.sequences)
     write_frames(folder / FRAMES_TABLE, frames)
@@ -185,7 +189,7 @@ def sample_frames(
         folder / STORED / source.sequence,
         progress=lambda done: progress("frames", done, int(frames.chosen.sum())),
     )
-    return SampledSequence(frames, track, lenses[keys[0]], list(candidates.notes))
+    return SampledSequence(frames, track, lenses[keys[0]], [*candidates.notes, *notes])
 
 
 def _sampled(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from spn_data.capture.sources import Source
 from spn_data.errors import StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
-from spn_data.geometry.initial_lens import InitialLens
+from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.inputs.area_labels import read_geo, read_world_from_model
 from spn_data.inputs.evaluation_source import find_source, sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
@@ -150,6 +150,7 @@ def _register(
             progress,
             rate_hz=options.register.rate_hz,
             fov_deg=options.fov_deg,
+            fixed_lens=options.register.hold_lens,
             any_telemetry=options.any_telemetry,
             time_offset_s=options.time_offset_s,
         )
@@ -158,7 +159,7 @@ def _register(
         _frames_to_match(work.path / STORED, chosen, sampled.lens),
         work.path,
         area.folder(MODEL),
-        options.register,
+        replace(options.register, hold_lens=sampled.lens.hold is Hold.LENS),
         progress,
         dispatch=dispatch,
         stopwatch=stopwatch,
@@ -279,7 +280,8 @@ def lens_notes(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
                 f"its estimated focal length is {camera.focal_px[0]:.0f} px, that of {key} (same image size) "
                 f"is {lens.focal_px[0]:.0f} px. If both are the same lens, one of them is wrong, and "
                 f"with it heights by about {abs(difference):.0%}: a flight at one height with one viewing "
-                "direction hardly determines the focal length. Map from two heights, or give --camera"
+                "direction hardly determines the focal length. Map from two heights, or hold a calibrated "
+                "lens with --camera and --fixed-lens"
             ]
     return []
 

@@ -57,6 +57,8 @@ class FramesOptions:
         Horizontal field of view by sequence; "*" for all.
     camera_files : mapping of str to str
         Files of calibrated cameras (`camera_file`) by sequence; "*" for all.
+    fixed_lens : bool
+        Hold the focal lengths that are given or stated by metadata, and given cameras wholly.
     mask : str or None
         An image, or a folder of `<sequence>.png`.
     any_telemetry : bool
@@ -67,6 +69,7 @@ class FramesOptions:
     fov_deg: Mapping[str, float] = field(default_factory=dict)
     camera_files: Mapping[str, str] = field(default_factory=dict)
     mask: str | None = None
+    fixed_lens: bool = False
     any_telemetry: bool = False
 
 
@@ -217,6 +220,8 @@ def choose_frames(
     # Masks and cameras are identified by their content, not by their path.
     given = {name: read_camera(Path(path)) for name, path in options.camera_files.items()}
     made_with = asdict(replace(options, mask=None, camera_files={}))
+    if not options.fixed_lens:
+        del made_with["fixed_lens"]  # unknown to earlier versions, whose results are equal
     made_with["cameras"] = {name: camera_to_json(camera) for name, camera in given.items()}
     work = area.begin(FRAMES, made_with, inputs, overwrite=overwrite)
     if isinstance(work, StageRecord):
@@ -243,7 +248,9 @@ def choose_frames(
         frames = _frames_with_telemetry(one, track, choice)
         if stored is not None:
             write_track(work.path / TELEMETRY / f"{one.source.sequence}.csv", stored)
-        lenses.update(start_lenses(frames, one.photos, options.fov_deg, given))
+        fixed = options.fixed_lens
+        own, doubts = start_lenses(frames, one.photos, options.fov_deg, given, fixed=fixed)
+        lenses, notes = lenses | own, notes + doubts
         if one.source.sequence in masks:
             write_mask(masks[one.source.sequence], frames, work.path / MASKS)
         elif masks:

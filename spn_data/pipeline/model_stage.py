@@ -155,7 +155,8 @@ def _focal_notes(scene: Scene, frames: FramesToMap) -> list[str]:
         f"camera {change.camera}: the focal length was estimated as {change.estimated_px:.0f} px, "
         f"{change.estimated_px / change.known_px - 1:+.0%} from the known {change.known_px:.0f} px. "
         "A flight at one height with one viewing direction hardly determines it, and heights have the same "
-        "relative error; or the video is cropped. Give a calibrated lens with --camera"
+        "relative error; or the video is cropped. --camera gives a calibrated lens to start from, "
+        "and --fixed-lens holds it"
         for change in focal_changes(scene, frames, _FOCAL_CHANGE)
     ]
 

@@ -105,11 +105,11 @@ class Chance:
     most_missing: float
 
 
-def attempts(options: ReconstructOptions) -> list[Attempt]:
+def attempts(options: ReconstructOptions, *, focal_is_known: bool) -> list[Attempt]:
     """Return the attempts in order: as configured, with fixed intrinsics, with more features and wider pairs.
 
     Poses from all features take four times as long and have the same accuracy; all features are used only if
-    the first attempt fails.
+    the first attempt fails. Intrinsics are not fixed where a focal length is a guess.
     """
     features, pairs = options.features, options.pairs
     more = replace(
@@ -120,7 +120,7 @@ def attempts(options: ReconstructOptions) -> list[Attempt]:
     incremental = options.engine == "incremental"
     first = Attempt("first", "", "database.db", features, pairs, more, thinned=incremental)
     ladder = [first]
-    if incremental:
+    if incremental and focal_is_known:
         why = "intrinsics held until the end"
         ladder.append(replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False))
     why = "more features, wider pairs"

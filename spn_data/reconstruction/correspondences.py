@@ -11,7 +11,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, match_pairs
-from spn_data.geometry.initial_lens import InitialLens
+from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.matching.features import FeatureOptions, Features, extract_from_bytes
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_data.matching.putative import MatchOptions
@@ -46,6 +46,14 @@ class FramesToMap:
     positions_m: np.ndarray
     lenses: dict[str, InitialLens]
     masks: dict[str, Path]
+
+
+def held_cameras(database: Path, frames: FramesToMap) -> dict[int, Hold]:
+    """Return what an adjustment may not change of the cameras, by their ids in a database of the frames."""
+    with MapDatabase.open(database) as opened:
+        ids = opened.cameras_of(dict(zip(frames.names, frames.cameras.tolist(), strict=True)))
+    holds = {ids[key]: lens.hold for key, lens in frames.lenses.items()}
+    return {i: hold for i, hold in holds.items() if hold is not Hold.NOTHING}
 
 
 def extract_missing(

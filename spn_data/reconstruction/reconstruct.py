@@ -23,6 +23,7 @@ from spn_data.reconstruction.correspondences import (
     FramesToMap,
     appearance_of,
     extract_missing,
+    held_cameras,
     match_missing,
 )
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
@@ -177,7 +178,7 @@ def reconstruct(
         raise StageError(
             failure_message(work, len(frames.names), 0 if best is None else best.registered, notes)
         )
-    refined = _refine(run, best.model, notes)
+    refined = _refine(run, best, notes)
     scene, observations, points = read_map(refined)
     with MapDatabase.open(work / best.database) as database:
         registrations = diagnose(database, frames, scene, observations)
@@ -201,7 +202,8 @@ def _best_attempt(run: _Run, notes: list[str]) -> _Candidate | None:
     """Return the first attempt that is good enough, otherwise the best of all."""
     options = run.options
     best: _Candidate | None = None
-    for attempt in attempts(options):
+    known = all(lens.focal_is_known for lens in run.frames.lenses.values())
+    for attempt in attempts(options, focal_is_known=known):
         found = _try(run if attempt.name == "first" else run.named(attempt.name), attempt, notes)
         if found is None:
             continue
@@ -289,6 +291,7 @@ def _map(
     n = len(run.frames.names)
     with run.stopwatch.step("mapping"):
         database = run.work / (chance or attempt).database
+        held = held_cameras(database, run.frames)
         # Frames that are missing then get a second chance with all features.
         if attempt.thinned and chance is None:
             thinned = folder / "thinned.db"
@@ -306,13 +309,14 @@ def _map(
             snapshot_every=max(3, n // 10),
             min_model_size=10 if n >= 30 else 3,
             hold_intrinsics=attempt.hold_intrinsics,
+            held=tuple(held.items()),
             start_from="" if snapshot is None else str(snapshot),
         )
         run.progress("mapping", 0 if snapshot is None else count_registered(snapshot), n)
         models = run_mapping(
             job,
             log=run.work / "mapping.log",
-            progress=lambda registered: run.progress("mapping", min(registered, n), n),
+            progress=lambda registered: run.progress("mapping", registered, n),
         )
     saved_models.write_submodels(folder, models)
     return models
@@ -375,18 +379,19 @@ def _without_misplaced(run: _Run, database: str, model: Path, notes: list[str]) 
     return target
 
 
-def _refine(run: _Run, model: Path, notes: list[str]) -> Path:
+def _refine(run: _Run, best: _Candidate, notes: list[str]) -> Path:
     target, frames, options = run.work / "refined", run.frames, run.options
     run.progress("refinement", 0, 1)
     known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
     with run.stopwatch.step("refinement"):
         done = refine(
-            model,
+            best.model,
             target,
             images=frames.folder,
             positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
             camera_model=options.camera_model,
             refine_principal_point=options.refine_principal_point,
+            held=held_cameras(run.work / best.database, frames),
             threads=options.threads,
             log=run.work / "mapping.log",
         )

@@ -40,6 +40,8 @@ class DroneXmp:
     utc_at_exposure: str = ""
     invalid_fix: bool = False
     unused_angles: bool = False
+    calibrated_focal_px: float = NAN
+    calibrated_center_px: tuple[float, float] = (NAN, NAN)
 
 
 def read_drone_xmp(xmp: Mapping[str, str]) -> DroneXmp:
@@ -86,6 +88,11 @@ def read_drone_xmp(xmp: Mapping[str, str]) -> DroneXmp:
         utc_at_exposure=xmp.get(_DJI + "UTCAtExposure", ""),
         invalid_fix=text(xmp.get(_DJI + "GpsStatus")).lower() == "invalid",
         unused_angles=not stated and any(space + "Pitch" in xmp for space in _PIX4D),
+        calibrated_focal_px=positive(xmp.get(_DJI + "CalibratedFocalLength")),
+        calibrated_center_px=(
+            positive(xmp.get(_DJI + "CalibratedOpticalCenterX")),
+            positive(xmp.get(_DJI + "CalibratedOpticalCenterY")),
+        ),
     )
 
 

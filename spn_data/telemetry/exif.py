@@ -31,6 +31,15 @@ from spn_data.telemetry.track import Telemetry
 
 _MAKE, _MODEL, _ORIENTATION = 271, 272, 274
 _FOCAL_MM, _FOCAL_35MM, _LENS_MODEL = 37386, 41989, 42036
+_ORIGINAL_WIDTH, _ORIGINAL_HEIGHT = 40962, 40963
+_FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
+_UNITS_MM = {
+    2.0: 25.4,
+    3.0: 10.0,
+    4.0: 1.0,
+    5.0: 0.001,
+}  # inch by default; 4 and 5 are common extensions
+_MAX_SIDE_PX = 1_000_000
 _GPS_LAT, _GPS_LON, _GPS_ALT_REF, _GPS_ALT = 2, 4, 5, 6
 _GPS_MEASURE_MODE, _GPS_DOP, _GPS_H_ERROR = 10, 11, 31
 _XMP = 700
@@ -53,6 +62,13 @@ class PhotoMetadata:
         Camera and lens.
     focal_mm, focal_35mm : float
         Focal length and its 35 mm equivalent.
+    focal_plane_px_per_mm : float
+        Pixels of the original image per millimetre of the sensor.
+    original_size : (int, int) or None
+        Width and height that the camera wrote, as stored.
+    calibrated_focal_px : float
+    calibrated_center_px : tuple of float
+        Focal length and principal point (x, y) in pixels of the original image, by the drone's calibration.
     local_s, utc_s : float
         Time of exposure in seconds since 1970, on the camera's clock of unknown time zone, and in UTC
         (only if the photo states the zone).
@@ -87,6 +103,10 @@ class PhotoMetadata:
     lens: str = ""
     focal_mm: float = NAN
     focal_35mm: float = NAN
+    focal_plane_px_per_mm: float = NAN
+    original_size: tuple[int, int] | None = None
+    calibrated_focal_px: float = NAN
+    calibrated_center_px: tuple[float, float] = (NAN, NAN)
     local_s: float = NAN
     utc_s: float = NAN
     lat_deg: float = NAN
@@ -156,6 +176,10 @@ def read_photo(path: Path | str) -> PhotoMetadata:
         lens=text(exif.get(_LENS_MODEL)),
         focal_mm=positive(exif.get(_FOCAL_MM)),
         focal_35mm=positive(exif.get(_FOCAL_35MM)),
+        focal_plane_px_per_mm=_focal_plane_px_per_mm(exif),
+        original_size=_original_size(exif),
+        calibrated_focal_px=drone.calibrated_focal_px,
+        calibrated_center_px=drone.calibrated_center_px,
         local_s=local_s,
         utc_s=utc_s,
         lat_deg=lat,
@@ -339,6 +363,18 @@ def _altitude(gps: Mapping[int, Any], drone: DroneXmp) -> tuple[float, HeightRef
     if math.isnan(altitude):
         return drone.altitude_m, HeightReference.UNKNOWN
     return altitude, HeightReference.AMSL if code in (2, 3) else HeightReference.UNKNOWN
+
+
+def _focal_plane_px_per_mm(exif: Mapping[int, Any]) -> float:
+    unit = _UNITS_MM.get(number(exif.get(_FOCAL_PLANE_UNIT, 2)))
+    return NAN if unit is None else positive(exif.get(_FOCAL_PLANE_X)) / unit
+
+
+def _original_size(exif: Mapping[int, Any]) -> tuple[int, int] | None:
+    size = positive(exif.get(_ORIGINAL_WIDTH)), positive(exif.get(_ORIGINAL_HEIGHT))
+    if not all(1 <= side <= _MAX_SIDE_PX for side in size):
+        return None
+    return int(size[0]), int(size[1])
 
 
 def _sigma(gps: Mapping[int, Any], drone: DroneXmp) -> Sigma:

@@ -165,6 +165,8 @@ def _open_flight(source: Source, given: Camera | None) -> tuple[Flight, list[str
             f"{source.sequence}: using focal lengths from the photo metadata, without distortion; "
             "a registered camera gives better poses."
         )
+        doubts = (headers.focal(row)[1] for row in readable)
+        notes += [f"{source.sequence}: {doubt}." for doubt in {d: None for d in doubts if d}][:1]
     origin = "photo metadata" if given is None else "given"
     return Flight(source, photos, origin, len(source.parts), time_s, headers), notes
 
@@ -175,8 +177,8 @@ def _photo_camera(headers: PhotoHeaders, row: int, given: Camera | None) -> Came
     width, height = headers.sizes[row].tolist()
     if given is not None:
         return camera_at_size(given, width, height, headers.paths[row])
-    focal_px = headers.focal_px(row)
-    return None if focal_px is None else camera_from_focal_length(focal_px, width, height)
+    stated, _ = headers.focal(row)
+    return None if stated is None else camera_from_focal_length(stated.focal_px, width, height)
 
 
 class ViewRenderers:
