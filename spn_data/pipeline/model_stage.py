@@ -21,7 +21,7 @@ from spn_data.area.names import (
 )
 from spn_data.capture.frames import Frames, read_frames
 from spn_data.colmap.model import Scene
-from spn_data.errors import FormatError, GeometryError
+from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.inputs.lens_file import read_lenses
 from spn_data.labels.labels import write_label_observations, write_labels
@@ -79,7 +79,7 @@ def build_model(
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
-    unlabelled = _write_labels(work.path, result, chosen, stopwatch)
+    _write_labels(work.path, result, chosen)
     _move_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen, shutters),
@@ -89,8 +89,8 @@ def build_model(
             *notes,
             *result.attempts,
             *passages,
-            *unlabelled,
-            *_focal_notes(result.scene, to_map),
+            *_unlabelled(result),
+            *_focal_notes(result.refined.scene, to_map),
             *(note for shutter in shutters if (note := shutter.describe())),
         ),
     )
@@ -161,20 +161,22 @@ def _focal_notes(scene: Scene, frames: FramesToMap) -> list[str]:
     ]
 
 
-def _write_labels(
-    work: Path, result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
-) -> tuple[str, ...]:
-    """Write labels of the mapping frames in the model's gauge; return a note if that is impossible."""
+def _write_labels(work: Path, result: ReconstructResult, chosen: Frames) -> None:
+    """Write labels of the mapping frames in the model's gauge, if they have covariances."""
+    refined = result.refined
+    if refined.covariance is None:
+        return
     reasons = {row.name: row.reason for row in result.registrations}
-    model = (result.scene, result.observations, result.points)
-    try:
-        with stopwatch.step("covariance"):
-            labels, seen = mapping_labels(chosen, *model, reasons)
-    except GeometryError as error:
-        return (f"the mapping frames have no covariances: {error}",)
+    labels, seen = mapping_labels(
+        chosen, refined.scene, refined.observations, refined.points, reasons, refined.covariance
+    )
     write_labels(work / POSES, labels)
     write_label_observations(work / OBSERVATIONS, seen)
-    return ()
+
+
+def _unlabelled(result: ReconstructResult) -> tuple[str, ...]:
+    problem = result.refined.problem
+    return (f"the mapping frames have no covariances: {problem}",) if problem else ()
 
 
 def _shutters(
@@ -182,13 +184,13 @@ def _shutters(
 ) -> tuple[ShutterDiagnosis, ...]:
     """Diagnose rolling shutter and stabilisation of each video; the interval of photos is too long."""
     with stopwatch.step("shutter"):
-        scene = result.scene
+        scene = result.refined.scene
         row = {name: k for k, name in enumerate(chosen.names.tolist())}
         rows = np.array([row[name] for name in scene.names], dtype=np.int64)
         if not (chosen.video_frame[rows] >= 0).any():
             return ()
         return diagnose_shutter(
-            scene, result.observations, chosen.sequences[rows], chosen.time_s[rows]
+            scene, result.refined.observations, chosen.sequences[rows], chosen.time_s[rows]
         )
 
 
@@ -200,7 +202,7 @@ def _move_results(work: Path, result: ReconstructResult) -> None:
     if result.database != work / DATABASE:
         (work / DATABASE).unlink()
         result.database.rename(work / DATABASE)
-    for path in result.model.iterdir():
+    for path in result.refined.folder.iterdir():
         path.rename(work / path.name)
 
 
@@ -209,7 +211,7 @@ def _counts(
 ) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
-    scene = result.scene
+    scene = result.refined.scene
     key_of = dict(zip(chosen.names.tolist(), chosen.cameras.tolist(), strict=True))
     keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
     cameras = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
+from spn_data.colmap.model import Scene
 from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
@@ -27,7 +29,8 @@ from spn_data.registration.solution import (
 )
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
-from spn_data.uncertainty.map_covariance import MapCovariance
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.shared_errors import LensPrior
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -73,6 +76,7 @@ def register_sequence(
     to_match: FramesToMap,
     folder: Path,
     map_folder: Path,
+    map_lenses: Callable[[Scene], Mapping[int, LensPrior]],
     options: RegisterOptions,
     progress: Progress,
     *,
@@ -89,6 +93,8 @@ def register_sequence(
         Working folder, which may contain features and matches of an earlier run.
     map_folder : Path
         Folder of a model and its database.
+    map_lenses : callable
+        Returns what is known of the lenses of the map, by camera id.
     options : RegisterOptions
     progress : Progress
     dispatch : Dispatch
@@ -135,9 +141,9 @@ def register_sequence(
         sequence = UnsolvedSequence(pixels, [putative[name] for name in names], tracks, points.xyz)
         (lens,) = to_match.lenses.values()
         solution = solve(sequence, lens, options)
-        registered = accept_poses(
-            sequence, solution, pairs, MapCovariance.of(scene, observations), points, options
-        )
+        known = MapCovarianceOptions(lenses=map_lenses(scene))
+        map_covariance = MapCovariance.of(scene, observations, known)
+        registered = accept_poses(sequence, solution, pairs, map_covariance, points, options)
     progress("poses", len(names), len(names))
     return registered
 

@@ -195,7 +195,7 @@ class MapCovariance:
                 )
             )
         points = np.concatenate([part[0] for part in parts])
-        held = held_columns(unknowns, options.lenses)
+        held = held_columns(scene, unknowns, options.lenses)
         after_points = 2 * len(rows) - 3 * len(points)
         redundancy = after_points - (unknowns.count - len(held)) + GAUGE
         if redundancy <= 0:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from spn_data.colmap.model import MapObservations, Scene
+from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, estimated_names
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.lens_errors import (
@@ -29,15 +30,24 @@ class LensPrior:
 
     Attributes
     ----------
-    held : bool
-        Whether mapping held its focal length.
+    hold : Hold
+        What mapping held.
     focal_sigma_px : float
         Standard deviation of a held focal length; of an estimated one, what is doubtful about it beyond its
         residuals.
     """
 
-    held: bool = False
+    hold: Hold = Hold.NOTHING
     focal_sigma_px: float = 0.0
+
+    @classmethod
+    def of(cls, lens: InitialLens) -> LensPrior:
+        """Return what is known of a lens with which mapping began."""
+        if lens.hold is Hold.NOTHING:
+            return cls()
+        return cls(
+            hold=lens.hold, focal_sigma_px=lens.focal_sigma * float(np.mean(lens.camera.focal_px))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +134,17 @@ def _units(n: int, columns: np.ndarray) -> np.ndarray:
     return units
 
 
-def held_columns(unknowns: Unknowns, priors: Mapping[int, LensPrior]) -> np.ndarray:
-    """Return the columns (h,) of the intrinsics of the lenses that mapping held."""
-    held = [c for i, c in unknowns.lens_columns.items() if i in priors and priors[i].held]
-    return np.concatenate([np.zeros(0, np.int64), *held])
+def held_columns(scene: Scene, unknowns: Unknowns, priors: Mapping[int, LensPrior]) -> np.ndarray:
+    """Return the columns (h,) of the intrinsics that mapping held."""
+    held = []
+    for camera_id, columns in unknowns.lens_columns.items():
+        hold = priors.get(camera_id, LensPrior()).hold
+        for column, name in zip(
+            columns.tolist(), estimated_names(scene.cameras[camera_id]), strict=True
+        ):
+            if hold is Hold.LENS or (hold is Hold.FOCAL and name[0] == "f"):
+                held.append(column)
+    return np.array(held, dtype=np.int64)
 
 
 class LensScores:
