@@ -20,15 +20,14 @@ from spn_data.area.names import (
     POSES,
 )
 from spn_data.capture.frames import Frames, read_frames
-from spn_data.colmap.model import Scene
 from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.inputs.lens_file import read_lenses
 from spn_data.labels.labels import write_label_observations, write_labels
 from spn_data.reconstruction.attempts import ReconstructOptions
-from spn_data.reconstruction.contradiction import focal_changes
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.diagnosis import missing_passages
+from spn_data.reconstruction.focal_trial import focal_trials
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
@@ -79,6 +78,7 @@ def build_model(
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
+    trials = focal_trials(result.refined.scene, result.refined.covariance, to_map)
     _write_labels(work.path, result, chosen)
     _move_results(work.path, result)
     return work.finish(
@@ -90,7 +90,7 @@ def build_model(
             *result.attempts,
             *passages,
             *_unlabelled(result),
-            *_focal_notes(result.refined.scene, to_map),
+            *(note for trial in trials for note in trial.notes()),
             *(note for shutter in shutters if (note := shutter.describe())),
         ),
     )
@@ -146,21 +146,6 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
-_FOCAL_CHANGE = 1.1  # ratio of estimated and known focal length that deserves a note
-
-
-def _focal_notes(scene: Scene, frames: FramesToMap) -> list[str]:
-    """Return a note for each focal length that differs much from its known value."""
-    return [
-        f"camera {change.camera}: the focal length was estimated as {change.estimated_px:.0f} px, "
-        f"{change.estimated_px / change.known_px - 1:+.0%} from the known {change.known_px:.0f} px. "
-        "A flight at one height with one viewing direction hardly determines it, and heights have the same "
-        "relative error; or the video is cropped. --camera gives a calibrated lens to start from, "
-        "and --fixed-lens holds it"
-        for change in focal_changes(scene, frames, _FOCAL_CHANGE)
-    ]
-
-
 def _write_labels(work: Path, result: ReconstructResult, chosen: Frames) -> None:
     """Write labels of the mapping frames in the model's gauge, if they have covariances."""
     refined = result.refined
@@ -214,9 +199,13 @@ def _counts(
     scene = result.refined.scene
     key_of = dict(zip(chosen.names.tolist(), chosen.cameras.tolist(), strict=True))
     keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
+    covariance = result.refined.covariance
+    of_images = {} if covariance is None else covariance.shared.focal_lengths
+    errors = {i: round(focal.error_px, 2) for i, focal in of_images.items()}
     cameras = {
         key: {
             "focal_px": round(scene.cameras[i].focal_px[0], 2),
+            "focal_error_px": errors.get(i),
             "fov_deg": round(scene.cameras[i].horizontal_fov_deg, 2),
             "model": scene.cameras[i].model,
             "params": [round(float(p), 6) for p in scene.cameras[i].params],

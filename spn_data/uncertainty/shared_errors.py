@@ -70,6 +70,27 @@ class PrincipalPoint:
         return np.sqrt(np.diag(self.covariance))
 
 
+@dataclass(frozen=True)
+class FocalLength:
+    """What the measurements of a map say about the focal length of a lens.
+
+    Attributes
+    ----------
+    shift_px : float
+        Its expected value minus the current one, if the lens has the fields that the residuals show.
+    sigma_px : float
+        Standard deviation of that, errors of measurements included.
+    """
+
+    shift_px: float
+    sigma_px: float
+
+    @property
+    def error_px(self) -> float:
+        """Root mean square error to be expected of the current value."""
+        return float(np.hypot(self.shift_px, self.sigma_px))
+
+
 @dataclass(frozen=True, eq=False)
 class SharedErrors:
     """t independent errors of unit variance, and what they change.
@@ -81,11 +102,14 @@ class SharedErrors:
     fields : dict of int to ndarray, shape (TERMS, t)
         Coefficients of the fields of each lens, by camera id.
     principal_points : dict of int to PrincipalPoint
+    focal_lengths : dict of int to FocalLength
+        Of lenses whose focal length was estimated.
     """
 
     unknowns: np.ndarray
     fields: dict[int, np.ndarray] = field(default_factory=dict)
     principal_points: dict[int, PrincipalPoint] = field(default_factory=dict)
+    focal_lengths: dict[int, FocalLength] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +272,7 @@ def shared_errors(
     effects: list[np.ndarray] = []
     roots: dict[int, np.ndarray] = {}
     points: dict[int, PrincipalPoint] = {}
+    focal_lengths: dict[int, FocalLength] = {}
     for camera_id in unknowns.lens_columns:
         # Minus the change of the unknowns per unit of each coefficient.
         response = inverse.solve(sums.cross[camera_id])
@@ -263,6 +288,14 @@ def shared_errors(
         points[camera_id] = PrincipalPoint(
             estimate.coefficients_px[constant], estimate.covariance[np.ix_(constant, constant)]
         )
+        column = unknowns.lens_columns[camera_id][:1]  # f or fx
+        if not np.isin(column, inverse.held).any():
+            solved = inverse.solve(_units(unknowns.count, column))
+            by_field = response[column[0]]
+            variance = by_field @ estimate.covariance @ by_field
+            variance += float((solved.T @ (meat @ solved)).item())
+            shift = -by_field @ estimate.coefficients_px
+            focal_lengths[camera_id] = FocalLength(float(shift), float(np.sqrt(variance)))
         roots[camera_id] = estimate.root
         effects.append(-response @ estimate.root)
     for camera_id, prior in priors.items():
@@ -277,4 +310,4 @@ def shared_errors(
         fields[camera_id] = np.zeros((TERMS, together.shape[1]))
         fields[camera_id][:, first : first + root.shape[1]] = root
         first += root.shape[1]
-    return SharedErrors(together, fields, points)
+    return SharedErrors(together, fields, points, focal_lengths)
