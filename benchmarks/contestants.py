@@ -50,7 +50,10 @@ def run_ours(frames: FramesToMap, job: Job, stopwatch: Stopwatch) -> tuple[Path,
 
     options = ReconstructOptions(threads=job.threads, seed=job.seed)
     made = reconstruct(frames, Path(job.work), options, lambda *_: None, stopwatch)
-    return made.model, (*made.attempts, f"{made.pairs_verified} of {made.pairs_tried} pairs fit")
+    return made.refined.folder, (
+        *made.attempts,
+        f"{made.pairs_verified} of {made.pairs_tried} pairs fit",
+    )
 
 
 def run_pycolmap(

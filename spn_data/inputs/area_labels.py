@@ -30,11 +30,13 @@ from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.pose import Similarity
 from spn_data.georegistration.result import GeoFit
+from spn_data.inputs.lens_file import map_lens_priors
 from spn_data.labels.labels import LabelObservations, Labels, read_label_observations, read_labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.registration_file import read_reasons
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +198,12 @@ def _mapping_labels(
     if (folder / POSES).exists():
         labels = read_labels(folder / POSES).transformed(read_world_from_model(area))
         return labels, read_label_observations(folder / OBSERVATIONS)
-    return mapping_labels(
-        chosen, scene, map_observations, points, read_reasons(folder), covariance=covariance
-    )
+    computed = None
+    if covariance:
+        options = MapCovarianceOptions(lenses=map_lens_priors(area, scene))
+        computed = MapCovariance.of(scene, map_observations, options)
+    reasons = read_reasons(folder)
+    return mapping_labels(chosen, scene, map_observations, points, reasons, computed)
 
 
 def _read_stage(

@@ -32,7 +32,7 @@ from spn_data.inputs.evaluation_source import find_source, sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
 from spn_data.inputs.gnss_check import GnssCheck, check_gnss
-from spn_data.inputs.lens_file import read_lenses
+from spn_data.inputs.lens_file import map_lens_priors, read_lenses
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.labels.labels import Labels, pose_sigmas, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
@@ -157,6 +157,7 @@ def _register(
         _frames_to_match(work.path / STORED, chosen, sampled.lens),
         work.path,
         area.folder(MODEL),
+        lambda scene: map_lens_priors(area, scene),
         replace(options.register, hold_lens=sampled.lens.hold is Hold.LENS),
         progress,
         dispatch=dispatch,

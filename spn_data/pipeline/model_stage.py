@@ -20,15 +20,14 @@ from spn_data.area.names import (
     POSES,
 )
 from spn_data.capture.frames import Frames, read_frames
-from spn_data.colmap.model import Scene
-from spn_data.errors import FormatError, GeometryError
+from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.inputs.lens_file import read_lenses
 from spn_data.labels.labels import write_label_observations, write_labels
 from spn_data.reconstruction.attempts import ReconstructOptions
-from spn_data.reconstruction.contradiction import focal_changes
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.diagnosis import missing_passages
+from spn_data.reconstruction.focal_trial import focal_trials
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.registration_file import write_registration
@@ -79,7 +78,8 @@ def build_model(
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
-    unlabelled = _write_labels(work.path, result, chosen, stopwatch)
+    trials = focal_trials(result.refined.scene, result.refined.covariance, to_map)
+    _write_labels(work.path, result, chosen)
     _move_results(work.path, result)
     return work.finish(
         counts=_counts(result, chosen, shutters),
@@ -89,8 +89,8 @@ def build_model(
             *notes,
             *result.attempts,
             *passages,
-            *unlabelled,
-            *_focal_notes(result.scene, to_map),
+            *_unlabelled(result),
+            *(note for trial in trials for note in trial.notes()),
             *(note for shutter in shutters if (note := shutter.describe())),
         ),
     )
@@ -146,35 +146,22 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
-_FOCAL_CHANGE = 1.1  # ratio of estimated and known focal length that deserves a note
-
-
-def _focal_notes(scene: Scene, frames: FramesToMap) -> list[str]:
-    """Return a note for each focal length that differs much from its known value."""
-    return [
-        f"camera {change.camera}: the focal length was estimated as {change.estimated_px:.0f} px, "
-        f"{change.estimated_px / change.known_px - 1:+.0%} from the known {change.known_px:.0f} px. "
-        "A flight at one height with one viewing direction hardly determines it, and heights have the same "
-        "relative error; or the video is cropped. --camera gives a calibrated lens to start from, "
-        "and --fixed-lens holds it"
-        for change in focal_changes(scene, frames, _FOCAL_CHANGE)
-    ]
-
-
-def _write_labels(
-    work: Path, result: ReconstructResult, chosen: Frames, stopwatch: Stopwatch
-) -> tuple[str, ...]:
-    """Write labels of the mapping frames in the model's gauge; return a note if that is impossible."""
+def _write_labels(work: Path, result: ReconstructResult, chosen: Frames) -> None:
+    """Write labels of the mapping frames in the model's gauge, if they have covariances."""
+    refined = result.refined
+    if refined.covariance is None:
+        return
     reasons = {row.name: row.reason for row in result.registrations}
-    model = (result.scene, result.observations, result.points)
-    try:
-        with stopwatch.step("covariance"):
-            labels, seen = mapping_labels(chosen, *model, reasons)
-    except GeometryError as error:
-        return (f"the mapping frames have no covariances: {error}",)
+    labels, seen = mapping_labels(
+        chosen, refined.scene, refined.observations, refined.points, reasons, refined.covariance
+    )
     write_labels(work / POSES, labels)
     write_label_observations(work / OBSERVATIONS, seen)
-    return ()
+
+
+def _unlabelled(result: ReconstructResult) -> tuple[str, ...]:
+    problem = result.refined.problem
+    return (f"the mapping frames have no covariances: {problem}",) if problem else ()
 
 
 def _shutters(
@@ -182,13 +169,13 @@ def _shutters(
 ) -> tuple[ShutterDiagnosis, ...]:
     """Diagnose rolling shutter and stabilisation of each video; the interval of photos is too long."""
     with stopwatch.step("shutter"):
-        scene = result.scene
+        scene = result.refined.scene
         row = {name: k for k, name in enumerate(chosen.names.tolist())}
         rows = np.array([row[name] for name in scene.names], dtype=np.int64)
         if not (chosen.video_frame[rows] >= 0).any():
             return ()
         return diagnose_shutter(
-            scene, result.observations, chosen.sequences[rows], chosen.time_s[rows]
+            scene, result.refined.observations, chosen.sequences[rows], chosen.time_s[rows]
         )
 
 
@@ -200,7 +187,7 @@ def _move_results(work: Path, result: ReconstructResult) -> None:
     if result.database != work / DATABASE:
         (work / DATABASE).unlink()
         result.database.rename(work / DATABASE)
-    for path in result.model.iterdir():
+    for path in result.refined.folder.iterdir():
         path.rename(work / path.name)
 
 
@@ -209,12 +196,16 @@ def _counts(
 ) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
-    scene = result.scene
+    scene = result.refined.scene
     key_of = dict(zip(chosen.names.tolist(), chosen.cameras.tolist(), strict=True))
     keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
+    covariance = result.refined.covariance
+    of_images = {} if covariance is None else covariance.shared.focal_lengths
+    errors = {i: round(focal.error_px, 2) for i, focal in of_images.items()}
     cameras = {
         key: {
             "focal_px": round(scene.cameras[i].focal_px[0], 2),
+            "focal_error_px": errors.get(i),
             "fov_deg": round(scene.cameras[i].horizontal_fov_deg, 2),
             "model": scene.cameras[i].model,
             "params": [round(float(p), 6) for p in scene.cameras[i].params],

@@ -30,6 +30,7 @@ from spn_data.inputs.area_labels import (
     read_labelled_area,
     read_world_from_model,
 )
+from spn_data.inputs.lens_file import map_lens_priors
 from spn_data.inputs.source_videos import find_videos
 from spn_data.labels.labels import LabelObservations, Labels, write_label_observations, write_labels
 from spn_data.labels.map_hash import map_hash
@@ -44,7 +45,7 @@ from spn_data.storage.json_files import DAMAGE, VERSION, read_json, write_json
 from spn_data.storage.stage_record import StageRecord
 from spn_data.tracking.label_video import track_frames
 from spn_data.tracking.tracked_frames import TrackingOptions
-from spn_data.uncertainty.map_covariance import MapCovariance
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
 from spn_data.work.timing import Progress, Stopwatch
 
 
@@ -173,7 +174,8 @@ def _with_covariances(
 ) -> Labels:
     """Add covariances from the errors of measurements, map and lens to the labels."""
     scene, observations, points = read_map(map_folder(area))
-    map_covariance = MapCovariance.of(scene, observations)
+    options = MapCovarianceOptions(lenses=map_lens_priors(area, scene))
+    map_covariance = MapCovariance.of(scene, observations, options)
     covariance = np.full((len(labels), 6, 6), np.nan)
     registered = np.flatnonzero(labels.registered)
     for key in np.unique(labels.cameras[registered]).tolist():

@@ -15,6 +15,7 @@ from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.matching.features import FeatureOptions, Features, check_features, extract_from_bytes
 from spn_data.matching.pairs import PairOptions, visual_vocabulary, vlad_descriptor
 from spn_data.matching.putative import MatchOptions
+from spn_data.uncertainty.shared_errors import LensPrior
 from spn_data.work.answers import check_asked, check_complete, check_kind
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress
@@ -51,10 +52,19 @@ class FramesToMap:
 
 def held_cameras(database: Path, frames: FramesToMap) -> dict[int, Hold]:
     """Return what an adjustment may not change of the cameras, by their ids in a database of the frames."""
+    lenses = _lenses_of(database, frames)
+    return {i: lens.hold for i, lens in lenses.items() if lens.hold is not Hold.NOTHING}
+
+
+def lens_priors(database: Path, frames: FramesToMap) -> dict[int, LensPrior]:
+    """Return what is known of the held cameras, by their ids in a database of the frames."""
+    return {i: LensPrior.of(lens) for i, lens in _lenses_of(database, frames).items()}
+
+
+def _lenses_of(database: Path, frames: FramesToMap) -> dict[int, InitialLens]:
     with MapDatabase.open(database) as opened:
         ids = opened.cameras_of(dict(zip(frames.names, frames.cameras.tolist(), strict=True)))
-    holds = {ids[key]: lens.hold for key, lens in frames.lenses.items()}
-    return {i: hold for i, hold in holds.items() if hold is not Hold.NOTHING}
+    return {ids[key]: lens for key, lens in frames.lenses.items()}
 
 
 def extract_missing(

@@ -17,8 +17,7 @@ def mapping_labels(
     observations: MapObservations,
     points: MapPoints,
     reasons: dict[str, str],
-    *,
-    covariance: bool = True,
+    covariance: MapCovariance | None = None,
 ) -> tuple[Labels, LabelObservations]:
     """Return labels of the mapping frames in the frame that the model is in.
 
@@ -30,13 +29,13 @@ def mapping_labels(
         The model, as `spn_data.colmap.model.read_map` reads it.
     reasons : dict of str to str
         Why a frame is missing, by name.
-    covariance : bool, optional
-        False leaves covariances NaN, which is quicker.
+    covariance : MapCovariance, optional
+        Covariance of the model; without it, those of the frames are NaN.
 
     Returns
     -------
     labels : Labels
-        N rows, with covariances relative to the map (`MapCovariance`).
+        N rows, with covariances relative to the map.
     seen : LabelObservations
         Map points that the frames observe.
     """
@@ -53,8 +52,8 @@ def mapping_labels(
         coverage[row] = covered_share(observations.pixels[mine], camera.width, camera.height)
         error_px[row] = np.sqrt(squared[mine].mean()) if inliers[row] else np.nan
     covariances = np.full((n, 6, 6), np.nan)
-    if covariance:
-        covariances[rows] = MapCovariance.of(scene, observations).pose_covariances()
+    if covariance is not None:
+        covariances[rows] = covariance.pose_covariances()
     labels = Labels.of_frames(
         chosen,
         scene.poses.at_rows(rows, n),

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from spn_data.colmap.model import Scene
 from spn_data.reconstruction.attempts import Attempt
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange
+from spn_data.uncertainty.shared_errors import PrincipalPoint
 
 
 def attempt_note(attempt: Attempt, submodels: tuple[int, ...], frames: int) -> str:
@@ -30,6 +34,16 @@ def bend_note(bend_m: float) -> str:
     return (
         f"the model was bent by {bend_m:.1f} m (median): straightened with the flight's positions before "
         "the final bundle adjustment"
+    )
+
+
+def principal_point_note(scene: Scene, camera_id: int, before: PrincipalPoint) -> str:
+    """Return where a principal point was found; `before` is how it was before it was estimated."""
+    camera = scene.cameras[camera_id]
+    x, y = camera.matrix[:2, 2] - np.array([camera.width, camera.height]) / 2
+    return (
+        f"camera {camera_id}: the principal point was estimated: {x:+.1f} px across and {y:+.1f} px down "
+        f"from the centre of the image (sigma {np.max(before.sigma_px):.1f} px)"
     )
 
 

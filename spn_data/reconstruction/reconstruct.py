@@ -9,11 +9,10 @@ import numpy as np
 
 from spn_data.colmap.database import DatabaseImage, MapDatabase
 from spn_data.colmap.job import MappingJob
-from spn_data.colmap.mapping import latest_snapshot, refine, run_mapping, triangulate
+from spn_data.colmap.mapping import latest_snapshot, run_mapping, triangulate
 from spn_data.colmap.misplaced import drop_misplaced
-from spn_data.colmap.model import MapObservations, Scene, count_registered, read_map, read_scene
+from spn_data.colmap.model import count_registered, read_scene
 from spn_data.errors import StageError
-from spn_data.labels.map_points import MapPoints
 from spn_data.matching.features import FeatureOptions
 from spn_data.matching.pairs import PairOptions, choose_pairs
 from spn_data.reconstruction import saved_models
@@ -29,12 +28,12 @@ from spn_data.reconstruction.correspondences import (
 from spn_data.reconstruction.diagnosis import FrameRegistration, diagnose
 from spn_data.reconstruction.notes import (
     attempt_note,
-    bend_note,
     contradiction_note,
     drift_note,
     failure_message,
     misplaced_note,
 )
+from spn_data.reconstruction.refinement import RefinedModel, refine_model
 from spn_data.work.cluster import dispatch_to
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
@@ -80,8 +79,7 @@ class ReconstructResult:
 
     Attributes
     ----------
-    model : Path
-        Folder of the refined model.
+    refined : RefinedModel
     database : Path
         Database file of the attempt that was kept.
     registrations : tuple of FrameRegistration
@@ -92,20 +90,15 @@ class ReconstructResult:
         Sentences: what was tried, with which result.
     pairs_tried, pairs_verified : int
         Number of matched and verified pairs.
-    scene, observations, points
-        The refined model.
     """
 
-    model: Path
+    refined: RefinedModel
     database: Path
     registrations: tuple[FrameRegistration, ...]
     submodels: tuple[int, ...]
     attempts: tuple[str, ...]
     pairs_tried: int
     pairs_verified: int
-    scene: Scene
-    observations: MapObservations
-    points: MapPoints
 
 
 # Measured on drone video and photos of 0.5 to 2 megapixels, with two cores and 4,096 features per image.
@@ -178,8 +171,11 @@ def reconstruct(
         raise StageError(
             failure_message(work, len(frames.names), 0 if best is None else best.registered, notes)
         )
-    refined = _refine(run, best, notes)
-    scene, observations, points = read_map(refined)
+    refined = refine_model(
+        best.model, work / best.database, frames, work, options, progress, stopwatch
+    )
+    notes += refined.notes
+    scene, observations = refined.scene, refined.observations
     with MapDatabase.open(work / best.database) as database:
         registrations = diagnose(database, frames, scene, observations)
         verified = len(database.verified_pairs())
@@ -192,9 +188,6 @@ def reconstruct(
         tuple(notes),
         tried,
         verified,
-        scene,
-        observations,
-        points,
     )
 
 
@@ -375,26 +368,4 @@ def _without_misplaced(run: _Run, database: str, model: Path, notes: list[str]) 
     if not wrong:
         return model
     notes.append(misplaced_note(wrong))
-    return target
-
-
-def _refine(run: _Run, best: _Candidate, notes: list[str]) -> Path:
-    target, frames, options = run.work / "refined", run.frames, run.options
-    run.progress("refinement", 0, 1)
-    known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
-    with run.stopwatch.step("refinement"):
-        done = refine(
-            best.model,
-            target,
-            images=frames.folder,
-            positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
-            camera_model=options.camera_model,
-            refine_principal_point=options.refine_principal_point,
-            held=held_cameras(run.work / best.database, frames),
-            threads=options.threads,
-            log=run.work / "mapping.log",
-        )
-    run.progress("refinement", 1, 1)
-    if done["bend_m"] > 0:
-        notes.append(bend_note(done["bend_m"]))
     return target

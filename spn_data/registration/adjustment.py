@@ -12,6 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.least_squares import (
     POSE,
     cauchy_weights,
@@ -22,9 +23,11 @@ from spn_data.geometry.least_squares import (
 )
 from spn_data.geometry.pose import Poses, to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
+from spn_data.uncertainty.lens_errors import PRINCIPAL_POINT_SIGMA
 
 _MAX_STEPS = 50
 _CONVERGED = 1e-7  # relative decrease of the cost
+_DEPENDENT = 10.0  # factor of the variance of a mean of residuals over that of independent ones
 _BEHIND_PX = 1e3  # residual of a point at or behind the camera, which makes it an outlier
 
 
@@ -67,11 +70,14 @@ class SequenceState:
         Shared by all frames.
     own_points : ndarray, shape (P, 3)
         Points that only the sequence observes.
+    expected : InitialLens
+        What is known of the lens from elsewhere.
     """
 
     poses: Poses
     camera: Camera
     own_points: np.ndarray
+    expected: InitialLens
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +108,9 @@ class Linearized:
 
 
 def lens_parameters(camera: Camera) -> tuple[str, ...]:
-    """Return the names of the intrinsics that a sequence can determine: focal length and radial distortion.
+    """Return the names of the intrinsics that a sequence can determine.
+
+    The principal point is estimated under a prior (`principal_point_prior`).
 
     Parameters
     ----------
@@ -111,9 +119,50 @@ def lens_parameters(camera: Camera) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Those of "f", "fx", "fy", "k1", "k2" that the camera model has.
+        Those of "f", "fx", "fy", "cx", "cy", "k1", "k2" that the camera model has.
     """
-    return tuple(name for name in MODELS[camera.model] if name in ("f", "fx", "fy", "k1", "k2"))
+    return tuple(name for name in MODELS[camera.model] if name not in ("p1", "p2"))
+
+
+@dataclass(frozen=True, eq=False)
+class LensPrior:
+    """Prior of the L estimated intrinsics, as additional squared residuals.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (L,)
+        Of the squares, in px^2 of residual; 0 for an intrinsic without prior.
+    offsets : ndarray, shape (L,)
+        Current value minus expected value.
+    """
+
+    weights: np.ndarray
+    offsets: np.ndarray
+
+    @property
+    def cost(self) -> float:
+        """Sum of the weighted squares."""
+        return float(self.weights @ self.offsets**2)
+
+
+def principal_point_prior(
+    state: SequenceState, lens: tuple[str, ...], scale_px: float
+) -> LensPrior:
+    """Return the prior of the principal point: within about 1 % of the image width of its expected place.
+
+    Errors of a sequence's measurements are dependent, and its lens has errors that none of them shows, so
+    that the prior counts as much as if there were a few hundred independent measurements.
+    """
+    names = MODELS[state.camera.model]
+    weights, offsets = np.zeros(len(lens)), np.zeros(len(lens))
+    for k, name in enumerate(lens):
+        if name in ("cx", "cy"):
+            axis = ("cx", "cy").index(name)
+            weights[k] = _DEPENDENT * (scale_px / (PRINCIPAL_POINT_SIGMA * state.camera.width)) ** 2
+            offsets[k] = (
+                state.camera.params[names.index(name)] - state.expected.camera.matrix[axis, 2]
+            )
+    return LensPrior(weights, offsets)
 
 
 def linearize(
@@ -179,20 +228,27 @@ def normal_equations(
     frames: int,
     own_points: int,
     weights: np.ndarray,
+    prior: LensPrior,
     damping: float = 0.0,
 ) -> NormalEquations:
-    """Build the normal equations, with damping as the factor by which the diagonal is raised (Marquardt).
+    """Build the normal equations of residuals and prior.
+
+    `damping` is the factor by which the diagonal is raised (Marquardt).
 
     Own points are damped like the other unknowns: one with little parallax would otherwise overshoot, however
     small the step.
     """
     weighted_jacobian = jacobian(linearized, observations.frame, frames, weights)
     residuals = (linearized.residuals_px * np.sqrt(weights)[:, None]).ravel()
-    matrix = (weighted_jacobian.T @ weighted_jacobian).tocsc()
+    of_lens = POSE * frames + np.arange(len(prior.weights))
+    priors = np.zeros(weighted_jacobian.shape[1])
+    priors[of_lens] = prior.weights
+    matrix = (weighted_jacobian.T @ weighted_jacobian + sparse.diags(priors)).tocsc()
     if damping:
         diagonal = matrix.diagonal()
         matrix = (matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())).tocsc()
     right = -(weighted_jacobian.T @ residuals)
+    right[of_lens] -= prior.weights * prior.offsets
     own = np.flatnonzero(observations.own >= 0)
     point_of = observations.own[own]
     root = np.sqrt(weights[own])[:, None]
@@ -228,32 +284,40 @@ def adjust(
     """
     damping = 1e-6
     linearized = linearize(state, observations, lens)
-    cost = _cost(linearized, scale_px)
+    prior = principal_point_prior(state, lens, scale_px)
+    cost = _cost(linearized, prior, scale_px)
     for _ in range(_MAX_STEPS):
         weights = cauchy_weights(linearized.residuals_px, scale_px)
         while True:
             normal = normal_equations(
-                linearized, observations, len(state.poses), len(state.own_points), weights, damping
+                linearized,
+                observations,
+                len(state.poses),
+                len(state.own_points),
+                weights,
+                prior,
+                damping,
             )
             candidate = _step(state, normal, lens)
             ahead = linearize(candidate, observations, lens)
-            new_cost = _cost(ahead, scale_px)
+            ahead_prior = principal_point_prior(candidate, lens, scale_px)
+            new_cost = _cost(ahead, ahead_prior, scale_px)
             if new_cost <= cost or damping > 1e6:
                 break
             damping *= 10
         if new_cost > cost:
             return state
         done = cost - new_cost < _CONVERGED * cost
-        state, linearized, cost = candidate, ahead, new_cost
+        state, linearized, prior, cost = candidate, ahead, ahead_prior, new_cost
         damping = max(damping / 10, 1e-9)
         if done:
             break
     return state
 
 
-def _cost(linearized: Linearized, scale_px: float) -> float:
+def _cost(linearized: Linearized, prior: LensPrior, scale_px: float) -> float:
     squared = (linearized.residuals_px**2).sum(axis=1)
-    return float(np.log1p(squared / scale_px**2).sum())
+    return float(np.log1p(squared / scale_px**2).sum()) + prior.cost / scale_px**2
 
 
 def _step(state: SequenceState, normal: NormalEquations, lens: tuple[str, ...]) -> SequenceState:
@@ -274,4 +338,4 @@ def _step(state: SequenceState, normal: NormalEquations, lens: tuple[str, ...]) 
     if len(own):
         right = normal.point_right - (normal.coupling.T @ change).reshape(-1, 3)
         own = own + np.einsum("pij,pj->pi", normal.point_inverse, right)
-    return SequenceState(poses, camera, own)
+    return SequenceState(poses, camera, own, state.expected)

@@ -4,7 +4,8 @@ Three causes of errors enter one least-squares problem: the noise of the sequenc
 and the points that its frames share, and the errors of the map points, which are correlated for points
 observed in the same mapping frames. Let S be the normal matrix of poses and lens (own points eliminated) and
 N the coupling between them and the map points. The errors are S^-1 (noise - N dX), and the covariance is the
-sum of s^2 k S^-1 and b S^-1 N Cov(X) N^T S^-1. s^2 is the variance of the residuals; k (at least 1) is the
+sum of s^2 k S^-1, b S^-1 N Cov(X) N^T S^-1, and what the fields of the lenses change, which no number of
+frames averages out (`uncertainty.lens_errors`). s^2 is the variance of the residuals; k (at least 1) is the
 design effect of clusters: how much the measurements of one image region are correlated; b (at least 1) is how
 much worse the sequence fits the map than sequences usually do.
 """
@@ -16,18 +17,22 @@ from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
+from spn_data.geometry.camera import MODELS
 from spn_data.geometry.least_squares import POSE, cauchy_weights, cluster_scores, rows_to_sparse
 from spn_data.registration.adjustment import (
     Linearized,
+    NormalEquations,
     SequenceObservations,
     SequenceState,
     jacobian,
     linearize,
     normal_equations,
+    principal_point_prior,
 )
 from spn_data.registration.solution import SCALE_PX
+from spn_data.uncertainty.lens_errors import TERMS, estimate_field, field_values
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
 _FRAMES_AT_ONCE = 8
@@ -45,6 +50,8 @@ class SequenceCovariance:
     ----------
     poses : ndarray, shape (N, 6, 6)
         As in Labels.
+    measured : ndarray, shape (N, 6, 6)
+        The part of it that is due to the errors of measurements: how well the frame is determined in the map.
     lens : ndarray, shape (L, L)
         Of the intrinsics in `lens_names`.
     lens_names : tuple of str
@@ -56,6 +63,7 @@ class SequenceCovariance:
     """
 
     poses: np.ndarray
+    measured: np.ndarray
     lens: np.ndarray
     lens_names: tuple[str, ...]
     sigma_px: float
@@ -78,7 +86,8 @@ def sequence_covariance(
     n = len(state.poses)
     linearized = linearize(state, observations, lens)
     weights = cauchy_weights(linearized.residuals_px, SCALE_PX)
-    normal = normal_equations(linearized, observations, n, len(state.own_points), weights)
+    prior = principal_point_prior(state, lens, SCALE_PX)
+    normal = normal_equations(linearized, observations, n, len(state.own_points), weights, prior)
     diagonal = normal.matrix.diagonal()
     factor = splu((normal.matrix + sparse.diags(1e-12 * diagonal)).tocsc())
     weighted_jacobian = jacobian(linearized, observations.frame, n, weights)
@@ -89,10 +98,19 @@ def sequence_covariance(
     coupling = _map_point_coupling(
         linearized, observations, weights, weighted_jacobian, columns, len(used)
     )
-    poses = np.empty((n, POSE, POSE))
+    fields = _effects_of_fields(
+        state,
+        observations,
+        linearized,
+        weights,
+        weighted_jacobian,
+        normal,
+        factor,
+        sigma_px**2 * effect,
+    )
     blocks = [np.arange(POSE * k, POSE * (k + 1)) for k in range(n)]
     blocks.append(np.arange(POSE * n, POSE * n + len(lens)))
-    covariances = []
+    totals, measured = [], []
     for first in range(0, len(blocks), _FRAMES_AT_ONCE):
         some = blocks[first : first + _FRAMES_AT_ONCE]
         rows = np.concatenate(some)
@@ -108,12 +126,78 @@ def sequence_covariance(
         of_map = map_covariance.functional_covariances(functionals)
         for k, block in enumerate(some):
             noise = sigma_px**2 * effect * solved[block, ends[k] : ends[k + 1]]
-            both = noise + misfit * of_map[k]
-            covariances.append(0.5 * (both + both.T))
-    poses[:] = covariances[:n]
+            both = noise + misfit * of_map[k].measured
+            measured.append(0.5 * (both + both.T))
+            shared = of_map[k].shared + fields[block] @ fields[block].T
+            totals.append(measured[-1] + 0.5 * (shared + shared.T))
     return SequenceCovariance(
-        poses, covariances[n], lens, sigma_px, effect, linearized.residuals_px
+        np.stack(totals[:n]),
+        np.stack(measured[:n]),
+        totals[n],
+        lens,
+        sigma_px,
+        effect,
+        linearized.residuals_px,
     )
+
+
+def _effects_of_fields(
+    state: SequenceState,
+    observations: SequenceObservations,
+    linearized: Linearized,
+    weights: np.ndarray,
+    weighted_jacobian: sparse.csr_matrix,
+    normal: NormalEquations,
+    factor: SuperLU,
+    variance: float,
+) -> np.ndarray:
+    """Return the changes (6N+L, t) of poses and lens by t independent errors of the sequence's own lens.
+
+    These are its fields, and the focal length if it is not estimated. `variance` is that of a residual
+    component, with the design effect.
+    """
+    own = observations.own >= 0
+    count = len(state.own_points)
+    of_own = rows_to_sparse(
+        (linearized.by_point * np.sqrt(weights)[:, None, None])[own],
+        3 * observations.own[own][:, None] + np.arange(3),
+        3 * count,
+    )
+    root = np.sqrt(weights)
+
+    def reduced(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return J^T F, F^T F and -F^T r of fields (2 M, t), with the own points projected out."""
+        scaled = values * np.repeat(root, 2)[:, None]
+        cross, square = weighted_jacobian.T @ scaled, scaled.T @ scaled
+        if count:
+            through = of_own.T @ scaled[np.repeat(own, 2)]
+            back = np.einsum("pij,pjt->pit", normal.point_inverse, through.reshape(count, 3, -1))
+            back = back.reshape(3 * count, -1)
+            cross, square = cross - normal.coupling @ back, square - through.T @ back
+        residuals = (linearized.residuals_px * root[:, None]).ravel()
+        return cross, square, -scaled.T @ residuals
+
+    camera = state.camera
+    values = field_values(camera, observations.pixels)
+    both = np.zeros((2 * len(values), TERMS))
+    both[0::2, : values.shape[1]] = both[1::2, values.shape[1] :] = values
+    cross, square, pull = reduced(both)
+    response = factor.solve(cross)
+    information = square - cross.T @ response
+    estimate = estimate_field(
+        camera,
+        information,
+        pull,
+        variance * information,
+        principal_point_is_estimated="cx" in linearized.lens,
+    )
+    effects = [-response @ estimate.root]
+    if not linearized.lens:
+        focal = tuple(name for name in MODELS[camera.model] if name in ("f", "fx", "fy"))
+        by_focal = linearize(state, observations, focal).by_lens.sum(axis=2).reshape(-1, 1)
+        sigma_px = state.expected.focal_sigma * float(np.mean(camera.focal_px))
+        effects.append(-sigma_px * factor.solve(reduced(by_focal)[0]))
+    return np.concatenate(effects, axis=1)
 
 
 def misfit_factor(sigma_px: float, map_covariance: MapCovariance) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
 from spn_data.geometry.least_squares import LENS, POSE, cauchy_weights, projection_jacobians
 from spn_data.geometry.pose import Poses
 from spn_data.registration.adjustment import (
@@ -22,6 +23,7 @@ from spn_data.registration.adjustment import (
 )
 from spn_data.registration.covariance import misfit_factor
 from spn_data.registration.solution import SCALE_PX
+from spn_data.uncertainty.lens_errors import field_values
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
 _FRAMES_AT_ONCE = 32
@@ -96,7 +98,7 @@ def frame_covariances(
             misfit.append(misfit_factor(sigma_px, map_covariance))
         of_map = map_covariance.functional_covariances(functionals)
         for k, own, b, through in zip(some, noise, misfit, of_map, strict=True):
-            both = own + b * through
+            both = own + b * through.measured + through.shared
             covariance[k] = 0.5 * (both + both.T)
     return covariance
 
@@ -114,7 +116,7 @@ def _frame_covariance(
         np.zeros(m, np.int64), frame.pixels, frame.xyz, np.full(m, -1)
     )
     names = lens_parameters(camera)
-    state = SequenceState(pose, camera, np.zeros((0, 3)))
+    state = SequenceState(pose, camera, np.zeros((0, 3)), InitialLens(camera, GUESS_SIGMA, ""))
     linearized = linearize(state, observations, names)
     weights = cauchy_weights(linearized.residuals_px, SCALE_PX)
     weighted = linearized.by_pose * weights[:, None, None]
@@ -126,13 +128,15 @@ def _frame_covariance(
     rows, where = np.unique(frame.point_rows, return_inverse=True)
     together = np.zeros((len(rows), POSE, 3))
     np.add.at(together, where, by_points)
-    by_lens = None
+    by_lens, by_field = None, None
     if lens.camera_id is not None:
         full = projection_jacobians(camera, pose.to_camera(frame.xyz))[1]
         by_lens = inverse @ np.einsum("mia,mil->al", weighted, full)
         assert by_lens.shape == (POSE, LENS)
+        values = field_values(camera, frame.pixels)
+        by_field = inverse @ np.concatenate([weighted[:, k].T @ values for k in (0, 1)], axis=1)
     elif lens.covariance is not None and len(lens.covariance):
         pull = inverse @ np.einsum("mia,mil->al", weighted, linearized.by_lens)
         noise = noise + pull @ lens.covariance @ pull.T
-    functional = Functional(rows, together.transpose(1, 0, 2), lens.camera_id, by_lens)
+    functional = Functional(rows, together.transpose(1, 0, 2), lens.camera_id, by_lens, by_field)
     return noise, functional, float(np.sqrt(variance))

@@ -69,7 +69,9 @@ def carry_failed_frames(
     resections, links = _links(sequence, solution, options)
     if len(resections) == np.count_nonzero(accepted):
         return None
-    carried = adjust_sequence(sequence, resections, solution.camera, *links, options)
+    carried = adjust_sequence(
+        sequence, resections, solution.camera, *links, solution.expected, options
+    )
     unconfirmed = np.zeros(len(accepted), bool)
     for row in np.flatnonzero(carried.posed & ~accepted).tolist():
         search = search_map(
@@ -90,7 +92,9 @@ def carry_failed_frames(
         return None
     sequence = replace(sequence, tracks=sequence.tracks.of_frames(known))
     resections, links = _links(sequence, remove_frames(carried, unconfirmed), options)
-    return sequence, adjust_sequence(sequence, resections, carried.camera, *links, options)
+    return sequence, adjust_sequence(
+        sequence, resections, carried.camera, *links, carried.expected, options
+    )
 
 
 def _links(

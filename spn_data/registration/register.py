@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.colmap.database import DatabaseImage, MapDatabase
+from spn_data.colmap.model import Scene
 from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
 from spn_data.matching.pairs import PairOptions, sequence_pairs
@@ -29,7 +30,8 @@ from spn_data.registration.solution import (
 )
 from spn_data.registration.solve import solve
 from spn_data.registration.tracks import find_tracks
-from spn_data.uncertainty.map_covariance import MapCovariance
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.shared_errors import LensPrior
 from spn_data.work.parallel import Dispatch
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -75,6 +77,7 @@ def register_sequence(
     to_match: FramesToMap,
     folder: Path,
     map_folder: Path,
+    map_lenses: Callable[[Scene], Mapping[int, LensPrior]],
     options: RegisterOptions,
     progress: Progress,
     *,
@@ -91,6 +94,8 @@ def register_sequence(
         Working folder, which may contain features and matches of an earlier run.
     map_folder : Path
         Folder of a model and its database.
+    map_lenses : callable
+        Returns what is known of the lenses of the map, by camera id.
     options : RegisterOptions
     progress : Progress
     dispatch : Dispatch
@@ -137,8 +142,9 @@ def register_sequence(
                 matches = [putative[name] for name in names]
                 sequence = UnsolvedSequence(pixels, matches, tracks, frozen.points.xyz)
                 (lens,) = to_match.lenses.values()
-                solution = solve(sequence, lens.camera, lens.focal_is_known, options)
-                covariance = MapCovariance.of(frozen.scene, frozen.observations)
+                solution = solve(sequence, lens, options)
+                known = MapCovarianceOptions(lenses=map_lenses(frozen.scene))
+                covariance = MapCovariance.of(frozen.scene, frozen.observations, known)
                 registered = accept_poses(
                     sequence, solution, pairs, covariance, frozen.points, options
                 )
@@ -168,8 +174,9 @@ def accept_poses(
     reason, inliers, coverage = [""] * n, np.zeros(n, np.int64), np.zeros(n)
     settled = np.zeros(n, bool)  # a rejected frame keeps the reason and figures from when it failed
     while True:
-        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
-        evidence = gather_evidence(sequence, solution, covariances, pairs, options)
+        covariance = _covariance(sequence, solution, map_covariance, options)
+        measured = _of_all_frames(solution, None if covariance is None else covariance.measured)
+        evidence = gather_evidence(sequence, solution, measured, pairs, options)
         verdict = check_poses(solution.posed, evidence, options.checks)
         for row in np.flatnonzero(~settled):
             reason[row] = verdict.reason[row]
@@ -186,7 +193,6 @@ def accept_poses(
         inliers,
         coverage,
         covariance,
-        covariances,
         map_covariance,
         points,
     )
@@ -215,10 +221,9 @@ def recover_frames(
     while True:
         if not (solution.posed & ~accepted).any() or not solution.posed[accepted].all():
             return first
-        covariance, covariances = _covariances(sequence, solution, map_covariance, options)
-        evidence = gather_evidence(
-            sequence, solution, covariances, pairs, options, find_rivals=False
-        )
+        covariance = _covariance(sequence, solution, map_covariance, options)
+        measured = _of_all_frames(solution, None if covariance is None else covariance.measured)
+        evidence = gather_evidence(sequence, solution, measured, pairs, options, find_rivals=False)
         stands = check_carried(sequence, solution, accepted, evidence, options.checks)
         failing = solution.posed & ~stands
         if not failing.any():
@@ -232,7 +237,6 @@ def recover_frames(
         np.where(posed, evidence.inliers, first.inliers),
         np.where(posed, evidence.coverage, first.coverage),
         covariance,
-        covariances,
         map_covariance,
         frozen.points,
     )
@@ -245,7 +249,6 @@ def _registered(
     inliers: np.ndarray,
     coverage: np.ndarray,
     covariance: SequenceCovariance | None,
-    covariances: np.ndarray,
     map_covariance: MapCovariance,
     points: MapPoints,
 ) -> RegisteredSequence:
@@ -261,32 +264,37 @@ def _registered(
         inliers=inliers,
         coverage=coverage,
         covariance=covariance,
-        covariances=covariances,
+        covariances=_of_all_frames(solution, None if covariance is None else covariance.poses),
         seen=seen,
         map_sigma_px=map_covariance.sigma_px,
     )
 
 
-def _covariances(
+def _covariance(
     sequence: UnsolvedSequence,
     solution: SequenceSolution,
     map_covariance: MapCovariance,
     options: RegisterOptions,
-) -> tuple[SequenceCovariance | None, np.ndarray]:
-    """Return the covariance of the posed frames, and (N, 6, 6) of all frames, NaN without a pose."""
-    covariances = np.full((len(solution.posed), 6, 6), np.nan)
+) -> SequenceCovariance | None:
+    """Return the covariance of the posed frames, None if there is none."""
     if not solution.posed.any():
-        return None, covariances
+        return None
     state, observations = solution.least_squares(sequence)
-    covariance = sequence_covariance(
+    return sequence_covariance(
         state,
         observations,
         solution.point_row,
         map_covariance,
         estimated_intrinsics(solution.camera, len(state.poses), options),
     )
-    covariances[solution.posed] = covariance.poses
-    return covariance, covariances
+
+
+def _of_all_frames(solution: SequenceSolution, of_posed: np.ndarray | None) -> np.ndarray:
+    """Return covariances (N, 6, 6) of all frames from those of the posed ones, NaN without a pose."""
+    covariances = np.full((len(solution.posed), 6, 6), np.nan)
+    if of_posed is not None:
+        covariances[solution.posed] = of_posed
+    return covariances
 
 
 def labels_of(chosen: Frames, registered: RegisteredSequence) -> Labels:

@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_data.colmap.resection import Resection
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.pose import Poses
 from spn_data.registration.adjustment import (
     SequenceObservations,
@@ -68,6 +69,8 @@ class SequenceSolution:
         sequence's own points, `point_row` is -1 and `own` is its row.
     own_points : ndarray, shape (P, 3)
         Points that only the sequence observes.
+    expected : InitialLens
+        What is known of the lens from elsewhere.
     """
 
     posed: np.ndarray
@@ -78,6 +81,7 @@ class SequenceSolution:
     point_row: np.ndarray
     own: np.ndarray
     own_points: np.ndarray
+    expected: InitialLens
 
     def inliers(self, row: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the features (K,) of a frame that are map points, and the rows (K,) of these points."""
@@ -110,7 +114,8 @@ class SequenceSolution:
         places[of_map] = sequence.map_xyz[self.point_row[of_map]]
         pixels = sequence.pixels_of(self.frame, self.feature)
         observations = SequenceObservations(position[self.frame], pixels, places, self.own)
-        return SequenceState(self.poses[rows], self.camera, self.own_points), observations
+        state = SequenceState(self.poses[rows], self.camera, self.own_points, self.expected)
+        return state, observations
 
 
 def adjust_sequence(
@@ -120,6 +125,7 @@ def adjust_sequence(
     putative: list[np.ndarray],
     own: np.ndarray,
     own_points: np.ndarray,
+    expected: InitialLens,
     options: RegisterOptions,
 ) -> SequenceSolution:
     """Adjust all frames, their lens and their own points together from single resections.
@@ -141,7 +147,9 @@ def adjust_sequence(
     table = table[posed[table[:, 0]]]
     table = table[np.lexsort(table.T[::-1])]
     frame, feature, point_row, own_row = table.T
-    start = SequenceSolution(posed, poses, camera, frame, feature, point_row, own_row, own_points)
+    start = SequenceSolution(
+        posed, poses, camera, frame, feature, point_row, own_row, own_points, expected
+    )
     return adjust_inliers(sequence, start, options)
 
 

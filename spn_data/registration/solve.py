@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_data.colmap.resection import Resection, resect
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.pose import Poses
 from spn_data.registration.adjustment import (
     SequenceObservations,
@@ -29,7 +30,7 @@ _FOCAL_FRAMES = 12  # used for the initial focal length
 
 
 def solve(
-    sequence: UnsolvedSequence, start: Camera, focal_is_known: bool, options: RegisterOptions
+    sequence: UnsolvedSequence, start: InitialLens, options: RegisterOptions
 ) -> SequenceSolution:
     """Estimate the poses of all frames that agree with the map at all.
 
@@ -38,28 +39,27 @@ def solve(
     Parameters
     ----------
     sequence : UnsolvedSequence
-    start : Camera
-        Initial intrinsics. All but the principal point are re-estimated, none with `hold_lens`.
-    focal_is_known : bool
-        If false, the focal length is first estimated by resections.
+    start : InitialLens
+        Initial intrinsics. They are re-estimated, the principal point under a prior; none with `hold_lens`.
+        A focal length that nothing states is first estimated by resections.
     options : RegisterOptions
 
     Returns
     -------
     SequenceSolution
     """
-    camera = start if options.hold_lens else radial(start)
-    if not (focal_is_known or options.hold_lens):
+    camera = start.camera if options.hold_lens else radial(start.camera)
+    if not (start.focal_is_known or options.hold_lens):
         camera = _guess_focal(sequence, camera, options)
     if not options.hold_lens:
-        camera = _find_lens(sequence, camera, options)
+        camera = _find_lens(sequence, camera, start, options)
     resections = {}
     for row in range(len(sequence.pixels)):
         pose = _resect(sequence, row, camera, options, max_error_px=options.max_error_px)
         if pose is not None:
             resections[row] = pose
     putative, own_points, own = propagate_poses(sequence, resections, camera, options)
-    return adjust_sequence(sequence, resections, camera, putative, own, own_points, options)
+    return adjust_sequence(sequence, resections, camera, putative, own, own_points, start, options)
 
 
 def radial(camera: Camera) -> Camera:
@@ -100,7 +100,9 @@ def _guess_focal(sequence: UnsolvedSequence, camera: Camera, options: RegisterOp
     return _with_focal(camera, float(np.array(focals)[order][half]))
 
 
-def _find_lens(sequence: UnsolvedSequence, camera: Camera, options: RegisterOptions) -> Camera:
+def _find_lens(
+    sequence: UnsolvedSequence, camera: Camera, expected: InitialLens, options: RegisterOptions
+) -> Camera:
     """Estimate focal length and distortion from the frames that agree best, with decreasing thresholds."""
     rows = _strongest(sequence, _LENS_FRAMES)
     for max_error_px in (options.start_error_px, options.start_error_px / 2, options.max_error_px):
@@ -123,7 +125,7 @@ def _find_lens(sequence: UnsolvedSequence, camera: Camera, options: RegisterOpti
             np.concatenate(places),
             np.full(sum(map(len, frame)), -1),
         )
-        state = SequenceState(Poses.concatenate(poses), camera, np.zeros((0, 3)))
+        state = SequenceState(Poses.concatenate(poses), camera, np.zeros((0, 3)), expected)
         lens = estimated_intrinsics(camera, len(poses), options)
         camera = adjust(state, observations, scale_px=SCALE_PX, lens=lens).camera
     return camera

@@ -1,6 +1,6 @@
 """Jacobians of a bundle adjustment at its solution, with the points eliminated (Schur complement).
 
-The remaining unknowns are the poses (6 per frame) and the intrinsics that mapping estimated.
+The remaining unknowns are the poses (6 per frame) and the intrinsics.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Unknowns:
     count : int
         Number of columns n.
     lens_columns : dict of int to ndarray, shape (L,)
-        Columns of the estimated intrinsics, by camera id.
+        Columns of the intrinsics in the order of `estimated_names`, by camera id.
     lens_jacobian : dict of int to ndarray, shape (8, L)
-        Derivatives of fx, fy, cx, cy, k1, k2, p1, p2 by the L estimated intrinsics, by camera id.
+        Derivatives of fx, fy, cx, cy, k1, k2, p1, p2 by the L intrinsics, by camera id.
     """
 
     count: int
@@ -47,32 +47,21 @@ class Unknowns:
     lens_jacobian: dict[int, np.ndarray]
 
     @classmethod
-    def of(cls, scene: Scene, *, refine_principal_point: bool) -> Unknowns:
-        """Return the unknowns of a map.
-
-        Parameters
-        ----------
-        scene : Scene
-            The map.
-        refine_principal_point : bool
-            Whether mapping estimated the principal points.
-        """
+    def of(cls, scene: Scene) -> Unknowns:
+        """Return the unknowns of a map: all poses, and all intrinsics but the principal points."""
         columns, mixing = {}, {}
         count = POSE * len(scene.names)
         for camera_id in np.unique(scene.camera_ids).tolist():
             camera = scene.cameras[camera_id]
-            mixing[camera_id] = lens_parameter_jacobian(
-                _lens_parameters(camera, refine_principal_point)
-            )
+            mixing[camera_id] = lens_parameter_jacobian(estimated_names(camera))
             columns[camera_id] = count + np.arange(mixing[camera_id].shape[1])
             count += mixing[camera_id].shape[1]
         return cls(count, columns, mixing)
 
 
-def _lens_parameters(camera: Camera, refine_principal_point: bool) -> list[str]:
-    """Return the names of the intrinsics that mapping estimates."""
-    fixed = () if refine_principal_point else ("cx", "cy")
-    return [name for name in MODELS[camera.model] if name not in fixed]
+def estimated_names(camera: Camera) -> list[str]:
+    """Return the names of the intrinsics that are unknowns; a principal point is a field of its lens."""
+    return [name for name in MODELS[camera.model] if name not in ("cx", "cy")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +98,11 @@ class LinearizedBundle:
     coupling: sparse.csr_matrix
     residuals: np.ndarray
     views: np.ndarray
+
+    def by_points(self) -> sparse.csr_matrix:
+        """Return the derivatives (2 M, 3 P) of the residuals by the points in whitened coordinates."""
+        columns = 3 * self.point[:, None] + np.arange(3)
+        return rows_to_sparse(self.whitened, columns, 3 * len(self.points))
 
     def reduced_normal_matrix(self) -> sparse.csr_matrix:
         """Return the Schur complement (n, n) of the points; singular in the seven gauge directions."""

@@ -12,6 +12,10 @@ independent, and the covariance is the cluster-robust (sandwich) estimate S^+ M 
 clusters. A point's own error, for which its few residuals are not enough, is predicted by a model of the
 drift (`track_noise`).
 
+Some errors are shared by all measurements of a lens, and no number of measurements averages them out: the
+field that the camera model does not describe (`lens_errors`), and errors of intrinsics that were held
+(`shared_errors`). They are propagated to all unknowns, and add to the covariance.
+
 References
 ----------
 Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using generalized linear models".
@@ -19,8 +23,8 @@ Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
@@ -35,6 +39,14 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
+from spn_data.uncertainty.shared_errors import (
+    HeldInverse,
+    LensPrior,
+    LensScores,
+    SharedErrors,
+    held_columns,
+    shared_errors,
+)
 from spn_data.uncertainty.track_noise import TrackNoise, fit_track_noise, whitened_point_covariances
 
 _FRAMES_AT_ONCE = 32
@@ -49,14 +61,17 @@ class MapCovarianceOptions:
 
     Attributes
     ----------
-    refine_principal_point : bool
-        Whether mapping estimated the principal points.
+    lenses : mapping of int to LensPrior
+        What is known of a lens from elsewhere, by camera id; `LensPrior()` for others.
     clustered : bool
         Whether only clusters of measurements are independent; False: every measurement is.
+    exact_lenses : bool
+        Whether lenses are exactly as modelled, and what was held is exact.
     """
 
-    refine_principal_point: bool = False
+    lenses: Mapping[int, LensPrior] = field(default_factory=dict)
     clustered: bool = True
+    exact_lenses: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +88,31 @@ class Functional:
         The lens; None if the function depends on none.
     by_lens : ndarray, shape (r, 8), or None
         Derivatives by fx, fy, cx, cy, k1, k2, p1, p2 of this lens.
+    by_field : ndarray, shape (r, TERMS), or None
+        Derivatives by the coefficients of the fields of this lens.
     """
 
     point_idx: np.ndarray
     by_points: np.ndarray
     camera_id: int | None = None
     by_lens: np.ndarray | None = None
+    by_field: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionalCovariance:
+    """Covariance of a functional with r values.
+
+    Attributes
+    ----------
+    measured : ndarray, shape (r, r)
+        Due to errors of measurements.
+    shared : ndarray, shape (r, r)
+        Due to errors that all measurements of a lens share.
+    """
+
+    measured: np.ndarray
+    shared: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +125,16 @@ class MapCovariance:
         Standard deviation of one residual component: root of the residual sum of squares over the redundancy.
     noise : TrackNoise or None
         Correlation of the errors along a track; None if all errors are taken as independent.
+    shared : SharedErrors
+        Errors that all measurements of a lens share.
     """
 
     sigma_px: float
     noise: TrackNoise | None
+    shared: SharedErrors
     _unknowns: Unknowns
     _frames: int
-    _inverse: InnerConstraintInverse
+    _inverse: HeldInverse
     _meat: sparse.csr_matrix  # (n, n), M
     _point_row: np.ndarray  # (P,) rows of scene points in the arrays below, -1 if unmeasured
     _whitening: np.ndarray  # (p, 3, 3), see LinearizedBundle
@@ -125,7 +162,7 @@ class MapCovariance:
             If the measurements do not determine the map up to a similarity.
         """
         options = options or MapCovarianceOptions()
-        unknowns = Unknowns.of(scene, refine_principal_point=options.refine_principal_point)
+        unknowns = Unknowns.of(scene)
         rows = np.flatnonzero(np.isfinite(seen.residuals_px).all(axis=1))
         cluster = _clusters_of_points(seen, rows, len(scene.points))
         rows = rows[np.lexsort((seen.point_idx[rows], cluster[seen.point_idx[rows]]))]
@@ -136,13 +173,19 @@ class MapCovariance:
             noise = fit_track_noise(linearize_bundle(scene, seen, unknowns, some))
         normal_matrix = sparse.csr_matrix((unknowns.count, unknowns.count))
         meat = sparse.csr_matrix((unknowns.count, unknowns.count))
+        gradient = np.zeros(unknowns.count)
+        lens_scores = LensScores(scene, unknowns)
         squares, parts = 0.0, []
         for part in _parts(rows, cluster[seen.point_idx[rows]]):
             bundle = linearize_bundle(scene, seen, unknowns, part)
             normal_matrix = normal_matrix + bundle.reduced_normal_matrix()
+            gradient += bundle.design.T @ bundle.residuals
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
-                meat = meat + _clustered_meat(bundle, cluster[bundle.points])
+                scores, of_measurement = _clustered_scores(bundle, cluster[bundle.points])
+                meat = meat + scores.T @ scores
+                if not options.exact_lenses:
+                    lens_scores.add(bundle, seen, part, of_measurement, scores)
             parts.append(
                 (
                     bundle.points,
@@ -152,22 +195,31 @@ class MapCovariance:
                 )
             )
         points = np.concatenate([part[0] for part in parts])
+        held = held_columns(scene, unknowns, options.lenses)
         after_points = 2 * len(rows) - 3 * len(points)
-        redundancy = after_points - unknowns.count + GAUGE
+        redundancy = after_points - (unknowns.count - len(held)) + GAUGE
         if redundancy <= 0:
             raise GeometryError("the map has no more measurements than unknowns")
         variance = squares / redundancy
         own = np.concatenate([part[3] for part in parts])
         # Residuals are smaller than errors because poses and intrinsics absorbed a part of them.
         meat = after_points / redundancy * meat if options.clustered else variance * normal_matrix
+        inverse = HeldInverse.of(InnerConstraintInverse.of(normal_matrix, scene, unknowns), held)
+        shared = SharedErrors(np.zeros((unknowns.count, 0)))
+        if options.clustered and not options.exact_lenses:
+            factor = after_points / redundancy
+            shared = shared_errors(
+                scene, unknowns, inverse, lens_scores, gradient, meat, factor, options.lenses
+            )
         point_row = np.full(len(scene.points), -1)
         point_row[points] = np.arange(len(points))
         return cls(
             float(np.sqrt(variance)),
             noise,
+            shared,
             unknowns,
             len(scene.names),
-            InnerConstraintInverse.of(normal_matrix, scene, unknowns),
+            inverse,
             meat.tocsr(),
             point_row,
             np.concatenate([part[1] for part in parts]),
@@ -175,11 +227,13 @@ class MapCovariance:
             own if options.clustered else variance * own,
         )
 
-    def functional_covariances(self, functionals: Sequence[Functional]) -> list[np.ndarray]:
+    def functional_covariances(
+        self, functionals: Sequence[Functional]
+    ) -> list[FunctionalCovariance]:
         """Return the covariance of each functional.
 
-        It is the sum of two parts: the errors of poses and intrinsics, which all points share, and the own
-        error of each point.
+        Errors of measurements act through poses and intrinsics, which all points share, and through the own
+        error of each point. Errors that all measurements of a lens share are kept apart.
 
         Parameters
         ----------
@@ -188,8 +242,8 @@ class MapCovariance:
 
         Returns
         -------
-        list of ndarray, shape (r, r)
-            One covariance per functional.
+        list of FunctionalCovariance
+            One per functional.
 
         Raises
         ------
@@ -199,7 +253,8 @@ class MapCovariance:
         if not functionals:
             return []
         sides = [self._right_side(functional) for functional in functionals]
-        solved = self._inverse.solve(np.concatenate([right for _, right in sides], axis=1))
+        rights = np.concatenate([right for _, right in sides], axis=1)
+        solved, of_unknowns = self._inverse.solve(rights), rights.T @ self.shared.unknowns
         weighted = self._meat @ solved
         ends = np.cumsum([0] + [right.shape[1] for _, right in sides])
         covariances = []
@@ -209,7 +264,16 @@ class MapCovariance:
             errors = self._own[self._point_row[functional.point_idx]]
             each = np.einsum("rki,kij->rkj", by_own, errors)
             of_points = np.tensordot(each, by_own, axes=((1, 2), (1, 2)))
-            covariances.append(solved[:, a:b].T @ weighted[:, a:b] + of_points)
+            of_shared = of_unknowns[a:b]
+            if functional.by_field is not None and functional.camera_id in self.shared.fields:
+                of_shared = (
+                    of_shared + functional.by_field @ self.shared.fields[functional.camera_id]
+                )
+            covariances.append(
+                FunctionalCovariance(
+                    solved[:, a:b].T @ weighted[:, a:b] + of_points, of_shared @ of_shared.T
+                )
+            )
         return covariances
 
     def pose_covariances(self, frames: np.ndarray | None = None) -> np.ndarray:
@@ -236,7 +300,10 @@ class MapCovariance:
             solved = self._inverse.solve(right)
             weighted = (self._meat @ solved).reshape(n, len(some), POSE)
             solved = solved.reshape(n, len(some), POSE)
-            found[first : first + len(some)] = np.einsum("nfi,nfj->fij", solved, weighted)
+            shared = self.shared.unknowns[columns].reshape(len(some), POSE, -1)
+            found[first : first + len(some)] = np.einsum(
+                "nfi,nfj->fij", solved, weighted
+            ) + shared @ np.swapaxes(shared, 1, 2)
         return found
 
     def _right_side(self, functional: Functional) -> tuple[np.ndarray, np.ndarray]:
@@ -283,8 +350,12 @@ def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
         first = last
 
 
-def _clustered_meat(bundle: LinearizedBundle, cluster_of_point: np.ndarray) -> sparse.csr_matrix:
-    """Return the meat (n, n) of the sandwich: the sum over clusters of the outer products of their scores."""
-    cluster = np.unique(cluster_of_point, return_inverse=True)[1]
-    scores = cluster_scores(bundle.residuals, cluster[bundle.point], bundle.design)
-    return (scores.T @ scores).tocsr()
+def _clustered_scores(
+    bundle: LinearizedBundle, cluster_of_point: np.ndarray
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Return the scores (C, n) of clusters, and the cluster (M,) of each measurement, 0..C-1.
+
+    The meat of the sandwich is the sum over clusters of the outer products of their scores.
+    """
+    cluster = np.unique(cluster_of_point, return_inverse=True)[1][bundle.point]
+    return cluster_scores(bundle.residuals, cluster, bundle.design), cluster

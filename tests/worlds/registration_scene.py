@@ -9,17 +9,20 @@ import numpy as np
 
 from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.labels.map_points import MapPoints
 from spn_data.registration.frozen_map import MapFrame
 from spn_data.registration.solution import UnsolvedSequence
 from spn_data.registration.tracks import find_tracks
+from spn_data.uncertainty.map_covariance import FunctionalCovariance
 
 PITCH_M = 2.0  # between window columns
 COLUMNS = 12
 A_COLUMN = 30  # points per column
 LENS = Camera("RADIAL", 320, 240, np.array([280.0, 160.0, 120.0, -0.05, 0.01]))
+KNOWN = InitialLens(LENS, 1e-6, "given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,4 +116,5 @@ class PerfectMap:
     sigma_px = 0.3
 
     def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
-        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
+        sizes = [f.by_points.shape[0] for f in functionals]
+        return [FunctionalCovariance(*np.zeros((2, r, r))) for r in sizes]

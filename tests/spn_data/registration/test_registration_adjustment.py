@@ -9,10 +9,12 @@ import pytest
 from scipy.optimize import minimize
 
 from spn_data.geometry.camera import MODELS, Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.least_squares import POSE
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.registration.adjustment import (
+    LensPrior,
     SequenceObservations,
     SequenceState,
     adjust,
@@ -20,6 +22,7 @@ from spn_data.registration.adjustment import (
     lens_parameters,
     linearize,
     normal_equations,
+    principal_point_prior,
 )
 from tests.worlds.registration_scene import LENS, flight
 
@@ -58,7 +61,8 @@ def problem(
         np.where(is_own[:, None], np.nan, made.points[points]),
         own_row[points],
     )
-    return SequenceState(made.poses, camera, made.points[own_ids]), observations
+    state = SequenceState(made.poses, camera, made.points[own_ids], InitialLens(camera, 0.05, ""))
+    return state, observations
 
 
 def changed(state: SequenceState, change: np.ndarray, lens: tuple[str, ...]) -> SequenceState:
@@ -75,6 +79,7 @@ def changed(state: SequenceState, change: np.ndarray, lens: tuple[str, ...]) -> 
         ),
         replace(state.camera, params=params),
         state.own_points + change[POSE * n + len(lens) :].reshape(-1, 3),
+        state.expected,
     )
 
 
@@ -151,7 +156,12 @@ def test_eliminating_own_points_changes_no_step() -> None:
     weights = np.random.default_rng(1).uniform(0.2, 1, len(observations.frame))
     linearized = linearize(state, observations, lens)
     reduced = normal_equations(
-        linearized, observations, len(state.poses), len(state.own_points), weights
+        linearized,
+        observations,
+        len(state.poses),
+        len(state.own_points),
+        weights,
+        LensPrior(*np.zeros((2, len(lens)))),
     )
     step = np.linalg.solve(reduced.matrix.toarray(), reduced.right)
     points = reduced.point_right - (reduced.coupling.T @ step).reshape(-1, 3)
@@ -197,7 +207,11 @@ def test_the_minimum_is_that_of_scipy() -> None:
         residuals = linearize(state, observations, lens).residuals_px
         weighted = residuals * cauchy_weights(residuals, 1.0)[:, None]
         gradient = 2 * dense(state, observations, lens).T @ weighted.ravel()
-        return float(np.log1p((residuals**2).sum(axis=1)).sum()), step.T @ gradient
+        prior = principal_point_prior(state, lens, 1.0)
+        first = POSE * len(state.poses)
+        gradient[first : first + len(lens)] += 2 * prior.weights * prior.offsets
+        of_residuals = np.log1p((residuals**2).sum(axis=1)).sum()
+        return float(of_residuals + prior.cost), step.T @ gradient
 
     least = minimize(loss, np.zeros(len(step)), jac=True, method="BFGS", options={"gtol": 1e-4})
     assert least.success

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
 from spn_data.geometry.pose import pose_errors
 from spn_data.labels.map_points import MapPoints
 from spn_data.registration.checks import (
@@ -26,7 +27,15 @@ from spn_data.registration.solution import (
     remove_frames,
 )
 from spn_data.registration.solve import solve
-from tests.worlds.registration_scene import A_COLUMN, LENS, PITCH_M, Flight, PerfectMap, flight
+from tests.worlds.registration_scene import (
+    A_COLUMN,
+    KNOWN,
+    LENS,
+    PITCH_M,
+    Flight,
+    PerfectMap,
+    flight,
+)
 
 OPTIONS = RegisterOptions()
 
@@ -164,7 +173,7 @@ def solved(
     made: Flight, putative: list[np.ndarray]
 ) -> tuple[UnsolvedSequence, SequenceSolution, Evidence]:
     sequence = made.sequence(putative)
-    solution = solve(sequence, LENS, True, OPTIONS)
+    solution = solve(sequence, KNOWN, OPTIONS)
     covariances = np.tile(1e-6 * np.eye(6), (len(made.poses), 1, 1))
     found = gather_evidence(sequence, solution, covariances, made.pairs, OPTIONS)
     return sequence, solution, found
@@ -193,7 +202,7 @@ def test_matches_agree_up_to_the_limit_of_the_sampson_error(
     sequence = shifted.sequence([np.empty((0, 2), np.int64)] * 2)
     none = np.empty(0, np.int64)
     posed = np.ones(2, bool)
-    solution = SequenceSolution(posed, made.poses, LENS, *(none,) * 4, np.empty((0, 3)))
+    solution = SequenceSolution(posed, made.poses, LENS, *(none,) * 4, np.empty((0, 3)), KNOWN)
     found = gather_evidence(sequence, solution, np.tile(np.eye(6), (2, 1, 1)), made.pairs, OPTIONS)
     assert found.agreement.tolist() == [agreement]
 
@@ -278,10 +287,10 @@ def test_a_lens_that_is_not_known_is_found() -> None:
     made = flight()
     start = replace(LENS, params=np.array([900.0, 160, 120, 0, 0]))
     sequence = made.sequence(made.matched())
-    found = solve(sequence, start, False, OPTIONS)
+    found = solve(sequence, InitialLens(start, GUESS_SIGMA, "guess"), OPTIONS)
     assert found.camera.focal_px[0] == pytest.approx(LENS.focal_px[0], rel=0.005)
     assert pose_errors(found.poses, made.poses)[0].max() < 0.06
-    held = solve(sequence, LENS, False, replace(OPTIONS, hold_lens=True))
+    held = solve(sequence, KNOWN, replace(OPTIONS, hold_lens=True))
     assert np.array_equal(held.camera.params, LENS.params)
     assert pose_errors(held.poses, made.poses)[0].max() < 0.03
 
@@ -334,7 +343,7 @@ def test_a_frame_that_fails_later_says_why_it_did(monkeypatch: pytest.MonkeyPatc
 
 def accepted(made: Flight, putative: list[np.ndarray]):  # type: ignore[no-untyped-def]
     sequence = made.sequence(putative)
-    solution = solve(sequence, LENS, True, OPTIONS)
+    solution = solve(sequence, KNOWN, OPTIONS)
     points = MapPoints(
         np.arange(100, 100 + len(made.points)),
         made.points,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.initial_lens import InitialLens
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_angles
 from spn_data.registration.adjustment import (
@@ -23,11 +24,16 @@ from spn_data.registration.frame_covariance import (
     PointObservations,
     frame_covariances,
 )
-from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.map_covariance import (
+    FunctionalCovariance,
+    MapCovariance,
+    MapCovarianceOptions,
+)
 from tests.spn_data.uncertainty.test_map_covariance import Small, small
 
 CHI2_MEDIAN = 5.348
 LENS = Camera("RADIAL", 640, 480, np.array([430.0, 320, 240, -0.08, 0.015]))
+KNOWN = InitialLens(LENS, 1e-6, "given")
 NAMES = lens_parameters(LENS)
 NOISE_PX = 0.5
 FRAMES, OWN = 5, 15
@@ -74,7 +80,7 @@ def observe(
     )
     map_from_true = Similarity.fit(truth.scene.poses.centers, mapped.scene.poses.centers)
     start = SequenceState(
-        map_from_true.apply_to_poses(poses), LENS, map_from_true.apply(cloud[mine])
+        map_from_true.apply_to_poses(poses), LENS, map_from_true.apply(cloud[mine]), KNOWN
     )
     state = adjust(start, observations, scale_px=50.0, lens=NAMES)
     return state, observations, np.where(own_rows >= 0, -1, points)
@@ -101,7 +107,7 @@ def maps() -> list[tuple[Small, MapCovariance]]:
     found = []
     for _ in range(TRIALS):
         mapped = truth.noisy(rng.normal(0, NOISE_PX, truth.seen.pixels.shape))
-        options = MapCovarianceOptions(clustered=False)
+        options = MapCovarianceOptions(clustered=False, exact_lenses=True)
         found.append((mapped, MapCovariance.of(mapped.scene, mapped.seen, options)))
     return found
 
@@ -140,7 +146,9 @@ class _Perfect:
     sigma_px = NOISE_PX
 
     def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
-        return [np.zeros((f.by_points.shape[0],) * 2) for f in functionals]
+        return [
+            FunctionalCovariance(*np.zeros((2, *[f.by_points.shape[0]] * 2))) for f in functionals
+        ]
 
 
 def test_errors_are_as_large_as_stated() -> None:
@@ -249,7 +257,7 @@ def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
             pixels = seen[rows] + rng.normal(0, NOISE_PX, (len(rows), 2))
             frame = PointObservations(pixels, rows, mapped.scene.points[rows])
             start = SequenceState(
-                map_from_true.apply_to_poses(poses[k : k + 1]), camera, np.zeros((0, 3))
+                map_from_true.apply_to_poses(poses[k : k + 1]), camera, np.zeros((0, 3)), KNOWN
             )
             only = SequenceObservations(
                 np.zeros(len(rows), np.int64), pixels, frame.xyz, np.full(len(rows), -1)
@@ -263,7 +271,7 @@ def test_a_mapping_lens_is_uncertain_together_with_the_map() -> None:
         covariance = frame_covariances(
             estimated, camera, frames, LensUncertainty(camera_id=camera_id), map_covariance
         )
-        state = SequenceState(estimated, camera, np.zeros((0, 3)))
+        state = SequenceState(estimated, camera, np.zeros((0, 3)), KNOWN)
         error = errors(truth, mapped, state)
         scores.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
     assert 0.7 < np.median(np.concatenate(scores)) / CHI2_MEDIAN < 1.4
@@ -284,7 +292,7 @@ def test_few_measurements_tell_the_noise_without_bias() -> None:
             truth.scene.points[rows],
             np.full(10, -1),
         )
-        start = SequenceState(poses, LENS, np.zeros((0, 3)))
+        start = SequenceState(poses, LENS, np.zeros((0, 3)), KNOWN)
         state = adjust(start, observations, scale_px=50.0, lens=())
         perfect = _Perfect()
         found = sequence_covariance(state, observations, rows, perfect, ())  # type: ignore[arg-type]
@@ -303,22 +311,26 @@ class _LensOnly:
 
     def functional_covariances(self, functionals):  # type: ignore[no-untyped-def]
         assert all(f.camera_id == 7 for f in functionals)
-        return [f.by_lens @ self.lens @ f.by_lens.T for f in functionals]
+        return [
+            FunctionalCovariance(f.by_lens @ self.lens @ f.by_lens.T, np.zeros((6, 6)))
+            for f in functionals
+        ]
 
 
 def test_a_lens_of_the_map_counts_as_one_of_the_sequence_with_the_same_covariance() -> None:
     """A lens covariance of the map has the same effect as an equal lens covariance of the sequence.
 
-    The map's parameters are fx, fy, cx, cy, k1, k2, p1, p2; focal length and two distortion terms vary.
+    The map's parameters are fx, fy, cx, cy, k1, k2, p1, p2; focal length, principal point and two distortion
+    terms vary.
     """
     truth = small()
     mapped, _ = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
     mine = (observations.frame == 0) & (rows >= 0)
     frames = [PointObservations(observations.pixels[mine], rows[mine], observations.map_xyz[mine])]
-    lens = np.diag([4.0, 1e-4, 4e-4])
-    place = np.zeros((8, 3))
-    place[[0, 1], 0] = place[4, 1] = place[5, 2] = 1.0
+    lens = np.diag([4.0, 2.0, 3.0, 1e-4, 4e-4])
+    place = np.zeros((8, 5))
+    place[[0, 1], 0] = place[2, 1] = place[3, 2] = place[4, 3] = place[5, 4] = 1.0
     own, of_map = (
         frame_covariances(state.poses[:1], state.camera, frames, uncertain, map_covariance)  # type: ignore[arg-type]
         for uncertain, map_covariance in (

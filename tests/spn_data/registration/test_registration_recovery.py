@@ -17,6 +17,7 @@ from spn_data.registration.register_options import RegisterOptions
 from spn_data.registration.solution import UnsolvedSequence
 from spn_data.registration.solve import solve
 from tests.worlds.registration_scene import (
+    KNOWN,
     LENS,
     PITCH_M,
     FacadeMap,
@@ -32,7 +33,7 @@ WEAK = [3, 7]  # frames that agree with a wrong window
 def first_attempt(made: Flight) -> tuple[UnsolvedSequence, RegisteredSequence]:
     """Register a flight of which two frames fail, since they were matched with another window."""
     sequence = made.sequence(made.matched({3: 1, 7: -1}))
-    solution = solve(sequence, LENS, True, OPTIONS)
+    solution = solve(sequence, KNOWN, OPTIONS)
     points = FacadeMap(made).points
     covariance = cast(Any, PerfectMap())
     first = accept_poses(sequence, solution, made.pairs, covariance, points, OPTIONS)

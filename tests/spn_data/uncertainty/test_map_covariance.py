@@ -31,7 +31,8 @@ from spn_data.uncertainty.bundle_jacobians import (
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance, MapCovarianceOptions
 from tests.worlds.native_world import native_model
 
-INDEPENDENT = MapCovarianceOptions(clustered=False)
+EXACT = MapCovarianceOptions(exact_lenses=True)
+INDEPENDENT = MapCovarianceOptions(clustered=False, exact_lenses=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ def scores(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 
 
 def linearized(scene: Scene, seen: MapObservations) -> tuple[Unknowns, LinearizedBundle]:
-    unknowns = Unknowns.of(scene, refine_principal_point=False)
+    unknowns = Unknowns.of(scene)
     rows = np.arange(len(seen.point_idx))
     return unknowns, linearize_bundle(scene, seen, unknowns, rows)
 
@@ -226,7 +227,7 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
                 wanted.by_lens @ unknowns.lens_jacobian[camera_id]
             )
         expected = row @ dense @ row.T
-        found = covariance.functional_covariances([wanted])[0]
+        found = covariance.functional_covariances([wanted])[0].measured
         assert np.allclose(found, expected, rtol=0, atol=1e-4 * np.trace(expected))
 
 
@@ -235,7 +236,7 @@ def test_clusters_give_the_sandwich_of_dense_algebra() -> None:
     rng = np.random.default_rng(6)
     whole = small(8, 60)
     made = whole.noisy(drifting(rng, whole.seen, 0.3))
-    found = MapCovariance.of(made.scene, made.seen).pose_covariances()
+    found = MapCovariance.of(made.scene, made.seen, EXACT).pose_covariances()
     _, bundle = linearized(made.scene, made.seen)
     design, residuals = bundle.design.toarray(), bundle.residuals
     n = design.shape[1]
@@ -271,14 +272,14 @@ def test_repeated_bundle_adjustments_scatter_as_told(kind: str) -> None:
             noise = drifting(rng, whole.seen, 0.3)
         made = whole.noisy(noise)
         pose_errors, point_errors = errors_of(made.scene, whole.scene)
-        covariance = MapCovariance.of(made.scene, made.seen)
+        covariance = MapCovariance.of(made.scene, made.seen, EXACT)
         told["poses"].append(scores(pose_errors, covariance.pose_covariances()))
         independent = MapCovariance.of(made.scene, made.seen, INDEPENDENT).pose_covariances()
         told["poses if independent"].append(scores(pose_errors, independent))
         for seed in range(8):
             wanted = some_functional(made.scene, seed=seed)
             value = np.einsum("rki,ki->r", wanted.by_points, point_errors[wanted.point_idx])
-            spread = covariance.functional_covariances([wanted])[0]
+            spread = covariance.functional_covariances([wanted])[0].measured
             told["points"].append(scores(value[None], spread[None]))
     mean = {name: float(np.mean(values)) for name, values in told.items()}
     assert mean["poses"] / 6 == pytest.approx(1, abs=0.35)
@@ -311,8 +312,8 @@ def test_a_similarity_moves_covariances_with_the_map() -> None:
     assert wanted.by_lens is not None
     same = replace(wanted, by_points=wanted.by_points @ turn.T / 7)
     assert np.allclose(
-        after.functional_covariances([same])[0],
-        before.functional_covariances([wanted])[0],
+        after.functional_covariances([same])[0].measured,
+        before.functional_covariances([wanted])[0].measured,
         rtol=1e-5,
     )
     assert after.sigma_px == pytest.approx(before.sigma_px, rel=1e-6)
@@ -329,8 +330,8 @@ def test_a_map_in_pieces_is_the_map_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
     assert np.allclose(in_pieces.pose_covariances(), at_once.pose_covariances(), rtol=1e-6)
     wanted = some_functional(made.scene, 1)
     assert np.allclose(
-        in_pieces.functional_covariances([wanted])[0],
-        at_once.functional_covariances([wanted])[0],
+        in_pieces.functional_covariances([wanted])[0].measured,
+        at_once.functional_covariances([wanted])[0].measured,
         rtol=1e-6,
     )
 

@@ -1,0 +1,180 @@
+"""Final bundle adjustments of a model, and the principal points that they estimate.
+
+A principal point is held at the centre of the image, unless the measurements tell where it is: its standard
+deviation, errors of the lens model included, must be far below what is usual among lenses, and the shift many
+standard deviations long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spn_data.colmap.mapping import refine
+from spn_data.colmap.model import MapObservations, Scene, read_map
+from spn_data.errors import GeometryError
+from spn_data.geometry.initial_lens import Hold
+from spn_data.labels.map_points import MapPoints
+from spn_data.reconstruction.attempts import ReconstructOptions
+from spn_data.reconstruction.correspondences import FramesToMap, held_cameras, lens_priors
+from spn_data.reconstruction.notes import bend_note, principal_point_note
+from spn_data.uncertainty.lens_errors import PRINCIPAL_POINT_SIGMA
+from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
+from spn_data.uncertainty.shared_errors import PrincipalPoint
+from spn_data.work.timing import Progress, Stopwatch
+
+# Determined: the standard deviation is at most this share of what is usual among lenses.
+_DETERMINED = 0.25
+_SHIFTED_SIGMAS = 5.0
+_LARGEST_SHIFT = (
+    0.03  # of the image width; a larger one is a cropped image, or not a principal point
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedModel:
+    """A model after its final adjustments.
+
+    Attributes
+    ----------
+    folder : Path
+    scene : Scene
+    observations : MapObservations
+    points : MapPoints
+    covariance : MapCovariance or None
+        None if the measurements do not determine one.
+    problem : str
+        Why there is no covariance.
+    notes : tuple of str
+    """
+
+    folder: Path
+    scene: Scene
+    observations: MapObservations
+    points: MapPoints
+    covariance: MapCovariance | None
+    problem: str
+    notes: tuple[str, ...]
+
+
+def refine_model(
+    model: Path,
+    database: Path,
+    frames: FramesToMap,
+    work: Path,
+    options: ReconstructOptions,
+    progress: Progress,
+    stopwatch: Stopwatch,
+) -> RefinedModel:
+    """Run the final adjustments of a model.
+
+    Parameters
+    ----------
+    model : Path
+        Folder of the model; it is only read.
+    database : Path
+        Database of its images.
+    frames : FramesToMap
+    work : Path
+        Folder to write into.
+    options : ReconstructOptions
+    progress : Progress
+    stopwatch : Stopwatch
+
+    Returns
+    -------
+    RefinedModel
+    """
+    progress("refinement", 0, 1)
+    held = held_cameras(database, frames)
+    notes = []
+    with stopwatch.step("refinement"):
+        done = _refine(
+            model, work / "refined", frames, work, options, held, options.refine_principal_point
+        )
+    if done["bend_m"] > 0:
+        notes.append(bend_note(done["bend_m"]))
+    refined = _read(work / "refined", database, frames, stopwatch)
+    if refined.covariance is not None and not options.refine_principal_point:
+        found = _determined(refined.scene, refined.covariance.shared.principal_points, held)
+        if found:
+            others = {i: Hold.LENS for i in refined.scene.cameras if i not in found}
+            with stopwatch.step("refinement"):
+                _refine(
+                    refined.folder,
+                    work / "refined-principal-points",
+                    frames,
+                    work,
+                    options,
+                    held | others,
+                    True,
+                )
+            refined = _read(work / "refined-principal-points", database, frames, stopwatch)
+            notes += [principal_point_note(refined.scene, i, found[i]) for i in sorted(found)]
+    progress("refinement", 1, 1)
+    return RefinedModel(
+        refined.folder,
+        refined.scene,
+        refined.observations,
+        refined.points,
+        refined.covariance,
+        refined.problem,
+        tuple(notes),
+    )
+
+
+def _refine(
+    source: Path,
+    target: Path,
+    frames: FramesToMap,
+    work: Path,
+    options: ReconstructOptions,
+    held: Mapping[int, Hold],
+    refine_principal_point: bool,
+) -> dict[str, float]:
+    known = np.flatnonzero(np.isfinite(frames.positions_m).all(axis=1))
+    return refine(
+        source,
+        target,
+        images=frames.folder,
+        positions={frames.names[k]: frames.positions_m[k].tolist() for k in known},
+        camera_model=options.camera_model,
+        refine_principal_point=refine_principal_point,
+        held=held,
+        threads=options.threads,
+        log=work / "mapping.log",
+    )
+
+
+def _read(folder: Path, database: Path, frames: FramesToMap, stopwatch: Stopwatch) -> RefinedModel:
+    """Read a model and compute its covariance."""
+    scene, observations, points = read_map(folder)
+    covariance, problem = None, ""
+    with stopwatch.step("covariance"):
+        try:
+            lenses = lens_priors(database, frames)
+            covariance = MapCovariance.of(scene, observations, MapCovarianceOptions(lenses=lenses))
+        except GeometryError as error:
+            problem = str(error)
+    return RefinedModel(folder, scene, observations, points, covariance, problem, ())
+
+
+def _determined(
+    scene: Scene, points: Mapping[int, PrincipalPoint], held: Mapping[int, Hold]
+) -> dict[int, PrincipalPoint]:
+    """Return the principal points that are not where they are held, by camera id."""
+    found = {}
+    for camera_id, point in points.items():
+        usual_px = PRINCIPAL_POINT_SIGMA * scene.cameras[camera_id].width
+        distance = point.shift_px @ np.linalg.solve(point.covariance, point.shift_px)
+        if (
+            camera_id not in held
+            and np.all(point.sigma_px <= _DETERMINED * usual_px)
+            and distance >= _SHIFTED_SIGMAS**2
+            and np.linalg.norm(point.shift_px) <= _LARGEST_SHIFT * scene.cameras[camera_id].width
+        ):
+            found[camera_id] = point
+    return found

@@ -1,0 +1,313 @@
+"""Errors that all measurements of a lens share, propagated to poses, intrinsics and points of a map.
+
+Fields that the camera model does not describe, principal points among them (`lens_errors`), held intrinsics,
+and what is doubtful about an estimated focal length although the residuals do not show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from spn_data.colmap.model import MapObservations, Scene
+from spn_data.geometry.initial_lens import Hold, InitialLens
+from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, estimated_names
+from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
+from spn_data.uncertainty.lens_errors import (
+    CONSTANT,
+    TERMS,
+    estimate_field,
+    field_values,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensPrior:
+    """What is known of a lens besides the measurements of the map.
+
+    Attributes
+    ----------
+    hold : Hold
+        What mapping held.
+    focal_sigma_px : float
+        Standard deviation of a held focal length; of an estimated one, what is doubtful about it beyond its
+        residuals.
+    """
+
+    hold: Hold = Hold.NOTHING
+    focal_sigma_px: float = 0.0
+
+    @classmethod
+    def of(cls, lens: InitialLens) -> LensPrior:
+        """Return what is known of a lens with which mapping began."""
+        if lens.hold is Hold.NOTHING:
+            return cls()
+        return cls(
+            hold=lens.hold, focal_sigma_px=lens.focal_sigma * float(np.mean(lens.camera.focal_px))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalPoint:
+    """What the measurements of a map say about the principal point of a lens.
+
+    Attributes
+    ----------
+    shift_px : ndarray, shape (2,)
+        Its expected value minus the current one.
+    covariance : ndarray, shape (2, 2)
+    """
+
+    shift_px: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviations (2,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """What the measurements of a map say about the focal length of a lens.
+
+    Attributes
+    ----------
+    shift_px : float
+        Its expected value minus the current one, if the lens has the fields that the residuals show.
+    sigma_px : float
+        Standard deviation of that, errors of measurements included.
+    """
+
+    shift_px: float
+    sigma_px: float
+
+    @property
+    def error_px(self) -> float:
+        """Root mean square error to be expected of the current value."""
+        return float(np.hypot(self.shift_px, self.sigma_px))
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """t independent errors of unit variance, and what they change.
+
+    Attributes
+    ----------
+    unknowns : ndarray, shape (n, t)
+        Changes of the unknowns.
+    fields : dict of int to ndarray, shape (TERMS, t)
+        Coefficients of the fields of each lens, by camera id.
+    principal_points : dict of int to PrincipalPoint
+    focal_lengths : dict of int to FocalLength
+        Of lenses whose focal length was estimated.
+    """
+
+    unknowns: np.ndarray
+    fields: dict[int, np.ndarray] = field(default_factory=dict)
+    principal_points: dict[int, PrincipalPoint] = field(default_factory=dict)
+    focal_lengths: dict[int, FocalLength] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldInverse:
+    """Generalised inverse of a normal matrix of which some unknowns are held.
+
+    Attributes
+    ----------
+    free : InnerConstraintInverse
+        Inverse with all unknowns free.
+    held : ndarray, shape (h,)
+        Columns of the held unknowns.
+    columns : ndarray, shape (n, h)
+        Their columns of the free inverse.
+    by_held : ndarray, shape (n, h)
+        Change of all unknowns per unit of the held ones.
+    """
+
+    free: InnerConstraintInverse
+    held: np.ndarray
+    columns: np.ndarray
+    by_held: np.ndarray
+
+    @classmethod
+    def of(cls, free: InnerConstraintInverse, held: np.ndarray) -> HeldInverse:
+        """Hold some unknowns (h,)."""
+        columns = free.solve(_units(len(free.scale), held))
+        return cls(free, held, columns, np.linalg.solve(columns[held].T, columns.T).T)
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Return the inverse times right_side (n, r), with zeros for the held unknowns."""
+        return self.free.solve(right_side) - self.by_held @ (self.columns.T @ right_side)
+
+    def change_by(self, columns: np.ndarray) -> np.ndarray:
+        """Return the change (n, 1) of all unknowns if some of them (k,) are raised by 1 and held there."""
+        is_held = np.isin(self.held, columns)
+        if is_held.any():
+            return np.asarray(self.by_held[:, is_held].sum(axis=1, keepdims=True))
+        solved = self.solve(_units(len(self.free.scale), columns))
+        return np.asarray(solved @ np.linalg.solve(solved[columns], np.ones((len(columns), 1))))
+
+
+def _units(n: int, columns: np.ndarray) -> np.ndarray:
+    units = np.zeros((n, len(columns)))
+    units[columns, np.arange(len(columns))] = 1.0
+    return units
+
+
+def held_columns(scene: Scene, unknowns: Unknowns, priors: Mapping[int, LensPrior]) -> np.ndarray:
+    """Return the columns (h,) of the intrinsics that mapping held."""
+    held = []
+    for camera_id, columns in unknowns.lens_columns.items():
+        hold = priors.get(camera_id, LensPrior()).hold
+        for column, name in zip(
+            columns.tolist(), estimated_names(scene.cameras[camera_id]), strict=True
+        ):
+            if hold is Hold.LENS or (hold is Hold.FOCAL and name[0] == "f"):
+                held.append(column)
+    return np.array(held, dtype=np.int64)
+
+
+class LensScores:
+    """Sums over the measurements of a map from which the fields of each lens are estimated.
+
+    F are the derivatives of the residuals by the coefficients of the fields, J those by the unknowns, both
+    with the points projected out; r are the residuals.
+    """
+
+    def __init__(self, scene: Scene, unknowns: Unknowns):
+        self._scene = scene
+        ids = sorted(unknowns.lens_columns)
+        self.cross = {i: np.zeros((unknowns.count, TERMS)) for i in ids}  # J^T F
+        self.information = {i: np.zeros((TERMS, TERMS)) for i in ids}  # F^T F
+        self.pull = {i: np.zeros(TERMS) for i in ids}  # -F^T r
+        self.noise = {i: np.zeros((TERMS, TERMS)) for i in ids}  # of the pull
+        self.noise_cross = {
+            i: np.zeros((unknowns.count, TERMS)) for i in ids
+        }  # of J^T r and the pull
+
+    def add(
+        self,
+        bundle: LinearizedBundle,
+        seen: MapObservations,
+        rows: np.ndarray,
+        cluster: np.ndarray,
+        scores: sparse.csr_matrix,
+    ) -> None:
+        """Add linearized measurements.
+
+        Parameters
+        ----------
+        bundle : LinearizedBundle
+        seen : MapObservations
+        rows : ndarray, shape (M,)
+            The linearized rows of `seen`.
+        cluster : ndarray, shape (M,)
+            Cluster of each measurement, 0..C-1.
+        scores : csr_matrix, shape (C, n)
+            Scores J^T r of the clusters.
+        """
+        ids = self._scene.camera_ids[seen.image_idx[rows]]
+        by_points = bundle.by_points()
+        clusters = scores.shape[0]
+        for camera_id in np.unique(ids).tolist():
+            own = np.flatnonzero(ids == camera_id)
+            values = field_values(self._scene.cameras[camera_id], seen.pixels[rows[own]])
+            half = values.shape[1]
+            gather = sparse.csr_matrix(
+                (np.ones(len(own)), (cluster[own], np.arange(len(own)))), (clusters, len(own))
+            )
+            through, cross, pulls = [], [], []
+            for component in (0, 1):
+                lines = 2 * own + component
+                through.append(by_points[lines].T @ values)
+                cross.append(bundle.design[lines].T @ values)
+                pulls.append(gather @ (-values * bundle.residuals[lines][:, None]))
+            of_points = np.concatenate(through, axis=1)
+            of_clusters = np.concatenate(pulls, axis=1)
+            self.cross[camera_id] += np.concatenate(cross, axis=1) - bundle.coupling.T @ of_points
+            own_part = values.T @ values
+            self.information[camera_id][:half, :half] += own_part
+            self.information[camera_id][half:, half:] += own_part
+            self.information[camera_id] -= of_points.T @ of_points
+            self.pull[camera_id] += of_clusters.sum(axis=0)
+            self.noise[camera_id] += of_clusters.T @ of_clusters
+            self.noise_cross[camera_id] += scores.T @ of_clusters
+
+
+def shared_errors(
+    scene: Scene,
+    unknowns: Unknowns,
+    inverse: HeldInverse,
+    sums: LensScores,
+    gradient: np.ndarray,
+    meat: sparse.csr_matrix,
+    noise_factor: float,
+    priors: Mapping[int, LensPrior],
+) -> SharedErrors:
+    """Estimate the errors that measurements of a lens share, and propagate them to the unknowns.
+
+    Parameters
+    ----------
+    scene : Scene
+    unknowns : Unknowns
+        The n unknowns.
+    inverse : HeldInverse
+    sums : LensScores
+    gradient : ndarray, shape (n,)
+        J^T r at the solution.
+    meat : csr_matrix, shape (n, n)
+        Covariance of the gradient.
+    noise_factor : float
+        Factor by which the clusters' scores in `sums` underestimate errors; `meat` contains it.
+    priors : mapping of int to LensPrior
+
+    Returns
+    -------
+    SharedErrors
+    """
+    effects: list[np.ndarray] = []
+    roots: dict[int, np.ndarray] = {}
+    points: dict[int, PrincipalPoint] = {}
+    focal_lengths: dict[int, FocalLength] = {}
+    for camera_id in unknowns.lens_columns:
+        # Minus the change of the unknowns per unit of each coefficient.
+        response = inverse.solve(sums.cross[camera_id])
+        mixed = response.T @ sums.noise_cross[camera_id]
+        noise = noise_factor * (sums.noise[camera_id] + mixed + mixed.T)
+        estimate = estimate_field(
+            scene.cameras[camera_id],
+            sums.information[camera_id] - sums.cross[camera_id].T @ response,
+            sums.pull[camera_id] + response.T @ gradient,
+            noise + response.T @ (meat @ response),
+        )
+        constant = list(CONSTANT)
+        points[camera_id] = PrincipalPoint(
+            estimate.coefficients_px[constant], estimate.covariance[np.ix_(constant, constant)]
+        )
+        column = unknowns.lens_columns[camera_id][:1]  # f or fx
+        if not np.isin(column, inverse.held).any():
+            solved = inverse.solve(_units(unknowns.count, column))
+            by_field = response[column[0]]
+            variance = by_field @ estimate.covariance @ by_field
+            variance += float((solved.T @ (meat @ solved)).item())
+            shift = -by_field @ estimate.coefficients_px
+            focal_lengths[camera_id] = FocalLength(float(shift), float(np.sqrt(variance)))
+        roots[camera_id] = estimate.root
+        effects.append(-response @ estimate.root)
+    for camera_id, prior in priors.items():
+        if prior.focal_sigma_px > 0 and camera_id in unknowns.lens_columns:
+            names = estimated_names(scene.cameras[camera_id])
+            columns = unknowns.lens_columns[camera_id]
+            focal = [c for c, name in zip(columns.tolist(), names, strict=True) if name[0] == "f"]
+            effects.append(prior.focal_sigma_px * inverse.change_by(np.array(focal)))
+    together = np.concatenate(effects, axis=1)
+    fields, first = {}, 0
+    for camera_id, root in roots.items():
+        fields[camera_id] = np.zeros((TERMS, together.shape[1]))
+        fields[camera_id][:, first : first + root.shape[1]] = root
+        first += root.shape[1]
+    return SharedErrors(together, fields, points, focal_lengths)
