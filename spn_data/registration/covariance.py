@@ -188,7 +188,7 @@ def _effects_of_fields(
         camera,
         information,
         pull,
-        variance * information,
+        variance,
         principal_point_is_estimated="cx" in linearized.lens,
     )
     effects = [-response @ estimate.root]

@@ -26,15 +26,15 @@ PRINCIPAL_POINT_SIGMA = (
 # Linear terms are a focal length, a rotation of the image, and the shape of the pixels: no errors of a lens.
 _DEGREES = (0, 2, 3, 4, 5)  # decentring and thin prisms have degree 2, radial distortion 3 and 5
 _USUAL_SIGMA = (
-    3e-4  # of the image width: where the measurements do not tell the size of a degree's terms
+    1e-4  # of the image width: where the measurements do not tell the size of a degree's terms
 )
-_LARGEST_SIGMA = 1e-3  # of the image width: no lens has more beyond its radial distortion
+_LARGEST_SIGMA = 2e-4  # of the image width: no usual lens has more beyond its radial distortion
 _EM_STEPS = 200
 # Share of the usual noise that every pull has: a shift of the principal point together with decentring is
 # exactly a rotation of the camera, and what little such terms show is rounding and curvature.
 _NOISE_FLOOR = 1e-4
 # Variance of the pulls over that of independent tracks: whole images share errors too (blur, shutter, haze).
-# Measured on two crossed flights of one camera, each of which must find the lens that both together show.
+# Chosen on two crossed flights of one camera, each of which must find the lens that both together show.
 _DEPENDENT = 10.0
 
 
@@ -111,7 +111,7 @@ def estimate_field(
     camera: Camera,
     information: np.ndarray,
     pull: np.ndarray,
-    noise: np.ndarray,
+    variance_px2: float,
     *,
     principal_point_is_estimated: bool = False,
 ) -> FieldEstimate:
@@ -126,8 +126,8 @@ def estimate_field(
         residuals by the coefficients.
     pull : ndarray, shape (TERMS,)
         -F^T r: where the residuals r pull the coefficients.
-    noise : ndarray, shape (TERMS, TERMS)
-        Covariance of the pull by the errors of measurements, if tracks are independent.
+    variance_px2 : float
+        Covariance of the pull over `information` if tracks are independent.
     principal_point_is_estimated : bool, optional
         Whether the principal point is among the other unknowns.
 
@@ -139,7 +139,7 @@ def estimate_field(
     variance = np.full(TERMS, (_USUAL_SIGMA * camera.width) ** 2)
     held = 0.0 if principal_point_is_estimated else PRINCIPAL_POINT_SIGMA
     variance[degree == 0] = (held * camera.width) ** 2
-    noise = _DEPENDENT * noise
+    noise = _DEPENDENT * variance_px2 * information
     noise = noise + _NOISE_FLOOR * np.mean(np.diag(noise)) * np.eye(TERMS)
     largest = (_LARGEST_SIGMA * camera.width) ** 2
     projector = _without_radial(camera)

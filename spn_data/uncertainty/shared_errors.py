@@ -23,6 +23,8 @@ from spn_data.uncertainty.lens_errors import (
     field_values,
 )
 
+_CAUTIOUS = 0.9  # quantile
+
 
 @dataclass(frozen=True, kw_only=True)
 class LensPrior:
@@ -171,6 +173,17 @@ def held_columns(scene: Scene, unknowns: Unknowns, priors: Mapping[int, LensPrio
     return np.array(held, dtype=np.int64)
 
 
+def _variance(information: np.ndarray, noise: np.ndarray) -> float:
+    """Return a cautious ratio of noise to information (TERMS, TERMS), over the directions of the latter.
+
+    The residuals contain the fields themselves, and so does the noise that is estimated from them: weighting
+    with its full matrix would hide them.
+    """
+    values, vectors = np.linalg.eigh(information)
+    ratio = np.einsum("ji,jk,ki->i", vectors, noise, vectors) / np.maximum(values, 1e-300)
+    return float(np.quantile(ratio, _CAUTIOUS))
+
+
 class LensScores:
     """Sums over the measurements of a map from which the fields of each lens are estimated.
 
@@ -278,11 +291,12 @@ def shared_errors(
         response = inverse.solve(sums.cross[camera_id])
         mixed = response.T @ sums.noise_cross[camera_id]
         noise = noise_factor * (sums.noise[camera_id] + mixed + mixed.T)
+        information = sums.information[camera_id] - sums.cross[camera_id].T @ response
         estimate = estimate_field(
             scene.cameras[camera_id],
-            sums.information[camera_id] - sums.cross[camera_id].T @ response,
+            information,
             sums.pull[camera_id] + response.T @ gradient,
-            noise + response.T @ (meat @ response),
+            _variance(information, noise + response.T @ (meat @ response)),
         )
         constant = list(CONSTANT)
         points[camera_id] = PrincipalPoint(

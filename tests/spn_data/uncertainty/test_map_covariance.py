@@ -346,7 +346,9 @@ def test_many_functionals_at_once_are_those_one_by_one() -> None:
     wanted.append(Functional(np.zeros(0, np.int64), np.zeros((8, 0, 3)), 2, np.eye(8)))
     together = covariance.functional_covariances(wanted)
     for functional, found in zip(wanted, together, strict=True):
-        assert np.allclose(found, covariance.functional_covariances([functional])[0], rtol=1e-9)
+        alone = covariance.functional_covariances([functional])[0]
+        assert np.allclose(found.measured, alone.measured, rtol=1e-9)
+        assert np.allclose(found.shared, alone.shared, rtol=1e-9)
     assert covariance.functional_covariances([]) == []
     some = covariance.pose_covariances(np.array([7, 2]))
     assert np.allclose(some, covariance.pose_covariances()[[7, 2]], rtol=1e-9)
@@ -370,9 +372,9 @@ def test_a_point_with_parallel_rays_has_an_open_depth_and_harms_nothing() -> Non
     covariance = MapCovariance.of(replace(scene, points=far), kept)
     independent = MapCovariance.of(replace(scene, points=far), kept, INDEPENDENT)
     toward = Functional(np.array([point]), (far[point] / np.linalg.norm(far[point]))[None, None])
-    depth = independent.functional_covariances([toward])[0][0, 0]
+    depth = independent.functional_covariances([toward])[0].measured[0, 0]
     assert depth > 1e12
-    assert 0.01 < covariance.functional_covariances([toward])[0][0, 0] / depth < 100
+    assert 0.01 < covariance.functional_covariances([toward])[0].measured[0, 0] / depth < 100
     before = MapCovariance.of(scene, seen, INDEPENDENT).pose_covariances()
     assert np.allclose(independent.pose_covariances(), before, rtol=0, atol=0.1 * before.max())
 

@@ -116,6 +116,22 @@ def test_an_image_without_a_pose_has_a_reason(bundle, flown, tmp_path):
     assert "need 500" in found.reason
 
 
+def test_the_offset_of_the_view_is_added_in_float64(bundle, flown, tmp_path):
+    """Poses of a bundle with an offset are those without it plus the offset, to 1e-8."""
+    offset, folder = [500_000.25, 5_400_000.5, 300.0], tmp_path / "bundle"
+    shutil.copytree(bundle, folder)
+    edited(lambda d: d["view"].update(offset=offset))(folder)
+    with pytest.raises(FormatError, match="its version and its offset contradict each other"):
+        Localizer(folder)
+    edited(lambda d: d.update(version=2))(folder)
+    near, far = (Localizer(each).localize(flown[0], LENS) for each in (bundle, folder))
+    np.testing.assert_allclose(far.poses.centers - offset, near.poses.centers, rtol=0, atol=1e-8)
+    assert np.array_equal(far.poses.quats_wxyz, near.poses.quats_wxyz)
+    assert np.array_equal(far.covariance, near.covariance)
+    line = json.loads(lines.json_line("a.png", 0, 0.0, far, None))
+    assert line["center"] == far.poses.centers[0].tolist()
+
+
 def test_the_view_on_board_is_that_of_the_data_set(flown):
     """Onboard rendering from 1280 x 720 to 480 x 270 matches the data set's to about one grey level."""
     lens = Camera("OPENCV", 1280, 720, np.array([820, 822, 645, 355, -0.11, 0.06, 1e-3, -5e-4]))
