@@ -10,7 +10,7 @@ from spn_cli import options
 
 
 @click.command("check-points")
-@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
 @options.area
 @options.gcp_sigma
 @options.mark_sigma

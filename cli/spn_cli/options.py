@@ -218,7 +218,7 @@ _GEOREGISTRATION = (
     click.option(
         "--gcp",
         "gcp_file",
-        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        type=click.Path(dir_okay=False, path_type=Path),
         help="Ground control points with their marks in images: ODM's gcp_list.txt, or CSV.",
     ),
     click.option(

@@ -174,8 +174,7 @@ class Area:
 
         Raises StageError if the stage is missing, FormatError if its record is damaged or of a newer version.
         """
-        path = self.folder(stage) / _RECORD
-        if not path.exists():
+        if not (path := self.folder(stage) / _RECORD).exists():
             raise StageError(f"{self.folder(stage)} is missing; run {command_of(stage)} first")
         record = read_record(path)
         if current_stage(record.stage).partition("/")[0] != stage.partition("/")[0]:

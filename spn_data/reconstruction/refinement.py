@@ -99,7 +99,9 @@ def refine_model(
         notes.append(bend_note(done["bend_m"]))
     refined = _read(work / "refined", database, frames, stopwatch)
     if refined.covariance is not None and not options.refine_principal_point:
-        found = _determined(refined.scene, refined.covariance.shared.principal_points, held)
+        found = shifted_principal_points(
+            refined.scene, refined.covariance.shared.principal_points, held
+        )
         if found:
             others = {i: Hold.LENS for i in refined.scene.cameras if i not in found}
             with stopwatch.step("refinement"):
@@ -162,7 +164,7 @@ def _read(folder: Path, database: Path, frames: FramesToMap, stopwatch: Stopwatc
     return RefinedModel(folder, scene, observations, points, covariance, problem, ())
 
 
-def _determined(
+def shifted_principal_points(
     scene: Scene, points: Mapping[int, PrincipalPoint], held: Mapping[int, Hold]
 ) -> dict[int, PrincipalPoint]:
     """Return the principal points that are not where they are held, by camera id."""

@@ -125,7 +125,7 @@ def lens_parameters(camera: Camera) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class LensPrior:
+class IntrinsicsPrior:
     """Prior of the L estimated intrinsics, as additional squared residuals.
 
     Attributes
@@ -147,7 +147,7 @@ class LensPrior:
 
 def principal_point_prior(
     state: SequenceState, lens: tuple[str, ...], scale_px: float
-) -> LensPrior:
+) -> IntrinsicsPrior:
     """Return the prior of the principal point: within about 1 % of the image width of its expected place.
 
     Errors of a sequence's measurements are dependent, and its lens has errors that none of them shows, so
@@ -162,7 +162,7 @@ def principal_point_prior(
             offsets[k] = (
                 state.camera.params[names.index(name)] - state.expected.camera.matrix[axis, 2]
             )
-    return LensPrior(weights, offsets)
+    return IntrinsicsPrior(weights, offsets)
 
 
 def linearize(
@@ -228,7 +228,7 @@ def normal_equations(
     frames: int,
     own_points: int,
     weights: np.ndarray,
-    prior: LensPrior,
+    prior: IntrinsicsPrior,
     damping: float = 0.0,
 ) -> NormalEquations:
     """Build the normal equations of residuals and prior.
@@ -315,7 +315,7 @@ def adjust(
     return state
 
 
-def _cost(linearized: Linearized, prior: LensPrior, scale_px: float) -> float:
+def _cost(linearized: Linearized, prior: IntrinsicsPrior, scale_px: float) -> float:
     squared = (linearized.residuals_px**2).sum(axis=1)
     return float(np.log1p(squared / scale_px**2).sum()) + prior.cost / scale_px**2
 

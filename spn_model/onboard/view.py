@@ -61,9 +61,22 @@ class View:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any], *, has_offset: bool = False) -> View:
-        """Parse the result of `to_json`; raise KeyError, TypeError or ValueError if invalid.
+        """Parse the result of `to_json`.
 
-        has_offset : whether there has to be an offset, as the version of the file says.
+        Parameters
+        ----------
+        value : mapping of str to object
+        has_offset : bool
+            Whether there has to be an offset, as the version of the file says.
+
+        Returns
+        -------
+        View
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If it does not describe a view.
         """
         camera, units, up = value["camera"], value["units"], value["up_is_known"]
         width, height = (int(side) for side in value["size"])

@@ -359,8 +359,7 @@ def _check_offset(area: Dataset, last: Path) -> None:
     if there != here:
         raise InputError(
             f"its positions have the offset {position_text(there)}, those of {area.path} have "
-            f"{position_text(here)}, but the last stage needs the same: train it on the latter, or import "
-            "both with the same --subtract",
+            f"{position_text(here)}: train the last stage there, or import both with the same --subtract",
             path=last,
         )
 

@@ -62,6 +62,7 @@ def test_the_commands_are_those_of_this_version():
     """spn-data has exactly these commands; a change here also needs a change of the README."""
     assert COMMANDS == [
         "audit",
+        "check-points",
         "coverage",
         "export",
         "georegister",
@@ -253,7 +254,9 @@ def test_every_option_is_documented(name):
         assert flag in rows
         if parameter.show_default is True:
             shown = rows[flag].strip("` ")
-            if isinstance(parameter.default, int | float):
+            if isinstance(parameter.default, tuple):
+                assert tuple(float(value) for value in shown.split()) == parameter.default, flag
+            elif isinstance(parameter.default, int | float):
                 assert float(shown) == parameter.default, flag
             else:
                 assert shown == parameter.default, flag

@@ -19,6 +19,7 @@ def test_a_given_time_offset_moves_the_telemetry(flight1, tmp_path):
         lambda *_: None,
         rate_hz=1.0,
         fov_deg=72.0,
+        fixed_lens=False,
         any_telemetry=False,
         time_offset_s=2.0,
     )

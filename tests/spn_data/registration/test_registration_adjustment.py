@@ -14,7 +14,7 @@ from spn_data.geometry.least_squares import POSE
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.registration.adjustment import (
-    LensPrior,
+    IntrinsicsPrior,
     SequenceObservations,
     SequenceState,
     adjust,
@@ -161,7 +161,7 @@ def test_eliminating_own_points_changes_no_step() -> None:
         len(state.poses),
         len(state.own_points),
         weights,
-        LensPrior(*np.zeros((2, len(lens)))),
+        IntrinsicsPrior(*np.zeros((2, len(lens)))),
     )
     step = np.linalg.solve(reduced.matrix.toarray(), reduced.right)
     points = reduced.point_right - (reduced.coupling.T @ step).reshape(-1, 3)

@@ -437,7 +437,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "infinite": (edited(lambda d: d["decoding"].update(stride_px=float("inf"))), "is damaged"),
     "no number": (edited(lambda d: d["decoding"].update(first_px="7")), "is damaged"),
     "many cells": (edited(lambda d: d["decoding"]["options"].update(cells=10**9)), "is damaged"),
-    "beyond floats": (edited(lambda d: d["input"].update(params=[10**400] * 3)), "is damaged"),
+    "beyond floats": (
+        edited(lambda d: d["input"].update(params=[10**400] * 3)),
+        "a number of 401 digits",
+    ),
     "no graphs": (edited(lambda d: d.update(graphs=[1])), "is damaged"),
     "other decoding": (edited(lambda d: d["decoding"].update(kind="magic")), "is damaged"),
     "huge input": (edited(lambda d: d["input"].update(width=60_000)), "is damaged"),
