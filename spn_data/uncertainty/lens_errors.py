@@ -26,16 +26,17 @@ PRINCIPAL_POINT_SIGMA = (
 # Linear terms are a focal length, a rotation of the image, and the shape of the pixels: no errors of a lens.
 _DEGREES = (0, 2, 3, 4, 5)  # decentring and thin prisms have degree 2, radial distortion 3 and 5
 _USUAL_SIGMA = (
-    1e-4  # of the image width: where the measurements do not tell the size of a degree's terms
+    3e-5  # of the image width: where the measurements do not tell the size of a degree's terms
 )
 _LARGEST_SIGMA = 2e-4  # of the image width: no usual lens has more beyond its radial distortion
 _EM_STEPS = 200
 # Share of the usual noise that every pull has: a shift of the principal point together with decentring is
 # exactly a rotation of the camera, and what little such terms show is rounding and curvature.
 _NOISE_FLOOR = 1e-4
-# Variance of the pulls over that of independent tracks: whole images share errors too (blur, shutter, haze).
-# Chosen on two crossed flights of one camera, each of which must find the lens that both together show.
-_DEPENDENT = 10.0
+# Largest factor of the variance of pulls that are larger than independent tracks explain: whole images share
+# errors too (blur, shutter, haze). Chosen on two crossed flights of one camera, each of which must find the
+# lens that both together show.
+_MOST_DEPENDENT = 10.0
 
 
 def _exponents() -> list[tuple[int, int]]:
@@ -139,7 +140,7 @@ def estimate_field(
     variance = np.full(TERMS, (_USUAL_SIGMA * camera.width) ** 2)
     held = 0.0 if principal_point_is_estimated else PRINCIPAL_POINT_SIGMA
     variance[degree == 0] = (held * camera.width) ** 2
-    noise = _DEPENDENT * variance_px2 * information
+    noise = variance_px2 * _dependence(information, pull, variance_px2) * information
     noise = noise + _NOISE_FLOOR * np.mean(np.diag(noise)) * np.eye(TERMS)
     largest = (_LARGEST_SIGMA * camera.width) ** 2
     projector = _without_radial(camera)
@@ -158,3 +159,11 @@ def estimate_field(
         if np.allclose(variance, before, rtol=1e-3):
             break
     return FieldEstimate(mean, 0.5 * (covariance + covariance.T))
+
+
+def _dependence(information: np.ndarray, pull: np.ndarray, variance_px2: float) -> float:
+    """Return the mean square of the pulls in their best determined directions, in units of their variance."""
+    values, vectors = np.linalg.eigh(information)
+    best = values >= np.median(values)
+    squares = (vectors.T @ pull)[best] ** 2 / (variance_px2 * values[best])
+    return float(np.clip(np.mean(squares), 1.0, _MOST_DEPENDENT))

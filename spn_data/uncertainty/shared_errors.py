@@ -1,7 +1,7 @@
 """Errors that all measurements of a lens share, propagated to poses, intrinsics and points of a map.
 
-Fields that the camera model does not describe, principal points among them (`lens_errors`), held intrinsics,
-and what is doubtful about an estimated focal length although the residuals do not show it.
+They are the fields that the camera model does not describe, principal points among them (`lens_errors`), and
+focal lengths that were held.
 """
 
 from __future__ import annotations
@@ -16,12 +16,7 @@ from spn_data.colmap.model import MapObservations, Scene
 from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, estimated_names
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
-from spn_data.uncertainty.lens_errors import (
-    CONSTANT,
-    TERMS,
-    estimate_field,
-    field_values,
-)
+from spn_data.uncertainty.lens_errors import CONSTANT, TERMS, estimate_field, field_values
 
 _CAUTIOUS = 0.9  # quantile
 
@@ -35,8 +30,7 @@ class LensPrior:
     hold : Hold
         What mapping held.
     focal_sigma_px : float
-        Standard deviation of a held focal length; of an estimated one, what is doubtful about it beyond its
-        residuals.
+        Standard deviation of a held focal length.
     """
 
     hold: Hold = Hold.NOTHING
@@ -146,12 +140,9 @@ class HeldInverse:
         return self.free.solve(right_side) - self.by_held @ (self.columns.T @ right_side)
 
     def change_by(self, columns: np.ndarray) -> np.ndarray:
-        """Return the change (n, 1) of all unknowns if some of them (k,) are raised by 1 and held there."""
-        is_held = np.isin(self.held, columns)
-        if is_held.any():
-            return np.asarray(self.by_held[:, is_held].sum(axis=1, keepdims=True))
-        solved = self.solve(_units(len(self.free.scale), columns))
-        return np.asarray(solved @ np.linalg.solve(solved[columns], np.ones((len(columns), 1))))
+        """Return the change (n, 1) of all unknowns if some of the held ones (k,) are raised by 1."""
+        raised = np.isin(self.held, columns)
+        return np.asarray(self.by_held[:, raised].sum(axis=1, keepdims=True))
 
 
 def _units(n: int, columns: np.ndarray) -> np.ndarray:

@@ -211,7 +211,7 @@ def test_a_sequence_that_fits_the_map_badly_takes_the_map_for_bent() -> None:
 
 
 def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
-    """`frame_covariances` with the lens covariance equals the sequence's, except for what frames share."""
+    """A frame with the sequence's lens covariance is stated alike, but for what frames and lens share."""
     truth = small()
     mapped, map_covariance = maps()[0]
     state, observations, rows = observe(truth, mapped, np.random.default_rng(1))
@@ -234,7 +234,7 @@ def test_a_single_frame_is_stated_as_the_sequence_states_it() -> None:
         LensUncertainty(covariance=exact.lens),
         _Perfect(),  # type: ignore[arg-type]
     )
-    assert np.allclose(deviations(alone), deviations(exact.poses), rtol=0.15)
+    assert np.allclose(deviations(alone), deviations(exact.poses), rtol=0.25)
     known = frame_covariances(state.poses, state.camera, frames, LensUncertainty(), map_covariance)
     assert np.all(np.linalg.eigvalsh(known) > 0)
 
