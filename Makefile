@@ -40,8 +40,8 @@ demo: $(VENV)/installed
 test: $(VENV)/readers
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile
 
-test-slow: $(VENV)/installed
-	$(BIN)/python -m pytest -m slow
+test-slow: $(VENV)/readers
+	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile
 
 # Mutated files through every reader, 12,000 of them in about ten minutes; failing ones stay in build/fuzz/failures.
 fuzz: $(VENV)/installed

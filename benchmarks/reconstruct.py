@@ -38,7 +38,7 @@ from spn_data.geometry.pose import Poses, Similarity, pose_errors
 from spn_data.storage.stage_record import versions
 
 VERSION = 1  # of the JSON
-STAGES = ("features", "pairs", "matching", "mapping", "refinement")
+STAGES = ("features", "pairs", "matching", "mapping", "refinement", "covariance")
 
 
 def run(

@@ -80,7 +80,7 @@ def test_both_pipelines_map_simulated_frames_and_are_judged_by_the_truth(tmp_pat
     assert figures["frames"] == record.counts["chosen"] == 8
     assert figures["threads"] == 2
     for who, stages in (
-        ("ours", {"features", "pairs", "matching", "mapping", "refinement"}),
+        ("ours", {"features", "pairs", "matching", "mapping", "refinement", "covariance"}),
         ("pycolmap", {"features", "matching", "mapping"}),
     ):
         mine = figures[who]

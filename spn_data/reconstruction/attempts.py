@@ -109,7 +109,7 @@ def attempts(options: ReconstructOptions, *, focal_is_known: bool) -> list[Attem
     """Return the attempts in order: as configured, with fixed intrinsics, with more features and wider pairs.
 
     Poses from all features take four times as long and have the same accuracy; all features are used only if
-    the first attempt fails. Intrinsics are not fixed where a focal length is a guess.
+    the first attempt fails. Where a focal length is a guess, it is held only if nothing else gives a model.
     """
     features, pairs = options.features, options.pairs
     more = replace(
@@ -119,15 +119,13 @@ def attempts(options: ReconstructOptions, *, focal_is_known: bool) -> list[Attem
     )
     incremental = options.engine == "incremental"
     first = Attempt("first", "", "database.db", features, pairs, more, thinned=incremental)
-    ladder = [first]
-    if incremental and focal_is_known:
-        why = "intrinsics held until the end"
-        ladder.append(replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False))
     why = "more features, wider pairs"
-    return [
-        *ladder,
-        Attempt("more features", why, "database-more-features.db", more, pairs.wider(), more),
-    ]
+    wider = Attempt("more features", why, "database-more-features.db", more, pairs.wider(), more)
+    if not incremental:
+        return [first, wider]
+    why = "intrinsics held until the end"
+    steady = replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False)
+    return [first, steady, wider] if focal_is_known else [first, wider, steady]
 
 
 _FEW_MISSING = (

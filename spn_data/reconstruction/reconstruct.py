@@ -250,7 +250,8 @@ def _try(run: _Run, attempt: Attempt, notes: list[str]) -> _Candidate | None:
         notes.append(contradiction_note(wrong))
     if drifted:
         notes.append(drift_note(drifted))
-    return _Candidate(not (wrong or drifted), registered, model, kept, submodels)
+    sound = registered > 2 and not (wrong or drifted)  # nothing contradicts a model of no frames
+    return _Candidate(sound, registered, model, kept, submodels)
 
 
 def _extract(run: _Run, database: MapDatabase, features: FeatureOptions) -> None:
