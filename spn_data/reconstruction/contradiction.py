@@ -112,10 +112,8 @@ def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[Focal
     -------
     list of FocalChange
     """
-    key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
-    lenses = {key_of[n]: int(i) for n, i in zip(scene.names, scene.camera_ids, strict=True)}
     changes = []
-    for key, camera_id in lenses.items():
+    for key, camera_id in frames.camera_ids(scene).items():
         start = frames.lenses[key]
         change = FocalChange(key, start.camera.focal_px[0], scene.cameras[camera_id].focal_px[0])
         if start.focal_is_known and change.ratio > ratio:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.colmap.database import MapDatabase
+from spn_data.colmap.model import Scene
 from spn_data.colmap.verify import ImageForMatching, VerifiedPair, check_pair, match_pairs
 from spn_data.geometry.initial_lens import Hold, InitialLens
 from spn_data.matching.features import FeatureOptions, Features, check_features, extract_from_bytes
@@ -48,6 +49,11 @@ class FramesToMap:
     positions_m: np.ndarray
     lenses: dict[str, InitialLens]
     masks: dict[str, Path]
+
+    def camera_ids(self, scene: Scene) -> dict[str, int]:
+        """Return the ids of the cameras in a model of the frames, by camera key."""
+        key_of = dict(zip(self.names, self.cameras.tolist(), strict=True))
+        return {key_of[name]: int(i) for name, i in zip(scene.names, scene.camera_ids, strict=True)}
 
 
 def held_cameras(database: Path, frames: FramesToMap) -> dict[int, Hold]:

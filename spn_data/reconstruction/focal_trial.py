@@ -14,8 +14,8 @@ from spn_data.uncertainty.shared_errors import FocalLength
 
 _DOUBTFUL = 0.01  # relative error of a focal length that deserves a note
 _SIGMAS = 2.0  # beyond which two statements contradict each other
-# Relative error if the measurements are too few to tell it.
-_UNTOLD = 0.05
+# Relative error if the measurements are too few to determine it.
+_UNDETERMINED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,56 +29,56 @@ class FocalTrial:
     adjusted_px : float
         Focal length in the model.
     images : FocalLength or None
-        What the images say; None if they are too few to tell.
-    told : InitialLens
+        What the images say; None if they are too few.
+    lens : InitialLens
         What metadata or the user say.
     """
 
     camera: str
     adjusted_px: float
     images: FocalLength | None
-    told: InitialLens
+    lens: InitialLens
 
     @property
     def error(self) -> float:
         """Relative error to be expected of the adjusted focal length, by the images."""
-        return _UNTOLD if self.images is None else self.images.error_px / self.adjusted_px
+        return _UNDETERMINED if self.images is None else self.images.error_px / self.adjusted_px
 
     @property
-    def told_px(self) -> float:
+    def stated_px(self) -> float:
         """Focal length that metadata or the user say."""
-        return self.told.camera.focal_px[0]
+        return self.lens.camera.focal_px[0]
 
     @property
     def contradicted(self) -> bool:
         """Whether metadata or the user contradict the adjusted focal length."""
-        change = np.log(self.adjusted_px / self.told_px)
-        known = self.told.focal_is_known
-        return known and abs(change) > _SIGMAS * float(np.hypot(self.error, self.told.focal_sigma))
+        change = np.log(self.adjusted_px / self.stated_px)
+        known = self.lens.focal_is_known
+        return known and abs(change) > _SIGMAS * float(np.hypot(self.error, self.lens.focal_sigma))
 
     def notes(self) -> list[str]:
-        """Return sentences for the user; none if all agree and the images tell the focal length well."""
-        if self.told.hold is not Hold.NOTHING:
+        """Return sentences for the user; none if all agree and the images determine the focal length well."""
+        if self.lens.hold is not Hold.NOTHING:
             return []
         if self.contradicted:
             return [
                 f"camera {self.camera}: the focal length was estimated as {self.adjusted_px:.0f} px, "
-                f"{self.adjusted_px / self.told_px - 1:+.0%} from {self._statement()}: more than both can be "
-                f"wrong by (the images tell it to {self.error:.1%}). Heights above the ground have the same "
-                "relative error; or the images are cropped. --camera gives a calibrated lens to start from, "
+                f"{self.adjusted_px / self.stated_px - 1:+.0%} from {self._statement()}: more than both can "
+                f"be wrong by (the images determine it to {self.error:.1%}). Heights above the ground have the "
+                "same relative error; or the images are cropped. --camera gives a calibrated lens to start from, "
                 "and --fixed-lens holds what is stated"
             ]
         if self.images is None or self.error < _DOUBTFUL:
             return []
         expected = self.adjusted_px + self.images.shift_px
-        stated = f"; stated: {self._statement()}" if self.told.focal_is_known else ""
+        stated = f"; stated: {self._statement()}" if self.lens.focal_is_known else ""
         hold = (
             " --fixed-lens holds the stated one, which is known better."
-            if self.told.focal_is_known and self.told.focal_sigma < self.error
+            if self.lens.focal_is_known and self.lens.focal_sigma < self.error
             else ""
         )
         return [
-            f"camera {self.camera}: the images tell the focal length to {self.error:.1%} only "
+            f"camera {self.camera}: the images determine the focal length only to {self.error:.1%} "
             f"({self.adjusted_px:.0f} px adjusted, {expected:.0f} px, sigma {self.images.sigma_px:.0f} px, "
             f"if the lens differs from its model as the residuals suggest{stated}). Heights above the ground "
             "and positions of other flights may be wrong by the same share, which their stated uncertainty "
@@ -86,7 +86,7 @@ class FocalTrial:
         ]
 
     def _statement(self) -> str:
-        return f"{self.told_px:.0f} px, sigma {self.told.focal_sigma:.1%} ({self.told.source})"
+        return f"{self.stated_px:.0f} px, sigma {self.lens.focal_sigma:.1%} ({self.lens.source})"
 
 
 def focal_trials(
@@ -106,10 +106,8 @@ def focal_trials(
     -------
     list of FocalTrial
     """
-    key_of = dict(zip(frames.names, frames.cameras.tolist(), strict=True))
-    ids = {key_of[name]: int(i) for name, i in zip(scene.names, scene.camera_ids, strict=True)}
     images = {} if covariance is None else covariance.shared.focal_lengths
     return [
         FocalTrial(key, scene.cameras[i].focal_px[0], images.get(i), frames.lenses[key])
-        for key, i in sorted(ids.items())
+        for key, i in sorted(frames.camera_ids(scene).items())
     ]

@@ -8,7 +8,7 @@ standard deviations long.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from spn_data.reconstruction.correspondences import FramesToMap, held_cameras, l
 from spn_data.reconstruction.notes import bend_note, principal_point_note
 from spn_data.uncertainty.lens_errors import PRINCIPAL_POINT_SIGMA
 from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
-from spn_data.uncertainty.shared_errors import PrincipalPoint
+from spn_data.uncertainty.shared_errors import LensPrior, PrincipalPoint
 from spn_data.work.timing import Progress, Stopwatch
 
 # Determined: the standard deviation is at most this share of what is usual among lenses.
@@ -89,7 +89,7 @@ def refine_model(
     RefinedModel
     """
     progress("refinement", 0, 1)
-    held = held_cameras(database, frames)
+    held, lenses = held_cameras(database, frames), lens_priors(database, frames)
     notes = []
     with stopwatch.step("refinement"):
         done = _refine(
@@ -97,7 +97,7 @@ def refine_model(
         )
     if done["bend_m"] > 0:
         notes.append(bend_note(done["bend_m"]))
-    refined = _read(work / "refined", database, frames, stopwatch)
+    refined = _read(work / "refined", lenses, stopwatch)
     if refined.covariance is not None and not options.refine_principal_point:
         found = shifted_principal_points(
             refined.scene, refined.covariance.shared.principal_points, held
@@ -114,18 +114,10 @@ def refine_model(
                     held | others,
                     True,
                 )
-            refined = _read(work / "refined-principal-points", database, frames, stopwatch)
+            refined = _read(work / "refined-principal-points", lenses, stopwatch)
             notes += [principal_point_note(refined.scene, i, found[i]) for i in sorted(found)]
     progress("refinement", 1, 1)
-    return RefinedModel(
-        refined.folder,
-        refined.scene,
-        refined.observations,
-        refined.points,
-        refined.covariance,
-        refined.problem,
-        tuple(notes),
-    )
+    return replace(refined, notes=tuple(notes))
 
 
 def _refine(
@@ -151,13 +143,12 @@ def _refine(
     )
 
 
-def _read(folder: Path, database: Path, frames: FramesToMap, stopwatch: Stopwatch) -> RefinedModel:
+def _read(folder: Path, lenses: Mapping[int, LensPrior], stopwatch: Stopwatch) -> RefinedModel:
     """Read a model and compute its covariance."""
     scene, observations, points = read_map(folder)
     covariance, problem = None, ""
     with stopwatch.step("covariance"):
         try:
-            lenses = lens_priors(database, frames)
             covariance = MapCovariance.of(scene, observations, MapCovarianceOptions(lenses=lenses))
         except GeometryError as error:
             problem = str(error)
