@@ -64,9 +64,9 @@ class FocalTrial:
             return [
                 f"camera {self.camera}: the focal length was estimated as {self.adjusted_px:.0f} px, "
                 f"{self.adjusted_px / self.stated_px - 1:+.0%} from {self._statement()}: more than both can "
-                f"be wrong by (the images determine it to {self.error:.1%}). Heights above the ground have "
-                "the same relative error; or the images are cropped. --camera gives a calibrated lens to start "
-                "from, and --fixed-lens holds what is stated"
+                f"be wrong by (the images determine it to {self.error:.1%}). Heights above the ground "
+                "have the same relative error; or the images are cropped. --camera gives a calibrated lens "
+                "to start from, and --fixed-lens holds what is stated"
             ]
         if self.images is None or self.error < _DOUBTFUL:
             return []
