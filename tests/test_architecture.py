@@ -134,16 +134,38 @@ def test_geometry_knows_arrays_only(name):
 
 
 def test_on_board_needs_errors_and_geometry_only():
-    """Modules of spn_model.onboard import only spn_data.errors, spn_data.geometry and each other.
+    """Rooms that run on board import only spn_data.errors, spn_data.geometry and each other.
 
     HEIC and DNG need other packages, so they are decoded by the function that decodes them elsewhere.
     """
     optional = "spn_data.capture.photos.decode_photo"
-    allowed = ("spn_data.errors.", "spn_data.geometry.", "spn_model.onboard.", optional)
-    for name, path in zip(NAMES, MODULES, strict=True):
-        if name.startswith("spn_model/onboard/"):
-            ours = {full for full in _imports(path) if full.startswith("spn_")}
+    values = ("spn_data.errors.", "spn_data.geometry.")
+    rooms = {
+        "spn_model/onboard/": (*values, "spn_model.onboard.", optional),
+        "spn_model/integrity/": (*values, "spn_model.integrity."),
+        "spn_model/autopilot/": (*values, "spn_model.autopilot.", "spn_model.integrity."),
+    }
+    for room, allowed in rooms.items():
+        names = [name for name in NAMES if name.startswith(room)]
+        assert names, room
+        for name in names:
+            ours = {full for full in _imports(ROOT / name) if full.startswith("spn_")}
             assert {full for full in ours if not full.startswith(allowed)} == set(), name
+
+
+LIGHT_ROOMS = ("spn_model/integrity/", "spn_model/autopilot/")
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(LIGHT_ROOMS)])
+def test_integrity_and_autopilot_load_only_numpy(name):
+    """At their head, modules of these rooms import only the standard library, NumPy and ours."""
+    known = {*sys.stdlib_module_names, "numpy", "spn_data", "spn_model"}
+    heads = [
+        node for node in _tree(ROOT / name).body if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
+    found = {alias.name for node in heads if isinstance(node, ast.Import) for alias in node.names}
+    found |= {node.module or "" for node in heads if isinstance(node, ast.ImportFrom)}
+    assert {full for full in found if full.split(".")[0] not in known} == set()
 
 
 def _module(path: Path) -> str:
