@@ -1,0 +1,186 @@
+"""Links to an autopilot: a thread that sends on an absolute schedule, and the function that opens one."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from spn_data.errors import InputError
+from spn_model.autopilot import mavlink
+from spn_model.autopilot.datum import Datum
+from spn_model.autopilot.frames import Mounting
+from spn_model.autopilot.profiles import ROS2, Message, Profile, profile_of
+from spn_model.autopilot.ros2 import Ros2Writer
+from spn_model.autopilot.sender import Sender, SenderOptions, SenderReport
+from spn_model.autopilot.transport import Transport, open_transport
+from spn_model.integrity.fix import Fix, NoFix
+
+_MOST_DATAGRAMS = 100  # taken in a slot
+
+
+class FixSink(Protocol):
+    """Where fixes go: a link to an autopilot, or a file."""
+
+    def send(self, item: Fix | NoFix) -> None:
+        """Take the result of one image."""
+
+    def close(self) -> None:
+        """Finish."""
+
+
+def unix_us() -> int:
+    """Return the time since 1970 in microseconds."""
+    return time.time_ns() // 1000
+
+
+class Link:
+    """A link to an autopilot, with a thread of its own.
+
+    Parameters
+    ----------
+    profile : Profile
+        The autopilot.
+    transport : Transport
+        Where the messages go.
+    options : SenderOptions
+        What is sent.
+    clock_us : callable
+        Clock of the fixes' `time_us`.
+
+    Notes
+    -----
+    Slot k is due at start + k / rate, so delays do not add up. A slot that is missed is not made up for: the
+    next one has the newest fix.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        transport: Transport,
+        options: SenderOptions,
+        clock_us: Callable[[], int] = unix_us,
+    ):
+        self._transport, self._clock_us = transport, clock_us
+        mav = mavlink.dialect().MAVLink(None, options.system, mavlink.COMPONENT)
+        mav.robust_parsing = True  # damaged bytes are a message of their own, not an error
+        self._mav = mav
+        self._sender = Sender(profile, options, mav)
+        self._period_s = 1 / profile.rate_hz
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="autopilot-link", daemon=True)
+        self._thread.start()
+
+    def send(self, item: Fix | NoFix) -> None:
+        """Take the result of one image; it goes out with the next slot, or is dropped if it is too old."""
+        self._sender.offer(item)
+
+    def report(self) -> SenderReport:
+        """Return a copy of the counts so far."""
+        return replace(self._sender.report)
+
+    def close(self) -> None:
+        """Stop sending; what waits for a slot is not sent."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join()
+            self._transport.close()
+
+    def _run(self) -> None:
+        start = before = time.monotonic()
+        slot = 0
+        while not self._stop.wait(max(0.0, start + slot * self._period_s - time.monotonic())):
+            now = time.monotonic()
+            if slot:
+                self._sender.report.worst_gap_s = max(self._sender.report.worst_gap_s, now - before)
+            before = now
+            self._receive()
+            for message in self._sender.slot(self._clock_us()):
+                self._write(message)
+            slot = max(slot + 1, int((time.monotonic() - start) / self._period_s))
+
+    def _receive(self) -> None:
+        """Take what the autopilot sent, and answer it."""
+        for _ in range(_MOST_DATAGRAMS):
+            try:
+                data = self._transport.receive()
+            except OSError as error:
+                self._failed(error)
+                return
+            if not data:
+                return
+            now_us = self._clock_us()
+            for message in self._mav.parse_buffer(data) or []:
+                for answer in self._sender.handle(message, now_us):
+                    self._write(answer)
+
+    def _write(self, message: Any) -> None:
+        try:
+            self._transport.send(message.pack(self._mav))
+        except OSError as error:
+            self._failed(error)
+        self._mav.seq = (self._mav.seq + 1) % 256
+
+    def _failed(self, error: OSError) -> None:
+        self._sender.report.errors += 1
+        self._sender.report.reason = f"the connection failed: {error}"
+
+
+def open_link(
+    profile: str,
+    url: str,
+    *,
+    mounting: Mounting,
+    datum: Datum | None,
+    messages: Sequence[Message] | None = None,
+    clock_us: Callable[[], int] = unix_us,
+    **options: Any,
+) -> FixSink:
+    """Open a link for fixes.
+
+    Parameters
+    ----------
+    profile : str
+        `px4`, `ardupilot` or `ros2`.
+    url : str
+        `udpout:HOST:PORT`, `udpin:HOST:PORT` or `serial:DEVICE:BAUD`; for `ros2` the new folder of a bag.
+    mounting : Mounting
+        How the camera is fixed to the body.
+    datum : Datum or None
+        Where the world is on the Earth; only `ros2` can do without.
+    messages : sequence of Message, optional
+        Messages to send instead of those of the profile.
+    clock_us : callable, optional
+        Clock of the fixes' `time_us`; Unix time by default.
+    **options
+        Further options of `SenderOptions`.
+
+    Returns
+    -------
+    FixSink
+        A `Link` or a `Ros2Writer`.
+
+    Raises
+    ------
+    InputError
+        If the profile is unknown, the world has no origin, an option is out of range, a package is missing or
+        the connection cannot be opened.
+    """
+    if profile == ROS2:
+        return Ros2Writer(Path(url), mounting=mounting, datum=datum)
+    chosen = profile_of(profile)
+    if datum is None:
+        raise InputError(
+            f"the profile {profile} needs the place of the world on the Earth, and this world has no origin"
+        )
+    given = SenderOptions(
+        mounting=mounting,
+        datum=datum,
+        messages=chosen.messages if messages is None else tuple(messages),
+        **options,
+    )
+    mavlink.dialect()  # before anything is opened
+    return Link(chosen, open_transport(url), given, clock_us)
