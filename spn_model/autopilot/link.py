@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from spn_data.errors import InputError
+from spn_data.errors import InputError, SpnError
 from spn_model.autopilot import mavlink
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
@@ -65,17 +65,26 @@ class Link:
         clock_us: Callable[[], int] = unix_us,
     ):
         self._transport, self._clock_us = transport, clock_us
-        mav = mavlink.dialect().MAVLink(None, options.system, mavlink.COMPONENT)
-        mav.robust_parsing = True  # damaged bytes are a message of their own, not an error
-        self._mav = mav
-        self._sender = Sender(profile, options, mav)
+        self._dialect = mavlink.dialect()
+        self._mav = self._dialect.MAVLink(None, options.system, mavlink.COMPONENT)
+        self._parser = self._new_parser()
+        self._sender = Sender(profile, options, self._mav)
         self._period_s = 1 / profile.rate_hz
         self._stop = threading.Event()
+        self._crash: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="autopilot-link", daemon=True)
         self._thread.start()
 
     def send(self, item: Fix | NoFix) -> None:
-        """Take the result of one image; it goes out with the next slot, or is dropped if it is too old."""
+        """Take the result of one image; it goes out with the next slot, or is dropped if it is too old.
+
+        Raises
+        ------
+        SpnError
+            If the thread has ended, so that nothing is sent any more.
+        """
+        if self._crash is not None:
+            raise SpnError(f"the link to the autopilot has ended: {self._crash!r}")
         self._sender.offer(item)
 
     def report(self) -> SenderReport:
@@ -90,6 +99,12 @@ class Link:
             self._transport.close()
 
     def _run(self) -> None:
+        try:
+            self._slots()
+        except Exception as error:  # silence must not go unnoticed
+            self._crash = error
+
+    def _slots(self) -> None:
         start = before = time.monotonic()
         slot = 0
         while not self._stop.wait(max(0.0, start + slot * self._period_s - time.monotonic())):
@@ -102,6 +117,11 @@ class Link:
                 self._write(message)
             slot = max(slot + 1, int((time.monotonic() - start) / self._period_s))
 
+    def _new_parser(self) -> Any:
+        parser = self._dialect.MAVLink(None)
+        parser.robust_parsing = True  # damaged bytes are a message of their own, not an error
+        return parser
+
     def _receive(self) -> None:
         """Take what the autopilot sent, and answer it."""
         for _ in range(_MOST_DATAGRAMS):
@@ -112,8 +132,10 @@ class Link:
                 return
             if not data:
                 return
+            if not self._transport.is_stream:  # a damaged datagram must not swallow those after it
+                self._parser = self._new_parser()
             now_us = self._clock_us()
-            for message in self._mav.parse_buffer(data) or []:
+            for message in self._parser.parse_buffer(data) or []:
                 for answer in self._sender.handle(message, now_us):
                     self._write(answer)
 

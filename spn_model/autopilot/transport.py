@@ -15,7 +15,15 @@ _FORMS = "udpout:HOST:PORT, udpin:HOST:PORT or serial:DEVICE:BAUD"
 
 
 class Transport(Protocol):
-    """Sends and receives bytes, never waiting."""
+    """Sends and receives bytes, never waiting.
+
+    Attributes
+    ----------
+    is_stream : bool
+        Whether a message may come in several pieces.
+    """
+
+    is_stream: bool
 
     def send(self, data: bytes) -> None:
         """Send bytes; raise OSError if that fails."""
@@ -30,35 +38,36 @@ class Transport(Protocol):
 class Udp:
     """UDP: as a client of one address, or as a server that answers the last sender."""
 
+    is_stream = False
+
     def __init__(self, host: str, port: int, *, server: bool):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._server = server
         self._peer: tuple[str, int] | None = None
         try:
             if server:
                 self._socket.bind((host, port))
             else:
-                self._peer = (socket.gethostbyname(host), port)
+                self._socket.connect((host, port))  # takes datagrams of no other address
             self._socket.setblocking(False)
         except OSError:
             self._socket.close()
             raise
-        self._server = server
 
     def send(self, data: bytes) -> None:
         """Send a datagram; nothing is sent before a server knows to whom."""
-        if self._peer is not None:
+        if not self._server:
+            self._socket.send(data)
+        elif self._peer is not None:
             self._socket.sendto(data, self._peer)
 
     def receive(self) -> bytes:
-        """Return the next datagram; a client takes none but those of its server."""
+        """Return the next datagram."""
         try:
             data, sender = self._socket.recvfrom(MAX_DATAGRAM)
-        except (BlockingIOError, ConnectionError):
+        except BlockingIOError:
             return b""
-        if self._server:
-            self._peer = sender
-        elif sender != self._peer:
-            return b""
+        self._peer = sender
         return data
 
     def close(self) -> None:
@@ -68,6 +77,8 @@ class Udp:
 
 class Serial:
     """A serial line, 8 data bits, no parity, without flow control."""
+
+    is_stream = True
 
     def __init__(self, device: Path, baud: int):
         import termios
