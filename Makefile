@@ -9,10 +9,10 @@ DEMO := demo
 $(VENV)/installed: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,model,cluster,docs,formats]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,model,cluster,docs,formats,mavlink,ros2]'
 	touch $@
 
-# 410 MB that only the tests of exports need.
+# 440 MB that only the tests of exports and of ROS 2 bags need.
 $(VENV)/readers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[readers]'
 	touch $@

@@ -1,4 +1,4 @@
-"""Optional packages for messages, imported when they are needed."""
+"""Optional packages for messages, imported when they are needed; this room cannot know spn_data.media's."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from spn_model.autopilot.frames import BodyPose
 from spn_model.autopilot.profiles import MAV_FRAME_BODY_FRD, Covariance, Profile
 
 INVALID_DEGREES = 2**31 - 1  # INT32_MAX: "invalid" in GLOBAL_POSITION_SENSOR
-UNHEALTHY, PRIMARY = 1, 2  # GLOBAL_POSITION_FLAGS
+UNHEALTHY = 1  # GLOBAL_POSITION_FLAGS
 SOURCE_VISION = 2  # GLOBAL_POSITION_SRC
 ESTIMATOR_VISION = 2  # MAV_ESTIMATOR_TYPE
 QUALITY_FAILED = -1

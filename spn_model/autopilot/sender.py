@@ -59,6 +59,11 @@ class SenderOptions:
     flag_unhealthy: bool = False
 
     def __post_init__(self) -> None:
+        known = set(Message)
+        if not self.messages or not known.issuperset(self.messages):
+            raise InputError(
+                f"the messages are {', '.join(self.messages) or 'none'}; there are {', '.join(Message)}"
+            )
         for name, value in (("sensor", self.sensor), ("system", self.system)):
             if not 1 <= value <= 255:
                 raise InputError(f"the {name} is {value}, not a number of 1 to 255")
@@ -91,7 +96,7 @@ class SenderReport:
     errors : int
         Datagrams that could not be sent or received; the last error is in `reason`.
     autopilot : int or None
-        MAV_AUTOPILOT of the last heartbeat of the autopilot.
+        MAV_AUTOPILOT of its last heartbeat; that of another profile gets no fixes.
     origin : Geodetic or None
         Origin that the autopilot stated.
     least_age_us : int or None
@@ -231,6 +236,11 @@ class Sender:
         if fix.time_us <= self._last_us:
             self.report.repeated += 1
             return []
+        if self.report.autopilot not in (None, self.profile.autopilot):
+            self.report.refused += 1
+            return self._drop(
+                f"the autopilot is of type {self.report.autopilot}, not of profile {self.profile.name}"
+            )
         self.report.reason = ""
         pose = body_pose(fix, self.options.mounting)
         built = [
@@ -245,8 +255,9 @@ class Sender:
         if not built:
             self.report.refused += 1
             return []
-        newest = fix.time_us > self._failed_us
-        self._last_us, self._fresh_until_us = fix.time_us, newest * (fix.time_us + _STALE_US)
+        self._last_us = fix.time_us
+        if fix.time_us > self._failed_us:  # else a later image has failed
+            self._fresh_until_us = fix.time_us + _STALE_US
         self._lost = False
         self.report.sent += 1
         age = max(0, age)

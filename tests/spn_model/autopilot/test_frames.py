@@ -118,6 +118,11 @@ def test_the_covariances_of_mavlink_and_ros_are_those_of_differences():
     def ros(f):
         return body_pose(f, TILTED).with_body_axes(FRD_FROM_FLU)
 
+    def turned(f):
+        return body_pose(f, TILTED).with_body_axes(NED_FROM_ENU @ FRD_FROM_FLU)
+
+    expected = by_differences(fix, turned)
+    np.testing.assert_allclose(turned(fix).covariance, expected, rtol=1e-6, atol=1e-10)
     assert np.abs(ned(fix).rpy[:2]).min() > 0.05
     expected = by_differences(fix, ned, angles=True)
     np.testing.assert_allclose(ned(fix).rpy_covariance(), expected, rtol=1e-6, atol=1e-10)

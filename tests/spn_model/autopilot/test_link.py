@@ -32,6 +32,7 @@ class Autopilot:
         self.url = f"udpout:127.0.0.1:{self.socket.getsockname()[1]}"
         self.messages: list = []
         self.offsets_us: list = []
+        self.type = 3
 
     def clock_us(self):
         """Return its time since boot."""
@@ -49,7 +50,7 @@ class Autopilot:
             if not asked:
                 asked = True
                 self.answer(peer, self.link.timesync_encode(0, self.clock_us() * 1000))
-                self.answer(peer, self.link.heartbeat_encode(2, 3, 0, 0, 4))
+                self.answer(peer, self.link.heartbeat_encode(2, self.type, 0, 0, 4))
                 self.socket.sendto(b"\xfd\xff noise that is no message", peer)
             for message in self.link.parse_buffer(data) or []:
                 self.messages.append(message)
@@ -100,6 +101,7 @@ def wait_for(found, seconds=5.0):
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_an_autopilot_receives_what_was_fixed(autopilot, profile):
     """Over UDP: origin asked for, clocks compared both ways, a fix taken, and its loss said at the rate."""
+    autopilot.type = 12 if profile == "px4" else 3
     link = open_link(profile, autopilot.url, mounting=Mounting(), datum=DATUM)
     autopilot.listen(0.3)
     wait_for(lambda: link.report().origin is not None)
@@ -117,7 +119,7 @@ def test_an_autopilot_receives_what_was_fixed(autopilot, profile):
     assert len(taker.fused) == (2 if profile == "px4" else 1)
     failed = [m for m in autopilot.messages if m.get_type() == "ODOMETRY" and m.quality == -1]
     assert 5 <= len(failed) <= report.failed
-    assert (report.sent, report.autopilot, report.errors) == (1, 3, 0)
+    assert (report.sent, report.autopilot, report.errors) == (1, autopilot.type, 0)
     # Loopback takes microseconds, but this machine may be busy.
     assert abs(report.offset_us + NOW_US // 2) < 20_000
     assert abs(autopilot.offsets_us[0] - NOW_US // 2) < 100_000
@@ -126,6 +128,7 @@ def test_an_autopilot_receives_what_was_fixed(autopilot, profile):
 
 def test_slots_follow_an_absolute_schedule(autopilot):
     """In 1.2 s, 50 slots a second: delays of single slots do not add up, and the worst gap is measured."""
+    autopilot.type = 12
     link = open_link(
         "px4", autopilot.url, mounting=Mounting(), datum=DATUM, messages=[Message.ODOMETRY]
     )

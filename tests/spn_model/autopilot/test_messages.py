@@ -388,6 +388,26 @@ def test_origins_of_others_and_impossible_ones_are_not_used(system, lat, reason)
     assert reason in sender.report.reason
 
 
+def test_a_fix_is_not_sent_to_another_autopilot():
+    """To what ArduPilot would drop in silence, the heartbeat of the wrong autopilot is an objection."""
+    sender = make_sender("px4")
+    other = common.MAVLink(None, 1, 1)
+    sender.handle(parsed(other.heartbeat_encode(2, 3, 0, 0, 4), other), NOW_US)
+    sender.offer(make_fix())
+    assert said(sender) == []
+    assert sender.report.reason == "the autopilot is of type 3, not of profile px4"
+    sender.handle(parsed(other.heartbeat_encode(2, 12, 0, 0, 4), other), NOW_US)
+    sender.offer(make_fix())
+    assert len(said(sender)) == 2
+
+
+@pytest.mark.parametrize("messages", [(), ("ODOMETRY", "GPS_INPUT")])
+def test_other_messages_are_refused(messages):
+    """No message and one that is not offered are refused."""
+    with pytest.raises(InputError, match=r"the messages are .*; there are ODOMETRY"):
+        make_sender(messages=messages)
+
+
 @pytest.mark.parametrize("wrong", [{"sensor": 0}, {"sensor": 256}, {"system": 0}])
 def test_options_out_of_range_are_refused(wrong):
     """Identifiers are one byte and not zero."""
