@@ -19,8 +19,6 @@ from spn_model.autopilot.sender import Sender, SenderOptions, SenderReport
 from spn_model.autopilot.transport import Transport, open_transport
 from spn_model.integrity.fix import Fix, NoFix
 
-_MOST_DATAGRAMS = 100  # taken in a slot
-
 
 class FixSink(Protocol):
     """Where fixes go: a link to an autopilot, or a file."""
@@ -107,37 +105,44 @@ class Link:
     def _slots(self) -> None:
         start = before = time.monotonic()
         slot = 0
-        while not self._stop.wait(max(0.0, start + slot * self._period_s - time.monotonic())):
+        while self._wait(start + slot * self._period_s):
             now = time.monotonic()
             if slot:
                 self._sender.report.worst_gap_s = max(self._sender.report.worst_gap_s, now - before)
             before = now
-            self._receive()
             for message in self._sender.slot(self._clock_us()):
                 self._write(message)
             slot = max(slot + 1, int((time.monotonic() - start) / self._period_s))
+
+    def _wait(self, due: float) -> bool:
+        """Wait for a slot and answer at once what comes meanwhile; return whether the link goes on.
+
+        PX4 uses no answer to TIMESYNC that took more than 10 ms.
+        """
+        while (left := due - time.monotonic()) > 0 and not self._stop.is_set():
+            if self._transport.wait(left) and not self._receive():
+                self._stop.wait(left)
+        return not self._stop.is_set()
 
     def _new_parser(self) -> Any:
         parser = self._dialect.MAVLink(None)
         parser.robust_parsing = True  # damaged bytes are a message of their own, not an error
         return parser
 
-    def _receive(self) -> None:
-        """Take what the autopilot sent, and answer it."""
-        for _ in range(_MOST_DATAGRAMS):
-            try:
-                data = self._transport.receive()
-            except OSError as error:
-                self._failed(error)
-                return
-            if not data:
-                return
-            if not self._transport.is_stream:  # a damaged datagram must not swallow those after it
-                self._parser = self._new_parser()
-            now_us = self._clock_us()
-            for message in self._parser.parse_buffer(data) or []:
-                for answer in self._sender.handle(message, now_us):
-                    self._write(answer)
+    def _receive(self) -> bool:
+        """Take what the autopilot sent, and answer it; return whether there was anything."""
+        try:
+            data = self._transport.receive()
+        except OSError as error:
+            self._failed(error)
+            return False
+        if not self._transport.is_stream:  # a damaged datagram must not swallow those after it
+            self._parser = self._new_parser()
+        now_us = self._clock_us()
+        for message in self._parser.parse_buffer(data) or []:
+            for answer in self._sender.handle(message, now_us):
+                self._write(answer)
+        return bool(data)
 
     def _write(self, message: Any) -> None:
         try:

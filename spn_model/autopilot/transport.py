@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +16,7 @@ _FORMS = "udpout:HOST:PORT, udpin:HOST:PORT or serial:DEVICE:BAUD"
 
 
 class Transport(Protocol):
-    """Sends and receives bytes, never waiting.
+    """Sends and receives bytes without waiting.
 
     Attributes
     ----------
@@ -27,6 +28,9 @@ class Transport(Protocol):
 
     def send(self, data: bytes) -> None:
         """Send bytes; raise OSError if that fails."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until something may have arrived; return whether it may."""
 
     def receive(self) -> bytes:
         """Return what has arrived, or nothing; raise OSError if that fails."""
@@ -60,6 +64,10 @@ class Udp:
             self._socket.send(data)
         elif self._peer is not None:
             self._socket.sendto(data, self._peer)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a datagram."""
+        return bool(select.select([self._socket], [], [], seconds)[0])
 
     def receive(self) -> bytes:
         """Return the next datagram."""
@@ -98,6 +106,10 @@ class Serial:
     def send(self, data: bytes) -> None:
         """Write bytes; what the line cannot take at once is dropped whole by the receiver's checksum."""
         os.write(self._file, data)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for bytes."""
+        return bool(select.select([self._file], [], [], seconds)[0])
 
     def receive(self) -> bytes:
         """Return the bytes that have arrived."""
