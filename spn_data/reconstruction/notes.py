@@ -38,7 +38,7 @@ def bend_note(bend_m: float) -> str:
 
 
 def principal_point_note(key: str, camera: Camera, before: PrincipalPoint) -> str:
-    """Return where the principal point of the camera `key` is; `before` is how it was before it was estimated."""
+    """Return where a principal point was found; `before` is how it was before it was estimated."""
     x, y = camera.matrix[:2, 2] - np.array([camera.width, camera.height]) / 2
     return (
         f"camera {key}: the principal point was estimated: {x:+.1f} px across and {y:+.1f} px down "
