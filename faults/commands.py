@@ -72,7 +72,7 @@ _DATA: tuple[Command, ...] = (
     Command(
         "reconstruct --add",
         ("spn-data", "reconstruct", "second", "--add", "--any-telemetry", *SMALL),
-        "register --all-frames",
+        "reconstruct",
         ("area",),
         is_mapped=True,
     ),

@@ -73,6 +73,7 @@ def prepare(programs: set[str]) -> None:
 
     import spn_data
     import spn_model
+    from spn_data.simulate import produce
     from spn_data.work.parallel import WorkerPool
 
     def run_here(_: WorkerPool, function: Any, batches: Any, on_result: Any) -> None:
@@ -85,6 +86,8 @@ def prepare(programs: set[str]) -> None:
             if not module.name.endswith((".__main__", ".cluster")):
                 importlib.import_module(module.name)
     WorkerPool.run = run_here  # type: ignore[method-assign]
+    in_processes = produce._RenderPool
+    produce._RenderPool = lambda options, folder, _: in_processes(options, folder, 1)  # type: ignore
     cv2.setNumThreads(1)
     adopt_orphans()
     if spn_model in packages:

@@ -331,7 +331,8 @@ def main() -> None:
         parser.error("--work cannot be below /tmp, which is replaced")
     library = str(counter(folder))
     if os.environ.get("LD_PRELOAD") != library:
-        environment = {**os.environ, "LD_PRELOAD": library}
+        # As many threads in a process of its own as in one that is forked: sums depend on them.
+        environment = {**os.environ, "LD_PRELOAD": library, "OMP_NUM_THREADS": "1"}
         os.execve(
             sys.executable, [sys.executable, "-m", "faults.limits", *sys.argv[1:]], environment
         )

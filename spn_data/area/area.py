@@ -260,10 +260,10 @@ class Area:
                     "use --overwrite to redo it, or another --area to keep it"
                 )
         path = self.partial(stage)
-        started = path / _STARTED
-        resumed = started.exists()
+        started, complete = path / _STARTED, (path / _RECORD).exists()
+        resumed = complete or started.exists()
         if resumed:
-            found = read_record(started)
+            found = read_record(path / _RECORD if complete else started)
             if not found.is_made_as(record):
                 if not overwrite and _has_files(path):
                     raise StageError(
@@ -272,7 +272,7 @@ class Area:
                     )
                 shutil.rmtree(path)
                 resumed = False
-            elif (path / _RECORD).exists():  # killed while temporary files were being removed
+            elif complete:  # killed before it was in place
                 self.put_in_place(stage, path)
                 return self.record(stage)
         if not resumed:
@@ -287,11 +287,11 @@ class Area:
         for pattern in SCRATCH.get(stage.partition("/")[0], ()):
             for scratch in path.glob(pattern):
                 shutil.rmtree(scratch) if scratch.is_dir() else scratch.unlink()
+        (path / _STARTED).unlink(missing_ok=True)
         shutil.rmtree(self._old(stage), ignore_errors=True)
         if self.has(stage):
             self.folder(stage).rename(self._old(stage))
         path.rename(self.folder(stage))
-        (self.folder(stage) / _STARTED).unlink(missing_ok=True)
         shutil.rmtree(self._old(stage), ignore_errors=True)
 
     @contextmanager

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.colmap.model import Scene
+from spn_data.geometry.camera import Camera
 from spn_data.reconstruction.attempts import Attempt
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange
 from spn_data.uncertainty.shared_errors import PrincipalPoint
@@ -37,12 +37,11 @@ def bend_note(bend_m: float) -> str:
     )
 
 
-def principal_point_note(scene: Scene, camera_id: int, before: PrincipalPoint) -> str:
+def principal_point_note(key: str, camera: Camera, before: PrincipalPoint) -> str:
     """Return where a principal point was found; `before` is how it was before it was estimated."""
-    camera = scene.cameras[camera_id]
     x, y = camera.matrix[:2, 2] - np.array([camera.width, camera.height]) / 2
     return (
-        f"camera {camera_id}: the principal point was estimated: {x:+.1f} px across and {y:+.1f} px down "
+        f"camera {key}: the principal point was estimated: {x:+.1f} px across and {y:+.1f} px down "
         f"from the centre of the image (sigma {np.max(before.sigma_px):.1f} px)"
     )
 

@@ -115,7 +115,11 @@ def refine_model(
                     True,
                 )
             refined = _read(work / "refined-principal-points", lenses, stopwatch)
-            notes += [principal_point_note(refined.scene, i, found[i]) for i in sorted(found)]
+            notes += [
+                principal_point_note(key, refined.scene.cameras[i], found[i])
+                for key, i in sorted(frames.camera_ids(refined.scene).items())
+                if i in found
+            ]
     progress("refinement", 1, 1)
     return replace(refined, notes=tuple(notes))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-import signal
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -31,7 +30,7 @@ from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
 from spn_data.storage.files import LOCK, locked
-from spn_data.work.parallel import exit_with_parent
+from spn_data.work.parallel import exit_with_parent, interrupts_blocked
 
 Progress = Callable[[int, int], None]
 
@@ -216,8 +215,6 @@ _context: _RenderContext | None = None
 
 def _init_worker(options: SimulateOptions, texture_folder: Path, parent_pid: int) -> None:
     global _context
-    # Ctrl-C reaches every process of the terminal; only the parent handles it, and it ends the workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent(parent_pid)
     _context = _RenderContext(options, texture_folder)
 
@@ -259,7 +256,8 @@ class _RenderPool:
             return
         pending: deque[Future[Any]] = deque()
         for args in arguments:
-            pending.append(self._pool.submit(_run_in_worker, task, args))
+            with interrupts_blocked():  # it starts processes
+                pending.append(self._pool.submit(_run_in_worker, task, args))
             if len(pending) > 4 * self._workers:
                 yield pending.popleft().result()
         while pending:

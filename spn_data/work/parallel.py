@@ -234,18 +234,14 @@ def living_workers_cpu_seconds() -> float:
 def _start_worker() -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    # If it were started with the first worker, it would clear the signal mask set below.
-    resource_tracker.ensure_running()
-    # A worker never receives Ctrl-C, not even while it loads.
-    before_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     # Workers inherit the environment; BLAS reads its thread limit when it is loaded.
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)
     try:
         process = context.Process(target=_serve, args=(theirs, os.getpid()))
-        process.start()
+        with interrupts_blocked():
+            process.start()
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before_mask)
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -305,6 +301,21 @@ def _deferred_interrupts() -> Iterator[Callable[[], None]]:
         raise_if_interrupted()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Block Ctrl-C: processes started within the block never receive it, not even while they load.
+
+    It reaches every process of the terminal; only the parent handles it, and it ends its children.
+    """
+    # If it were started with the first of these processes, it would clear the signal mask.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def exit_with_parent(parent_pid: int) -> None:

@@ -13,7 +13,6 @@ from torch import Tensor
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.option_parsing import from_mapping
 from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.regression_examples import (
     FeatureCache,
@@ -25,6 +24,7 @@ from spn_model.models.regression_examples import (
 from spn_model.models.regression_options import RegressionOptions, RegressionStageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.normalization import initialize_as_identity
+from spn_model.networks.option_parsing import from_mapping
 from spn_model.networks.pose_loss import (
     beta_weighted_loss,
     laplace_nll,

@@ -16,10 +16,10 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
-from spn_model.models.option_parsing import from_mapping
 from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.scene_examples import SceneExamples, SceneStageOptions
 from spn_model.networks.imagenet import MEAN, STD
+from spn_model.networks.option_parsing import from_mapping
 from spn_model.networks.scene_coordinates import (
     SceneCoordinates,
     laplace_loss,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import torch
 
 from spn_data.errors import InputError
+from spn_model.networks.option_parsing import from_mapping
 from spn_model.networks.posenet import PoseNet, PoseNetOptions
 from spn_model.networks.regressor import Regressor
 from spn_model.networks.squeezeposenet import SqueezePoseNet, SqueezePoseNetOptions
@@ -41,7 +42,10 @@ def build(name: str, options: Mapping[str, Any] | None = None, *, seed: int = 0)
     if name not in REGRESSORS:
         raise InputError(f"unknown network {name!r}; choose one of {', '.join(REGRESSORS)}")
     network, kind = REGRESSORS[name]
-    chosen = _options(name, kind, dict(options or {}))
+    try:
+        chosen = from_mapping(kind, options or {}, f"network {name}")
+    except ValueError as error:
+        raise InputError(f"network {name}: {error}") from error
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return network(chosen)
@@ -50,23 +54,3 @@ def build(name: str, options: Mapping[str, Any] | None = None, *, seed: int = 0)
 def options_of(network: Regressor) -> dict[str, Any]:
     """Return the options with which `build` makes a network of the same architecture."""
     return asdict(network.options)
-
-
-def _options(name: str, kind: type[Any], given: dict[str, Any]) -> Any:
-    defaults = {field.name: field.default for field in fields(kind)}
-    for option, value in given.items():
-        if option not in defaults:
-            raise InputError(
-                f"network {name} has no option {option!r}; its options are {', '.join(defaults)}"
-            )
-        wanted = type(defaults[option])
-        if wanted is float and type(value) is int:
-            given[option] = float(value)
-        elif type(value) is not wanted:
-            raise InputError(
-                f"option {option} of network {name} is {value!r}, needs to be of type {wanted.__name__}"
-            )
-    try:
-        return kind(**given)
-    except ValueError as error:
-        raise InputError(f"invalid options of network {name}: {error}") from error

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -113,6 +116,41 @@ def test_a_kill_between_the_two_renames_loses_neither_version(tmp_path: Path) ->
     make(area, FRAMES, "first")
     area.folder(FRAMES).rename(tmp_path / f".old-{FRAMES}")
     assert content(Area(tmp_path), FRAMES) == "first"
+
+
+@pytest.mark.parametrize("killed_after", range(5))
+def test_a_finished_stage_is_the_same_after_a_kill_at_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_after: int
+) -> None:
+    """Killed at any removal or renaming of files, a replaced stage gets the files that it gets otherwise."""
+    area = Area(tmp_path)
+    make(area, FRAMES, "first", n=1)
+    whole = {path.name for path in area.folder(FRAMES).iterdir()}
+    left = [killed_after]
+
+    def killed(change: Callable[..., Any]) -> Callable[..., Any]:
+        def changed(*given: Any, **options: Any) -> Any:
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return change(*given, **options)
+
+        return changed
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        work = area.begin(FRAMES, {"n": 2}, {}, overwrite=True)
+        assert isinstance(work, StageWork)
+        (work.path / "content").write_text("second")
+        for name in ("rename", "unlink", "replace"):
+            patch.setattr(Path, name, killed(getattr(Path, name)))
+        work.finish(counts={}, seconds={}, cpu_seconds={})
+    area = Area(tmp_path)
+    with area.locked():
+        if not isinstance(area.begin(FRAMES, {"n": 2}, {}, overwrite=True), StageRecord):
+            make(area, FRAMES, "second", n=2, overwrite=True)
+    assert content(area, FRAMES) == "second"
+    assert {path.name for path in area.folder(FRAMES).iterdir()} == whole
+    assert {path.name for path in tmp_path.iterdir()} == {FRAMES, ".lock"}
 
 
 @pytest.mark.parametrize("killed_after", [0, 1, 2, 3])

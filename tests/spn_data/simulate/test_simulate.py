@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from spn_data.simulate import (
     simulate_paths,
     simulate_telemetry,
 )
+from spn_data.simulate.produce import _RenderPool
 
 # Three frames of each flight at 160 x 90, with coarse textures: quick to paint and render.
 TINY = replace(
@@ -161,6 +163,18 @@ def test_existing_folder_is_refused_and_a_stopped_run_leaves_nothing(tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         simulate(tmp_path / "stopped", replace(TINY, only=("low",)), stop, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def blocked_signals(_: object) -> set[signal.Signals]:
+    return set(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def test_ctrl_c_does_not_reach_processes_that_render(tmp_path: Path) -> None:
+    """Ctrl-C is blocked from the start of a rendering process: it may come while its modules load."""
+    with _RenderPool(TINY, tmp_path, 2) as pool:
+        (blocked,) = pool.map(blocked_signals, [()])
+    assert signal.SIGINT in blocked
+    assert signal.SIGINT not in blocked_signals(None)
 
 
 def test_what_a_killed_run_left_is_replaced_and_a_second_run_is_refused(tmp_path: Path) -> None:
