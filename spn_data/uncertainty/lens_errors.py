@@ -41,6 +41,7 @@ _EM_STEPS = 300
 # nearly a rotation of the camera, and what little such terms show is rounding and curvature.
 _NOISE_FLOOR = 1e-6
 _RIDGE = 1e-9  # of the largest information
+_TINY = 1e-12  # keeps matrices regular where measurements tell nothing at all
 _FEWEST_BLOCKS = 4  # with fewer, they tell nothing of noise
 
 
@@ -197,7 +198,7 @@ def estimate_field(
     noise = variance_px2 * whole
     if len(pull) >= _FEWEST_BLOCKS:
         noise, variance_px2 = _held_out_noise(information, pull)
-    noise = noise + _NOISE_FLOOR * np.mean(np.diag(noise)) * np.eye(TERMS)
+    noise = noise + (_NOISE_FLOOR * np.mean(np.diag(noise)) + _TINY) * np.eye(TERMS)
     through = whole @ groups.fields
     variance = groups.usual.copy()
     for _ in range(_EM_STEPS):
@@ -228,10 +229,11 @@ def _held_out_noise(information: np.ndarray, pull: np.ndarray) -> tuple[np.ndarr
     """
     whole, pulled = information.sum(axis=0), pull.sum(axis=0)
     values, vectors = np.linalg.eigh(whole)
-    values = np.maximum(values, _RIDGE * values[-1])
+    ridge = max(_RIDGE * float(values[-1]), _TINY)
+    values = np.maximum(values, ridge)
     squares, expected = [], []
     for own, own_pull in zip(information, pull, strict=True):
-        spread = np.linalg.inv(whole - own + _RIDGE * values[-1] * np.eye(len(values)))
+        spread = np.linalg.inv(whole - own + ridge * np.eye(len(values)))
         missed = vectors.T @ (own_pull - own @ (spread @ (pulled - own_pull)))
         squares.append(missed**2)
         covariance = own + own @ spread @ own

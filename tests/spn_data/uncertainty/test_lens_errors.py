@@ -84,6 +84,15 @@ def test_what_differs_between_blocks_is_noise_and_what_does_not_is_a_field() -> 
     assert np.abs(np.delete(apart.coefficients_px, CONSTANT)).max() < 0.02
 
 
+def test_measurements_that_tell_nothing_leave_what_is_usual() -> None:
+    """Without information, the principal point is as uncertain as among lenses, and nothing else is large."""
+    found = estimate_field(MODEL, np.zeros((BLOCKS, TERMS, TERMS)), np.zeros((BLOCKS, TERMS)), 1.0)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.allclose(sigma[list(CONSTANT)], 6.4, rtol=1e-2)
+    assert np.delete(sigma, CONSTANT).max() < 0.2
+    assert np.all(found.coefficients_px == 0)
+
+
 def test_a_shifted_principal_point_is_told_by_converging_views() -> None:
     """A shift of 9 and -6 px is found within three sigma, with a sigma below 3.5 px, in one step."""
     _, made = seen_through(lens_with((9.0, -6.0)), seed=1)
