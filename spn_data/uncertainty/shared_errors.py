@@ -18,8 +18,6 @@ from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, es
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.lens_errors import CONSTANT, TERMS, estimate_field, field_values
 
-_CAUTIOUS = 0.9  # quantile
-
 
 @dataclass(frozen=True, kw_only=True)
 class LensPrior:
@@ -326,6 +324,7 @@ def shared_errors(
     focal_lengths: dict[int, FocalLength] = {}
     dependences: dict[int, float] = {}
     for camera_id in unknowns.lens_columns:
+        # Minus the change of the unknowns per unit of each coefficient.
         response = inverse.solve(sums.cross[camera_id])
         mixed = response.T @ sums.noise_cross[camera_id]
         noise = noise_factor * (sums.noise[camera_id] + mixed + mixed.T)
