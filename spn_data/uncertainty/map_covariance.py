@@ -10,8 +10,8 @@ independent: a keypoint that drifts as the view changes drifts alike in neighbou
 gives several keypoints. Therefore only the scores (J^T r) of whole clusters of measurements are taken as
 independent, and the covariance is the cluster-robust (sandwich) estimate S^+ M S^+ with M summed over
 clusters. A point's own error, for which its few residuals are not enough, is predicted by a model of the
-drift (`track_noise`). Whole images may err alike too: cross-validation of blocks of measurements tells by which
-factor M is too small (`shared_errors`).
+drift (`track_noise`). Whole images may err alike too: cross-validation of blocks of measurements tells by
+which factor M is too small (`shared_errors`).
 
 Some errors are shared by all measurements of a lens, and no number of measurements averages them out: the
 field that the camera model does not describe (`lens_errors`), and errors of intrinsics that were held
