@@ -1,12 +1,12 @@
-"""Compare all labels of an area with the exact ground truth of the simulated flights.
+"""Compare all labels of an area with the exact ground truth of its flights.
 
     python benchmarks/labels.py AREA FLIGHTS [--json OUT]
 
-FLIGHTS is the output of `spn-data simulate`, including evaluation flights. The best similarity of the map to
-the truth, over its mapping frames, is removed first, so that only registration is evaluated. A covariance is
-correct if the NEES e^T C^-1 e is chi-squared with 6 degrees of freedom: median 5.35 (calibration 1), 0.1 %
-above 22.5 (beyond). Frames of one sequence share the error of the map, so that the calibration of one
-sequence is hardly more than a single draw.
+FLIGHTS is the output of `spn-data simulate`, including evaluation flights, or `../shared/data/courtyard-b`.
+The best similarity of the map to the truth, over its mapping frames, is removed first, so that only
+registration is evaluated. A covariance is correct if the NEES e^T C^-1 e is chi-squared with 6 degrees of
+freedom: median 5.35 (calibration 1), 0.1 % above 22.5 (beyond). Frames of one sequence share the error of the
+map, so that the calibration of one sequence is hardly more than a single draw.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from truth import error_figures, read_arguments, true_poses
+from truth import error_figures, read_arguments, true_flight, true_poses
 
 from spn_data.area.area import Area
 from spn_data.geometry.pose import Similarity, pose_errors
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.labels import Labels
-from spn_data.simulate.truth import read_truth
 
 CHI2_MEDIAN, CHI2_FAR = 5.348, 22.5
 WRONG_M, WRONG_DEG = 0.5, 2.0
@@ -35,30 +34,29 @@ def compare(area: Area, flights: Path) -> dict[str, Any]:
     """Return the figures of each kind of label, lengths in metres."""
     labelled = read_labelled_area(area)
     mapping = labelled.mapping.select(labelled.mapping.registered)
-    truth = flights / "truth"
-    world_from_map = Similarity.fit(mapping.poses.centers, true_poses(mapping, truth).centers)
-    figures = {"mapping": figures_of(mapping, world_from_map, truth)}
+    world_from_map = Similarity.fit(mapping.poses.centers, true_poses(mapping, flights).centers)
+    figures = {"mapping": figures_of(mapping, world_from_map, flights)}
     for name in np.unique(labelled.tracked.sequences).tolist():
         mine = labelled.tracked.select(labelled.tracked.sequences == name)
-        figures[f"{name} (between)"] = figures_of(mine, world_from_map, truth)
+        figures[f"{name} (between)"] = figures_of(mine, world_from_map, flights)
     for name, labels in labelled.evaluation.items():
-        figures[name] = figures_of(labels.select(~labels.tracked), world_from_map, truth)
+        figures[name] = figures_of(labels.select(~labels.tracked), world_from_map, flights)
         if labels.tracked.any():
             figures[f"{name} (between)"] = figures_of(
-                labels.select(labels.tracked), world_from_map, truth
+                labels.select(labels.tracked), world_from_map, flights
             )
-            figures[f"{name} (all frames)"] = figures_of(labels, world_from_map, truth)
-        figures[name]["focal_error"] = focal_error(labelled, name, truth)
+            figures[f"{name} (all frames)"] = figures_of(labels, world_from_map, flights)
+        figures[name]["focal_error"] = focal_error(labelled, name, flights)
     return figures
 
 
-def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[str, Any]:
+def figures_of(labels: Labels, world_from_map: Similarity, flights: Path) -> dict[str, Any]:
     """Return the errors and the calibration of labels."""
     registered = labels.select(labels.registered)
     figures: dict[str, Any] = {"frames": len(labels), "registered": len(registered)}
     if not len(registered):
         return figures
-    true = true_poses(registered, truth)
+    true = true_poses(registered, flights)
     found = registered.transformed(world_from_map)
     error_m, error_deg = pose_errors(found.poses, true)
     turned = rotation_vectors(true.rotations @ np.transpose(found.poses.rotations, (0, 2, 1)))
@@ -73,10 +71,9 @@ def figures_of(labels: Labels, world_from_map: Similarity, truth: Path) -> dict[
     }
 
 
-def focal_error(labelled: LabelledArea, name: str, truth: Path) -> float:
+def focal_error(labelled: LabelledArea, name: str, flights: Path) -> float:
     """Return the relative error of a sequence's focal length."""
-    true = read_truth(truth, name).camera
-    return labelled.cameras[name].focal_px[0] / true.focal_px[0] - 1
+    return labelled.cameras[name].focal_px[0] / true_flight(flights, name)[1] - 1
 
 
 def main() -> None:

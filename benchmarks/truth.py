@@ -29,12 +29,25 @@ from spn_data.simulate.truth import read_truth
 from spn_data.storage.json_files import read_json
 
 
-def true_poses(frames: Frames | Labels, truth_folder: Path) -> Poses:
+def true_flight(flights: Path, sequence: str) -> tuple[Poses, float]:
+    """Return the exact poses of the frames of a flight, and its focal length in px."""
+    table = flights / f"{sequence}.truth.csv"  # of courtyard-b
+    if not table.exists():
+        truth = read_truth(flights / "truth", sequence)
+        return truth.poses, truth.camera.focal_px[0]
+    rows = np.loadtxt(table, delimiter=",", skiprows=1, ndmin=2)
+    if not np.array_equal(rows[:, 0], np.arange(len(rows))):
+        raise SystemExit(f"{table}: frames are not numbered from 0")
+    camera = read_json(flights / f"{sequence}.camera.json")
+    return Poses(rows[:, 2:5], rows[:, 5:9]), float(camera["f"])
+
+
+def true_poses(frames: Frames | Labels, flights: Path) -> Poses:
     """Return the exact poses of N frames by their index in the video."""
     true = Poses.unknown(len(frames))
     for sequence in np.unique(frames.sequences).tolist():
         rows = np.flatnonzero(frames.sequences == sequence)
-        poses = read_truth(truth_folder, sequence).poses[frames.video_frame[rows]]
+        poses = true_flight(flights, sequence)[0][frames.video_frame[rows]]
         true.centers[rows], true.quats_wxyz[rows] = poses.centers, poses.quats_wxyz
     return true
 
@@ -75,7 +88,7 @@ def true_of_scene(scene: Scene, chosen: Frames, flights: Path) -> Poses:
     """Return the exact poses of a scene's images in its order."""
     row = {name: k for k, name in enumerate(chosen.names.tolist())}
     registered = chosen.select(np.array([row[name] for name in scene.names]))
-    return true_poses(registered, flights / "truth")
+    return true_poses(registered, flights)
 
 
 def error_figures(poses: Poses, true: Poses) -> dict[str, float]:

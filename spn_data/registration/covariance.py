@@ -32,7 +32,7 @@ from spn_data.registration.adjustment import (
     principal_point_prior,
 )
 from spn_data.registration.solution import SCALE_PX
-from spn_data.uncertainty.lens_errors import TERMS, estimate_field, field_values
+from spn_data.uncertainty.lens_errors import BLOCKS, TERMS, estimate_field, field_values
 from spn_data.uncertainty.map_covariance import Functional, MapCovariance
 
 _FRAMES_AT_ONCE = 8
@@ -101,6 +101,7 @@ def sequence_covariance(
     fields = _effects_of_fields(
         state,
         observations,
+        point_rows,
         linearized,
         weights,
         weighted_jacobian,
@@ -144,6 +145,7 @@ def sequence_covariance(
 def _effects_of_fields(
     state: SequenceState,
     observations: SequenceObservations,
+    point_rows: np.ndarray,
     linearized: Linearized,
     weights: np.ndarray,
     weighted_jacobian: sparse.csr_matrix,
@@ -158,36 +160,34 @@ def _effects_of_fields(
     """
     own = observations.own >= 0
     count = len(state.own_points)
-    of_own = rows_to_sparse(
-        (linearized.by_point * np.sqrt(weights)[:, None, None])[own],
-        3 * observations.own[own][:, None] + np.arange(3),
-        3 * count,
-    )
     root = np.sqrt(weights)
+    by_own = linearized.by_point[own] * root[own][:, None, None]
+    of_own = rows_to_sparse(by_own, 3 * observations.own[own][:, None] + np.arange(3), 3 * count)
 
-    def reduced(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return J^T F, F^T F and -F^T r of fields (2 M, t), with the own points projected out."""
-        scaled = values * np.repeat(root, 2)[:, None]
-        cross, square = weighted_jacobian.T @ scaled, scaled.T @ scaled
-        if count:
-            through = of_own.T @ scaled[np.repeat(own, 2)]
-            back = np.einsum("pij,pjt->pit", normal.point_inverse, through.reshape(count, 3, -1))
-            back = back.reshape(3 * count, -1)
-            cross, square = cross - normal.coupling @ back, square - through.T @ back
-        residuals = (linearized.residuals_px * root[:, None]).ravel()
-        return cross, square, -scaled.T @ residuals
+    def without_points(values: np.ndarray) -> np.ndarray:
+        """Return weighted fields (2 M, t) with the own points projected out."""
+        if not count:
+            return values
+        lines = np.repeat(own, 2)
+        through = (of_own.T @ values[lines]).reshape(count, 3, -1)
+        moved = np.einsum("pij,pjt->pit", normal.point_inverse, through).reshape(3 * count, -1)
+        left = values.copy()
+        left[lines] -= of_own @ moved
+        return left
 
     camera = state.camera
-    values = field_values(camera, observations.pixels)
+    values = field_values(camera, observations.pixels) * root[:, None]
     both = np.zeros((2 * len(values), TERMS))
     both[0::2, : values.shape[1]] = both[1::2, values.shape[1] :] = values
-    cross, square, pull = reduced(both)
-    response = factor.solve(cross)
-    information = square - cross.T @ response
+    response = factor.solve(weighted_jacobian.T @ without_points(both))
+    fields = without_points(both - weighted_jacobian @ response)
+    residuals = (linearized.residuals_px * root[:, None]).ravel()
+    block = np.repeat(_blocks_of_points(observations, point_rows), 2)
+    parts = [(fields[block == b], residuals[block == b]) for b in range(BLOCKS)]
     estimate = estimate_field(
         camera,
-        information,
-        pull,
+        np.stack([part.T @ part for part, _ in parts]),
+        np.stack([-part.T @ left for part, left in parts]),
         variance,
         principal_point_is_estimated="cx" in linearized.lens,
     )
@@ -196,8 +196,20 @@ def _effects_of_fields(
         focal = tuple(name for name in MODELS[camera.model] if name in ("f", "fx", "fy"))
         by_focal = linearize(state, observations, focal).by_lens.sum(axis=2).reshape(-1, 1)
         sigma_px = state.expected.focal_sigma * float(np.mean(camera.focal_px))
-        effects.append(-sigma_px * factor.solve(reduced(by_focal)[0]))
+        by_focal = without_points(by_focal * np.repeat(root, 2)[:, None])
+        effects.append(-sigma_px * factor.solve(weighted_jacobian.T @ by_focal))
     return np.concatenate(effects, axis=1)
+
+
+def _blocks_of_points(observations: SequenceObservations, point_rows: np.ndarray) -> np.ndarray:
+    """Return the block (M,) of each measurement, 0..BLOCKS-1: whole points, in order of their first frame."""
+    point = np.where(observations.own >= 0, -1 - observations.own, point_rows)
+    _, first, index = np.unique(point, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    ends = np.cumsum(np.bincount(index)[order])
+    block = np.empty(len(first), dtype=np.int64)
+    block[order] = (ends - 1) * BLOCKS // len(point)
+    return np.asarray(block[index])
 
 
 def misfit_factor(sigma_px: float, map_covariance: MapCovariance) -> float:

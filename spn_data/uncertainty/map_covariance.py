@@ -10,7 +10,8 @@ independent: a keypoint that drifts as the view changes drifts alike in neighbou
 gives several keypoints. Therefore only the scores (J^T r) of whole clusters of measurements are taken as
 independent, and the covariance is the cluster-robust (sandwich) estimate S^+ M S^+ with M summed over
 clusters. A point's own error, for which its few residuals are not enough, is predicted by a model of the
-drift (`track_noise`).
+drift (`track_noise`). Whole images may err alike too: cross-validation of blocks of measurements tells by
+which factor M is too small (`shared_errors`).
 
 Some errors are shared by all measurements of a lens, and no number of measurements averages them out: the
 field that the camera model does not describe (`lens_errors`), and errors of intrinsics that were held
@@ -39,6 +40,7 @@ from spn_data.uncertainty.bundle_jacobians import (
     linearize_bundle,
 )
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
+from spn_data.uncertainty.lens_errors import BLOCKS
 from spn_data.uncertainty.shared_errors import (
     HeldInverse,
     LensPrior,
@@ -173,19 +175,18 @@ class MapCovariance:
             noise = fit_track_noise(linearize_bundle(scene, seen, unknowns, some))
         normal_matrix = sparse.csr_matrix((unknowns.count, unknowns.count))
         meat = sparse.csr_matrix((unknowns.count, unknowns.count))
-        gradient = np.zeros(unknowns.count)
         lens_scores = LensScores(scene, unknowns)
         squares, parts = 0.0, []
         for part in _parts(rows, cluster[seen.point_idx[rows]]):
             bundle = linearize_bundle(scene, seen, unknowns, part)
-            normal_matrix = normal_matrix + bundle.reduced_normal_matrix()
-            gradient += bundle.design.T @ bundle.residuals
+            normal = bundle.reduced_normal_matrix()
+            normal_matrix = normal_matrix + normal
             squares += float(bundle.residuals @ bundle.residuals)
             if options.clustered:
                 scores, of_measurement = _clustered_scores(bundle, cluster[bundle.points])
                 meat = meat + scores.T @ scores
                 if not options.exact_lenses:
-                    lens_scores.add(bundle, seen, part, of_measurement, scores)
+                    lens_scores.add(bundle, normal, seen, part, of_measurement, scores)
             parts.append(
                 (
                     bundle.points,
@@ -209,8 +210,9 @@ class MapCovariance:
         if options.clustered and not options.exact_lenses:
             factor = after_points / redundancy
             shared = shared_errors(
-                scene, unknowns, inverse, lens_scores, gradient, meat, factor, options.lenses
+                scene, unknowns, inverse, lens_scores, meat, factor, options.lenses
             )
+            meat = shared.dependence * meat
         point_row = np.full(len(scene.points), -1)
         point_row[points] = np.arange(len(points))
         return cls(
@@ -343,8 +345,9 @@ def _clusters_of_points(seen: MapObservations, rows: np.ndarray, points: int) ->
 def _parts(rows: np.ndarray, cluster: np.ndarray) -> Iterator[np.ndarray]:
     """Yield pieces of rows sorted by cluster without splitting a cluster."""
     first = 0
+    most = min(_MEASUREMENTS_AT_ONCE, -(-len(rows) // BLOCKS))
     while first < len(rows):
-        last = min(first + _MEASUREMENTS_AT_ONCE, len(rows))
+        last = min(first + most, len(rows))
         last = int(np.searchsorted(cluster, cluster[last - 1], side="right"))
         yield rows[first:last]
         first = last

@@ -18,8 +18,6 @@ from spn_data.uncertainty.bundle_jacobians import LinearizedBundle, Unknowns, es
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.lens_errors import CONSTANT, TERMS, estimate_field, field_values
 
-_CAUTIOUS = 0.9  # quantile
-
 
 @dataclass(frozen=True, kw_only=True)
 class LensPrior:
@@ -100,12 +98,15 @@ class SharedErrors:
     principal_points : dict of int to PrincipalPoint
     focal_lengths : dict of int to FocalLength
         Of lenses whose focal length was estimated.
+    dependence : float
+        Factor (at least 1) by which whole blocks of measurements vary more than their tracks explain.
     """
 
     unknowns: np.ndarray
     fields: dict[int, np.ndarray] = field(default_factory=dict)
     principal_points: dict[int, PrincipalPoint] = field(default_factory=dict)
     focal_lengths: dict[int, FocalLength] = field(default_factory=dict)
+    dependence: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,18 +166,40 @@ def held_columns(scene: Scene, unknowns: Unknowns, priors: Mapping[int, LensPrio
 
 
 def _variance(information: np.ndarray, noise: np.ndarray) -> float:
-    """Return a cautious ratio of noise to information (TERMS, TERMS), over the directions of the latter.
-
-    The residuals contain the fields themselves, and so does the noise that is estimated from them: weighting
-    with its full matrix would hide them.
-    """
+    """Return the ratio of noise to information (TERMS, TERMS), over their best determined directions."""
     values, vectors = np.linalg.eigh(information)
-    ratio = np.einsum("ji,jk,ki->i", vectors, noise, vectors) / np.maximum(values, 1e-300)
-    return float(np.quantile(ratio, _CAUTIOUS))
+    best = vectors[:, values >= np.median(values)]
+    of_noise, of_information = (np.trace(best.T @ m @ best) for m in (noise, information))
+    return float(of_noise / max(of_information, 1e-300))
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Sums over one block of measurements; F, J and r are those of `LensScores`.
+
+    Attributes
+    ----------
+    normal : csr_matrix, shape (n, n)
+        J^T J.
+    gradient : ndarray, shape (n,)
+        J^T r.
+    information : dict of int to ndarray, shape (TERMS, TERMS)
+        F^T F by camera id.
+    cross : dict of int to csr_matrix, shape (n, TERMS)
+        J^T F.
+    pull : dict of int to ndarray, shape (TERMS,)
+        -F^T r.
+    """
+
+    normal: sparse.csr_matrix
+    gradient: np.ndarray
+    information: dict[int, np.ndarray]
+    cross: dict[int, sparse.csr_matrix]
+    pull: dict[int, np.ndarray]
 
 
 class LensScores:
-    """Sums over the measurements of a map from which the fields of each lens are estimated.
+    """Sums over blocks of measurements of a map from which the fields of each lens are estimated.
 
     F are the derivatives of the residuals by the coefficients of the fields, J those by the unknowns, both
     with the points projected out; r are the residuals.
@@ -185,27 +208,31 @@ class LensScores:
     def __init__(self, scene: Scene, unknowns: Unknowns):
         self._scene = scene
         ids = sorted(unknowns.lens_columns)
+        self._blocks: list[_Block] = []
         self.cross = {i: np.zeros((unknowns.count, TERMS)) for i in ids}  # J^T F
-        self.information = {i: np.zeros((TERMS, TERMS)) for i in ids}  # F^T F
-        self.pull = {i: np.zeros(TERMS) for i in ids}  # -F^T r
-        self.noise = {i: np.zeros((TERMS, TERMS)) for i in ids}  # of the pull
+        self.noise = {
+            i: np.zeros((TERMS, TERMS)) for i in ids
+        }  # of -F^T r, if tracks are independent
         self.noise_cross = {
             i: np.zeros((unknowns.count, TERMS)) for i in ids
-        }  # of J^T r and the pull
+        }  # of J^T r and -F^T r
 
     def add(
         self,
         bundle: LinearizedBundle,
+        normal: sparse.csr_matrix,
         seen: MapObservations,
         rows: np.ndarray,
         cluster: np.ndarray,
         scores: sparse.csr_matrix,
     ) -> None:
-        """Add linearized measurements.
+        """Add a block of linearized measurements.
 
         Parameters
         ----------
         bundle : LinearizedBundle
+        normal : csr_matrix, shape (n, n)
+            Its reduced normal matrix.
         seen : MapObservations
         rows : ndarray, shape (M,)
             The linearized rows of `seen`.
@@ -214,6 +241,7 @@ class LensScores:
         scores : csr_matrix, shape (C, n)
             Scores J^T r of the clusters.
         """
+        block = _Block(normal, bundle.design.T @ bundle.residuals, {}, {}, {})
         ids = self._scene.camera_ids[seen.image_idx[rows]]
         by_points = bundle.by_points()
         clusters = scores.shape[0]
@@ -232,14 +260,34 @@ class LensScores:
                 pulls.append(gather @ (-values * bundle.residuals[lines][:, None]))
             of_points = np.concatenate(through, axis=1)
             of_clusters = np.concatenate(pulls, axis=1)
-            self.cross[camera_id] += np.concatenate(cross, axis=1) - bundle.coupling.T @ of_points
-            own_part = values.T @ values
-            self.information[camera_id][:half, :half] += own_part
-            self.information[camera_id][half:, half:] += own_part
-            self.information[camera_id] -= of_points.T @ of_points
-            self.pull[camera_id] += of_clusters.sum(axis=0)
+            mixed = np.concatenate(cross, axis=1) - bundle.coupling.T @ of_points
+            information = -of_points.T @ of_points
+            information[:half, :half] += values.T @ values
+            information[half:, half:] += values.T @ values
+            block.information[camera_id] = information
+            block.cross[camera_id] = sparse.csr_matrix(mixed)
+            block.pull[camera_id] = of_clusters.sum(axis=0)
+            self.cross[camera_id] += mixed
             self.noise[camera_id] += of_clusters.T @ of_clusters
             self.noise_cross[camera_id] += scores.T @ of_clusters
+        self._blocks.append(block)
+
+    def projected(self, camera_id: int, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return information (B, TERMS, TERMS) and pull (B, TERMS) of a lens, all unknowns projected out.
+
+        `response` (n, TERMS) is minus the change of the unknowns per unit of each coefficient.
+        """
+        information, pulls = [], []
+        for block in self._blocks:
+            of_unknowns = response.T @ (block.normal @ response)
+            pull = response.T @ block.gradient
+            if camera_id in block.pull:
+                mixed = block.cross[camera_id].T @ response
+                of_unknowns = of_unknowns + block.information[camera_id] - mixed - mixed.T
+                pull = pull + block.pull[camera_id]
+            information.append(0.5 * (of_unknowns + of_unknowns.T))
+            pulls.append(pull)
+        return np.stack(information), np.stack(pulls)
 
 
 def shared_errors(
@@ -247,7 +295,6 @@ def shared_errors(
     unknowns: Unknowns,
     inverse: HeldInverse,
     sums: LensScores,
-    gradient: np.ndarray,
     meat: sparse.csr_matrix,
     noise_factor: float,
     priors: Mapping[int, LensPrior],
@@ -261,10 +308,8 @@ def shared_errors(
         The n unknowns.
     inverse : HeldInverse
     sums : LensScores
-    gradient : ndarray, shape (n,)
-        J^T r at the solution.
     meat : csr_matrix, shape (n, n)
-        Covariance of the gradient.
+        Covariance of the gradient J^T r, if tracks are independent.
     noise_factor : float
         Factor by which the clusters' scores in `sums` underestimate errors; `meat` contains it.
     priors : mapping of int to LensPrior
@@ -277,18 +322,17 @@ def shared_errors(
     roots: dict[int, np.ndarray] = {}
     points: dict[int, PrincipalPoint] = {}
     focal_lengths: dict[int, FocalLength] = {}
+    dependences: dict[int, float] = {}
     for camera_id in unknowns.lens_columns:
         # Minus the change of the unknowns per unit of each coefficient.
         response = inverse.solve(sums.cross[camera_id])
         mixed = response.T @ sums.noise_cross[camera_id]
         noise = noise_factor * (sums.noise[camera_id] + mixed + mixed.T)
-        information = sums.information[camera_id] - sums.cross[camera_id].T @ response
-        estimate = estimate_field(
-            scene.cameras[camera_id],
-            information,
-            sums.pull[camera_id] + response.T @ gradient,
-            _variance(information, noise + response.T @ (meat @ response)),
-        )
+        noise = noise + response.T @ (meat @ response)
+        information, pull = sums.projected(camera_id, response)
+        of_tracks = _variance(information.sum(axis=0), noise)
+        estimate = estimate_field(scene.cameras[camera_id], information, pull, of_tracks)
+        dependences[camera_id] = max(1.0, estimate.variance_px2 / of_tracks)
         constant = list(CONSTANT)
         points[camera_id] = PrincipalPoint(
             estimate.coefficients_px[constant], estimate.covariance[np.ix_(constant, constant)]
@@ -298,7 +342,7 @@ def shared_errors(
             solved = inverse.solve(_units(unknowns.count, column))
             by_field = response[column[0]]
             variance = by_field @ estimate.covariance @ by_field
-            variance += float((solved.T @ (meat @ solved)).item())
+            variance += dependences[camera_id] * float((solved.T @ (meat @ solved)).item())
             shift = -by_field @ estimate.coefficients_px
             focal_lengths[camera_id] = FocalLength(float(shift), float(np.sqrt(variance)))
         roots[camera_id] = estimate.root
@@ -315,4 +359,6 @@ def shared_errors(
         fields[camera_id] = np.zeros((TERMS, together.shape[1]))
         fields[camera_id][:, first : first + root.shape[1]] = root
         first += root.shape[1]
-    return SharedErrors(together, fields, points, focal_lengths)
+    return SharedErrors(
+        together, fields, points, focal_lengths, max(dependences.values(), default=1.0)
+    )

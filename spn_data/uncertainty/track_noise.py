@@ -53,11 +53,7 @@ class TrackNoise:
 
     def correlations(self, views: np.ndarray) -> np.ndarray:
         """Return the correlations (..., n, n) between the errors of a track seen in views (..., n, 4)."""
-        squared = np.zeros((*views.shape[:-1], views.shape[-2]))
-        for axis in range(views.shape[-1]):
-            column = views[..., axis]
-            squared += (column[..., :, None] - column[..., None, :]) ** 2
-        shared = (1 - self.apart) * np.exp(-np.sqrt(squared) / self.length)
+        shared = (1 - self.apart) * _drift(views, self.length)
         return shared + self.apart * np.eye(views.shape[-2])
 
 
@@ -83,6 +79,38 @@ class _Tracks:
     residuals: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class _Spectra:
+    """T tracks of n measurements each, in the directions in which their drifts are independent.
+
+    Attributes
+    ----------
+    drifts : ndarray, shape (T, n)
+        Variances of the drifts in these directions.
+    values : ndarray, shape (T, n, 2, 4)
+        The whitened derivatives and the residuals there.
+    """
+
+    drifts: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def of(cls, tracks: _Tracks) -> _Spectra:
+        """Decompose tracks; the directions depend on their views alone."""
+        drifts, directions = np.linalg.eigh(_drift(tracks.views, _LENGTH))
+        values = np.concatenate([tracks.whitened, tracks.residuals[..., None]], axis=3)
+        return cls(drifts, np.einsum("tnm,tnki->tmki", directions, values, optimize=True))
+
+
+def _drift(views: np.ndarray, length: float) -> np.ndarray:
+    """Return the correlations (..., n, n) of what drifts between views (..., n, 4)."""
+    squared = np.zeros((*views.shape[:-1], views.shape[-2]))
+    for axis in range(views.shape[-1]):
+        column = views[..., axis]
+        squared += (column[..., :, None] - column[..., None, :]) ** 2
+    return np.asarray(np.exp(-np.sqrt(squared) / length))
+
+
 def fit_track_noise(bundle: LinearizedBundle) -> TrackNoise:
     """Fit the maximum-likelihood noise model to a sample of a bundle's tracks."""
     lengths = np.bincount(bundle.point)
@@ -92,9 +120,10 @@ def fit_track_noise(bundle: LinearizedBundle) -> TrackNoise:
     chosen = np.random.default_rng(0).permutation(usable)[:_FITTED_TRACKS]
     tracks = list(_tracks(bundle, chosen))
     variance = np.median(np.concatenate([(t.residuals**2).mean(axis=(1, 2)) for t in tracks]))
+    spectra = [_Spectra.of(t) for t in tracks]
     start = np.array([np.log(max(2 * float(variance), 1e-12)), -1.0, 1.0])
     found = optimize.minimize(
-        lambda x: sum(_minus_log_likelihood(t, _noise(x)) for t in tracks),
+        lambda x: sum(_minus_log_likelihood(one, _noise(x)) for one in spectra),
         start,
         method="Nelder-Mead",
         options={
@@ -134,7 +163,9 @@ def whitened_point_covariances(bundle: LinearizedBundle, noise: TrackNoise | Non
         )
         # Zero except for points with parallel rays, whose depth remains undetermined.
         undetermined = np.eye(3) - np.einsum("tnki,tnkj->tij", tracks.whitened, tracks.whitened)
-        misfit, _ = _misfit(tracks, correlations)
+        values = np.concatenate([tracks.whitened, tracks.residuals[..., None]], axis=3)
+        values = values.reshape(*correlations.shape[:2], 8)
+        misfit, _ = _misfit(np.linalg.solve(np.linalg.cholesky(correlations), values))
         redundancy = 2 * tracks.views.shape[1] - 3
         # Posterior mean of this track's variance: its own residuals and the distribution over all tracks.
         variance = (noise.tails * noise.sigma_px**2 + misfit) / max(
@@ -166,15 +197,16 @@ def _tracks(bundle: LinearizedBundle, points: np.ndarray) -> Iterator[_Tracks]:
         yield _Tracks(points[of_length], bundle.views[rows], bundle.whitened[rows], residuals[rows])
 
 
-def _misfit(tracks: _Tracks, correlations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the squared Mahalanobis norm of the residuals (T,) and the log determinant (T,).
+def _misfit(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the squared norm of decorrelated residuals (T,), and log determinants of points (T,).
 
-    The points are eliminated.
+    Parameters
+    ----------
+    values : ndarray, shape (T, n, 8)
+        Decorrelated derivatives by the whitened point and residuals, in x and in y. Points are eliminated.
     """
-    count, n = correlations.shape[:2]
-    root = np.linalg.cholesky(correlations)
-    values = np.concatenate([tracks.whitened, tracks.residuals[..., None]], axis=3)
-    scaled = np.linalg.solve(root, values.reshape(count, n, 8)).reshape(count, 2 * n, 4)
+    count, n = values.shape[:2]
+    scaled = values.reshape(count, 2 * n, 4)
     products = np.swapaxes(scaled, 1, 2) @ scaled
     normal, right_side = products[:, :3, :3], products[:, :3, 3]
     trace = np.trace(normal, axis1=1, axis2=2)
@@ -182,14 +214,17 @@ def _misfit(tracks: _Tracks, correlations: np.ndarray) -> tuple[np.ndarray, np.n
     misfit = products[:, 3, 3] - np.einsum(
         "ti,ti->t", right_side, np.linalg.solve(normal, right_side[..., None])[..., 0]
     )
-    log_det = 4 * np.log(np.einsum("tii->ti", root)).sum(axis=1)
-    return np.maximum(misfit, 0.0), log_det + np.linalg.slogdet(normal)[1]
+    return np.maximum(misfit, 0.0), np.linalg.slogdet(normal)[1]
 
 
-def _minus_log_likelihood(tracks: _Tracks, noise: TrackNoise) -> float:
+def _minus_log_likelihood(tracks: _Spectra, noise: TrackNoise) -> float:
     """Return the negative log-likelihood under Student's t, with the constants that depend on its tails."""
-    misfit, log_det = _misfit(tracks, noise.correlations(tracks.views))
-    m, v = 2 * tracks.views.shape[1] - 3, noise.tails
+    count, n = tracks.drifts.shape
+    variances = (1 - noise.apart) * tracks.drifts + noise.apart
+    scaled = tracks.values / np.sqrt(variances)[..., None, None]
+    misfit, log_det = _misfit(scaled.reshape(count, n, 8))
+    log_det = log_det + 2 * np.log(variances).sum(axis=1)
+    m, v = 2 * n - 3, noise.tails
     variance = noise.sigma_px**2
     each = (
         0.5 * log_det

@@ -11,7 +11,7 @@ import pytest
 from spn_data.colmap.model import Scene
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.initial_lens import Hold
-from spn_data.uncertainty.lens_errors import TERMS, estimate_field, field_values
+from spn_data.uncertainty.lens_errors import BLOCKS, CONSTANT, TERMS, estimate_field, field_values
 from spn_data.uncertainty.map_covariance import MapCovariance, MapCovarianceOptions
 from spn_data.uncertainty.shared_errors import LensPrior
 from tests.spn_data.uncertainty.test_map_covariance import Small, adjusted, errors_of, scores, small
@@ -65,8 +65,32 @@ def test_radial_distortion_is_no_error_of_a_lens() -> None:
     cubic = rays * (rays**2).sum(axis=1, keepdims=True)
     radial = (values.T @ cubic / len(values)).T.ravel()
     radial[[0, TERMS // 2]] = 0.0
-    found = estimate_field(MODEL, np.eye(TERMS) * 1e4, 1e4 * radial, 1e-2)
+    found = estimate_field(MODEL, np.eye(TERMS)[None] * 1e4, 1e4 * radial[None], 1e-2)
     assert np.abs(found.coefficients_px).max() < 0.05 * np.abs(radial).max()
+
+
+def test_what_differs_between_blocks_is_noise_and_what_does_not_is_a_field() -> None:
+    """Blocks that agree show a field and little noise; blocks that pull apart as strongly show only noise."""
+    rng = np.random.default_rng(0)
+    one = np.zeros(TERMS)
+    one[8] = 0.05  # of degree 3
+    information = np.stack([np.eye(TERMS) * 1e3] * BLOCKS)
+    noise = np.sqrt(0.09 * 1e3) * rng.standard_normal((BLOCKS, TERMS))
+    alike = estimate_field(MODEL, information, information @ one + noise, 9.0)
+    assert 0.07 < alike.variance_px2 < 0.12
+    assert abs(alike.coefficients_px[8] - 0.05) < 0.01
+    apart = estimate_field(MODEL, information, 10 * noise, 0.09)
+    assert 7.0 < apart.variance_px2 < 12.0
+    assert np.abs(np.delete(apart.coefficients_px, CONSTANT)).max() < 0.02
+
+
+def test_measurements_that_tell_nothing_leave_what_is_usual() -> None:
+    """Without information, the principal point is as uncertain as among lenses, and nothing else is large."""
+    found = estimate_field(MODEL, np.zeros((BLOCKS, TERMS, TERMS)), np.zeros((BLOCKS, TERMS)), 1.0)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.allclose(sigma[list(CONSTANT)], 6.4, rtol=1e-2)
+    assert np.delete(sigma, CONSTANT).max() < 0.2
+    assert np.all(found.coefficients_px == 0)
 
 
 def test_a_shifted_principal_point_is_told_by_converging_views() -> None:
@@ -78,14 +102,14 @@ def test_a_shifted_principal_point_is_told_by_converging_views() -> None:
 
 
 def test_a_lens_as_modelled_adds_little() -> None:
-    """With the lens as modelled, no shift is found, and standard deviations grow to three times at most."""
+    """With the lens as modelled, no shift is found, and standard deviations grow to four times at most."""
     _, made = seen_through(lens_with(), seed=2)
     told = MapCovariance.of(made.scene, made.seen)
     point = told.shared.principal_points[1]
     assert np.all(np.abs(point.shift_px) < 3 * point.sigma_px)
     exact = MapCovariance.of(made.scene, made.seen, EXACT).pose_covariances()
     growth = np.einsum("nii->ni", told.pose_covariances()) / np.einsum("nii->ni", exact)
-    assert np.sqrt(np.median(growth)) < 3
+    assert np.sqrt(np.median(growth)) < 4
 
 
 def test_labels_contain_the_truth_though_the_lens_is_not_as_modelled() -> None:
