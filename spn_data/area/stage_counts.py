@@ -28,7 +28,10 @@ _KINDS: dict[str, dict[str, Any]] = {
         **dict.fromkeys(("pairs_verified", "pairs_tried"), COUNT),
         "mean_error_px": KNOWN,
         "cameras": {
-            "*": {"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},
+            "*": {
+                **{"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},
+                "focal_doubt_px?": KNOWN,
+            },
         },
         "shutter": [{"sequence": TEXT, "rolls?": FLAG}],
         "submodels": [COUNT],
