@@ -187,11 +187,12 @@ class FocalTrial:
             else ""
         )
         lacking = f" To determine it, add {' or '.join(self.missing)}." if self.missing else ""
+        said = ", ".join(map(str, heard)) + together
         return (
             f"camera {self.camera}: the images determine the focal length only to {share:.1%}: "
-            f"{self.adjusted_px:.0f} px adjusted; {', '.join(map(str, heard))}{together}, if the lens differs "
-            f"from its model as the residuals suggest. {self._heights(share)}, which their stated "
-            f"uncertainty contains.{hold}{lacking}"
+            f"{self.adjusted_px:.0f} px adjusted; {said}, if the lens differs from its model as the "
+            f"residuals suggest. {self._heights(share)}, which their stated uncertainty contains."
+            f"{hold}{lacking}"
         )
 
     def _heights(self, share: float) -> str:
