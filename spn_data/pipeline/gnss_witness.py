@@ -17,7 +17,6 @@ from spn_data.pipeline.geo_stage import (
 )
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.focal_trial import Statement
-from spn_data.reconstruction.view_variety import ground_distance
 from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.timing import Progress
 
@@ -52,8 +51,8 @@ def focal_lengths_by_gnss(
     -------
     statements : dict of str to Statement
         By camera; empty if fixes do not determine a georegistration.
-    distance_m : float
-        Distance of the ground; NaN then.
+    metres : float
+        Length of a unit of the model; NaN then.
     """
     tracks = read_tracks(area)
     if covariance is None or not any(track.has_fix.any() for track in tracks.values()):
@@ -85,4 +84,4 @@ def focal_lengths_by_gnss(
         key: Statement("GNSS", focal_px[key] + one.shift_px, one.sigma_px)
         for key, one in found.items()
     }
-    return statements, ground_distance(scene) * fitted.world_from_model.scale
+    return statements, fitted.world_from_model.scale

@@ -36,6 +36,7 @@ from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
 from spn_data.reconstruction.refinement import RefinedModel
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
+from spn_data.reconstruction.view_variety import viewing_distance
 from spn_data.storage.stage_record import StageRecord, current_options
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -85,11 +86,13 @@ def build_model(
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
-    trials = _trials(area, result.refined, to_map, geo or GeoStageOptions(), progress, stopwatch)
+    distance = viewing_distance(result.refined.scene, result.refined.observations)
+    with stopwatch.step("focal lengths"):
+        trials = _trials(area, result.refined, to_map, distance, geo or GeoStageOptions(), progress)
     _write_labels(work.path, result, chosen, trials)
     _move_results(work.path, result)
     return work.finish(
-        counts=_counts(result, trials, shutters),
+        counts=_counts(result, trials, distance, shutters),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=(
@@ -157,17 +160,14 @@ def _trials(
     area: Area,
     refined: RefinedModel,
     frames: FramesToMap,
+    distance: float,
     geo: GeoStageOptions,
     progress: Progress,
-    stopwatch: Stopwatch,
 ) -> dict[int, FocalTrial]:
     """Compare what is known of the focal lengths, by camera id."""
-    scene = refined.scene
-    with stopwatch.step("focal lengths"):
-        gnss, distance_m = focal_lengths_by_gnss(
-            area, scene, refined.covariance, frames, geo, progress
-        )
-    return focal_trials(scene, refined.covariance, frames, gnss, distance_m)
+    scene, covariance = refined.scene, refined.covariance
+    gnss, metres = focal_lengths_by_gnss(area, scene, covariance, frames, geo, progress)
+    return focal_trials(scene, covariance, frames, gnss, distance, metres)
 
 
 def _write_labels(
@@ -222,6 +222,7 @@ def _move_results(work: Path, result: ReconstructResult) -> None:
 def _counts(
     result: ReconstructResult,
     trials: Mapping[int, FocalTrial],
+    distance: float,
     shutters: tuple[ShutterDiagnosis, ...],
 ) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
@@ -246,6 +247,7 @@ def _counts(
         "pairs_tried": result.pairs_tried,
         "pairs_verified": result.pairs_verified,
         "points": len(scene.points),
+        "viewing_distance": round(distance, 6),
         "observations": observations,
         "mean_error_px": round(
             sum(r.error_px * r.observations for r in registered) / observations, 4

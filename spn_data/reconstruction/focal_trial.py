@@ -36,7 +36,8 @@ class Statement:
         return abs(self.focal_px - other.focal_px) > _SIGMAS * sigma
 
     def __str__(self) -> str:
-        return f"{self.witness} {self.focal_px:.0f} px (sigma {self.sigma_px:.0f})"
+        digits = 0 if self.sigma_px >= 0.95 else 2
+        return f"{self.witness} {self.focal_px:.0f} px (sigma {self.sigma_px:.{digits}f})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class FocalTrial:
     missing : tuple of str
         Views that would determine it.
     distance_m : float
-        Distance of the ground; NaN if the model has no known scale.
+        Viewing distance; NaN if the model has no known scale.
     """
 
     camera: str
@@ -208,7 +209,8 @@ def focal_trials(
     covariance: MapCovariance | None,
     frames: FramesToMap,
     gnss: Mapping[str, Statement],
-    distance_m: float,
+    distance: float,
+    metres: float,
 ) -> dict[int, FocalTrial]:
     """Return the statements on the focal length of each camera of a model, by its id.
 
@@ -221,15 +223,17 @@ def focal_trials(
         Provides what is known of the lenses.
     gnss : mapping of str to Statement
         What fixes say, by camera.
-    distance_m : float
-        Distance of the ground; NaN if unknown.
+    distance : float
+        Viewing distance, in units of the model.
+    metres : float
+        Length of such a unit; NaN if unknown.
 
     Returns
     -------
     dict of int to FocalTrial
     """
     images = {} if covariance is None else covariance.shared.focal_lengths
-    missing = missing_views(scene)
+    missing = missing_views(scene, distance)
     return {
         i: FocalTrial(
             key,
@@ -238,7 +242,7 @@ def focal_trials(
             frames.lenses[key],
             gnss.get(key),
             missing,
-            distance_m,
+            distance * metres,
         )
         for key, i in sorted(frames.camera_ids(scene).items())
     }

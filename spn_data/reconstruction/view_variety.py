@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from spn_data.colmap.model import Scene
+from spn_data.colmap.model import MapObservations, Scene
 
 _SAME_DIRECTION_DEG = 25.0  # of 95 % of the views about their mean
 _ONE_AXIS = 0.8  # length of the mean of doubled headings; 1 if all lie on one axis
-_ONE_HEIGHT = 0.15  # spread of the heights over the distance of the ground
+_ONE_HEIGHT = 0.15  # spread of the heights over the viewing distance
 
 
-def missing_views(scene: Scene) -> tuple[str, ...]:
+def missing_views(scene: Scene, distance: float) -> tuple[str, ...]:
     """Return by name what further frames would determine a focal length: none if views converge.
 
     Parameters
     ----------
     scene : Scene
+    distance : float
+        Viewing distance, in units of the model.
 
     Returns
     -------
@@ -39,13 +41,13 @@ def missing_views(scene: Scene) -> tuple[str, ...]:
     missing.append("oblique frames, 30 deg or more from the others")
     apart = centers - centers.mean(axis=0)
     heights = apart @ np.linalg.svd(apart, full_matrices=False)[2][-1]
-    if np.ptp(np.quantile(heights, [0.05, 0.95])) < _ONE_HEIGHT * ground_distance(scene):
+    if np.ptp(np.quantile(heights, [0.05, 0.95])) < _ONE_HEIGHT * distance:
         missing.append("a second height, a third higher or lower")
     return tuple(missing)
 
 
-def ground_distance(scene: Scene) -> float:
-    """Return the median distance of the points along the mean viewing direction, in units of the model."""
-    mean = scene.poses.rotations[:, 2].mean(axis=0)
-    mean /= np.linalg.norm(mean)
-    return float(np.median(scene.points @ mean) - np.median(scene.poses.centers @ mean))
+def viewing_distance(scene: Scene, seen: MapObservations) -> float:
+    """Return the median depth of the measured points in their images, in units of the model."""
+    frame = seen.image_idx
+    offsets = scene.points[seen.point_idx] - scene.poses.centers[frame]
+    return float(np.median(np.einsum("ni,ni->n", offsets, scene.poses.rotations[frame, 2])))

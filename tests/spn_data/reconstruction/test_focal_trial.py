@@ -110,12 +110,12 @@ def test_missing_views_are_named_from_the_poses() -> None:
     n = 20
     down, east, level = np.full(n, -80.0), np.full(n, 90.0), np.full(n, 60.0)
     alternating = np.arange(n) % 2
-    one_way = missing_views(scene(down, east + 180.0 * alternating, level))
+    one_way = missing_views(scene(down, east + 180.0 * alternating, level), 60.0)
     assert [name.split()[0] for name in one_way] == ["cross", "oblique", "a"]
-    crossed = missing_views(scene(down, east + 90.0 * alternating, level))
+    crossed = missing_views(scene(down, east + 90.0 * alternating, level), 60.0)
     assert [name.split()[0] for name in crossed] == ["oblique", "a"]
     two_heights = missing_views(
-        scene(down, east + 90.0 * alternating, level + 25.0 * (np.arange(n) // 10))
+        scene(down, east + 90.0 * alternating, level + 25.0 * (np.arange(n) // 10)), 60.0
     )
     assert [name.split()[0] for name in two_heights] == ["oblique"]
-    assert missing_views(scene(down + 60.0 * alternating, east, level)) == ()
+    assert missing_views(scene(down + 60.0 * alternating, east, level), 60.0) == ()
