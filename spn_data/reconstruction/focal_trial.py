@@ -89,7 +89,7 @@ class FocalTrial:
         if self.lens.hold is not Hold.NOTHING:
             return self.stated
         if self.images is None:
-            return Statement("images", self.adjusted_px, _UNDETERMINED * self.adjusted_px)
+            return Statement("adjustment", self.adjusted_px, _UNDETERMINED * self.adjusted_px)
         return Statement("images", self.adjusted_px + self.images.shift_px, self.images.sigma_px)
 
     @property
@@ -127,6 +127,8 @@ class FocalTrial:
             return [self._contradicted(used)]
         if self._is_weak:
             return [self._weak()]
+        if self.images is None and self.lens.hold is Hold.NOTHING:
+            return []
         alone = [one for one in self._others if one.contradicts(used)]
         said = ", ".join(map(str, [used, *self._others]))
         verdict = f"{alone[0].witness} is outvoted" if alone else "they agree"

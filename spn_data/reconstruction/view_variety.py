@@ -27,6 +27,8 @@ def missing_views(scene: Scene, distance: float) -> tuple[str, ...]:
     rotations, centers = scene.poses.rotations, scene.poses.centers
     look = rotations[:, 2]
     mean = look.mean(axis=0)
+    if np.linalg.norm(mean) < 0.5:  # all around
+        return ()
     mean /= np.linalg.norm(mean)
     apart_deg = np.rad2deg(np.arccos(np.clip(look @ mean, -1.0, 1.0)))
     if np.quantile(apart_deg, 0.95) > _SAME_DIRECTION_DEG:
