@@ -189,7 +189,9 @@ class FocalTrial:
             if better is not None and better.sigma_px < self.images.error_px
             else ""
         )
-        lacking = f" To determine it, add {' or '.join(self.missing)}." if self.missing else ""
+        lacking = (
+            f" To determine it, add one of: {', '.join(self.missing)}." if self.missing else ""
+        )
         said = ", ".join(map(str, heard)) + together
         return (
             f"camera {self.camera}: the images determine the focal length only to {share:.1%}: "

@@ -39,12 +39,12 @@ def missing_views(scene: Scene, distance: float) -> tuple[str, ...]:
     top = -rotations[:, 1]
     heading = np.arctan2(top @ np.cross(mean, first), top @ first)
     if np.abs(np.exp(2j * heading).mean()) > _ONE_AXIS:
-        missing.append("cross lines, flown with the camera turned by 90 deg")
-    missing.append("oblique frames, 30 deg or more from the others")
+        missing.append("cross lines (camera turned by 90 deg)")
+    missing.append("oblique frames (30 deg or more from the others)")
     apart = centers - centers.mean(axis=0)
     heights = apart @ np.linalg.svd(apart, full_matrices=False)[2][-1]
     if np.ptp(np.quantile(heights, [0.05, 0.95])) < _ONE_HEIGHT * distance:
-        missing.append("a second height, a third higher or lower")
+        missing.append("a second height (a third higher or lower)")
     return tuple(missing)
 
 

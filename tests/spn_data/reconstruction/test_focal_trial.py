@@ -82,7 +82,7 @@ def test_images_that_cannot_tell_say_so_with_what_all_say_together() -> None:
     assert "together 464 px (sigma 7)" in note
     assert "6.5% (3.9 m)" in note
     assert "--fixed-lens holds the stated one" in note
-    assert note.endswith("To determine it, add oblique frames or a second height.")
+    assert note.endswith("To determine it, add one of: oblique frames, a second height.")
 
 
 def test_a_held_focal_length_that_gnss_contradicts_is_doubted() -> None:
