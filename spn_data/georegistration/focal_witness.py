@@ -22,12 +22,10 @@ from spn_data.georegistration.noise import apply_inverse_covariance, solve
 from spn_data.georegistration.uncertainty import drift_through
 
 # What fixes have besides the errors that the fit knows, chosen as typical and not measured.
-_ANTENNA_M = (
-    0.15  # horizontal distance of the antenna from the camera, along and across the heading
-)
+_ANTENNA_M = 0.15  # distance of the antenna from the camera, along and across the heading
 _CLOCK_S = 0.2  # between fixes and images
 _STEEP = (
-    0.7  # vertical component of a viewing direction; above it, the top of the image is the heading
+    0.7  # vertical component of a viewing direction, above which the image's top is the heading
 )
 _STEP = 1e-3  # of numerical derivatives, in sizes of the model and in radians
 

@@ -56,8 +56,8 @@ def map_lens_priors(area: Area, scene: Scene) -> dict[int, LensPrior]:
     frames, lenses = read_frames(folder / FRAMES_TABLE), read_lenses(folder)
     key_of = dict(zip(frames.names.tolist(), frames.cameras.tolist(), strict=True))
     keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
+    doubts = _focal_doubts(area)
     with reporting_damage(folder / CAMERAS, "a list of the cameras of frames.csv"):
-        doubts = _focal_doubts(area)
         return {i: LensPrior.of(lenses[key], doubts.get(key, 0.0)) for i, key in keys.items()}
 
 

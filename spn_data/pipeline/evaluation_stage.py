@@ -292,7 +292,7 @@ def _focal_witness(area: Area, found: RegisteredSequence, gnss: GnssCheck) -> li
     errors = [
         float(np.hypot(lens.get("focal_error_px") or 0.0, lens.get("focal_doubt_px", 0.0)))
         / lens["focal_px"]
-        for lens in counts["cameras"].values()
+        for lens in counts.get("cameras", {}).values()
     ]
     if found.covariance is None or distance_m <= 0 or not errors:
         return []

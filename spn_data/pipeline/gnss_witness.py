@@ -58,17 +58,21 @@ def focal_lengths_by_gnss(
     if covariance is None or not any(track.has_fix.any() for track in tracks.values()):
         return {}, float("nan")
     registered = registered_frames(area, scene)
-    offsets = time_offsets(scene, registered, tracks, options, progress)
+    try:
+        offsets = time_offsets(scene, registered, tracks, options, progress)
+        fitted = fit_telemetry(
+            scene.poses,
+            telemetry_of(registered, tracks, offsets),
+            registered.sequences.tolist(),
+            registered.time_s,
+            options.fit,
+        )
+    except GeometryError:
+        return {}, float("nan")  # stage 3-geo says why
     clock_s = {
         name: _UNKNOWN_CLOCK_S if offset.offset_s is None else offset.sigma_s
         for name, offset in offsets.items()
     }
-    telemetry = telemetry_of(registered, tracks, offsets)
-    sequences = registered.sequences.tolist()
-    try:
-        fitted = fit_telemetry(scene.poses, telemetry, sequences, registered.time_s, options.fit)
-    except GeometryError:
-        return {}, float("nan")  # stage 3-geo says why
     changes = covariance.focal_changes()
     key_of = {i: key for key, i in frames.camera_ids(scene).items()}
     focal_px = {key_of[i]: scene.cameras[i].focal_px[0] for i in changes.by_focal}
