@@ -26,9 +26,12 @@ _KINDS: dict[str, dict[str, Any]] = {
     MODEL: {
         **dict.fromkeys(("registered", "frames", "points", "observations"), COUNT),
         **dict.fromkeys(("pairs_verified", "pairs_tried"), COUNT),
-        "mean_error_px": KNOWN,
+        **dict.fromkeys(("mean_error_px", "viewing_distance"), KNOWN),
         "cameras": {
-            "*": {"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},
+            "*": {
+                **{"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},
+                **{"focal_doubt_px?": KNOWN, "focal_error_px?": NUMBER},
+            },
         },
         "shutter": [{"sequence": TEXT, "rolls?": FLAG}],
         "submodels": [COUNT],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,23 @@ from spn_data.telemetry.track import Telemetry
 
 # A fix is an outlier if its residual exceeds this many sigma of the white noise.
 _OUTLIER_SIGMAS = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A problem with its solution; centred coordinates are ``(x_model - middle) / size``."""
+
+    problem: Problem
+    result: Estimate
+    gravity: Gravity
+    middle: np.ndarray
+    size: float
+
+    @property
+    def world_from_model(self) -> Similarity:
+        """Similarity from the model's own coordinates to the world."""
+        centred = Similarity(1 / self.size, np.eye(3), -self.middle / self.size)
+        return self.result.state.similarity @ centred
 
 
 def georegister(
@@ -73,6 +90,18 @@ def georegister(
     An initial similarity from RANSAC is refined by robust generalised least squares over fixes, heights and
     gravity, under errors that are correlated in time (Gauss-Markov).
     """
+    return _geo_fit(fit_telemetry(model, telemetry, sequence, time_s, options, control))
+
+
+def fit_telemetry(
+    model: Poses,
+    telemetry: Telemetry,
+    sequence: Sequence[str],
+    time_s: np.ndarray,
+    options: GeoregisterOptions | None = None,
+    control: Control | None = None,
+) -> Fitted:
+    """Fit a model to its telemetry as `georegister` does, without judging the result by cross-validation."""
     options = options or GeoregisterOptions()
     if len(model) != len(telemetry):
         raise ValueError(
@@ -116,7 +145,7 @@ def georegister(
             problem = replace(problem, control=judged)
             result = estimate(problem, result.state, initial.inlier)
     require_determined(problem, result, options)
-    return _geo_fit(problem, result, gravity, middle, size)
+    return Fitted(problem, result, gravity, middle, size)
 
 
 def _initial(
@@ -178,12 +207,10 @@ def _up_of_level_cameras(rotations: np.ndarray) -> np.ndarray:
     return up
 
 
-def _geo_fit(
-    problem: Problem, result: Estimate, gravity: Gravity, middle: np.ndarray, size: float
-) -> GeoFit:
+def _geo_fit(fitted: Fitted) -> GeoFit:
+    problem, result, gravity = fitted.problem, fitted.result, fitted.gravity
     state, fixes, options = result.state, problem.fixes, problem.options
-    centred_from_model = Similarity(1 / size, np.eye(3), -middle / size)
-    world_from_model = Similarity(state.scale, state.rotation, state.center) @ centred_from_model
+    world_from_model = fitted.world_from_model
     residuals = problem.residuals(state)
     residuals_m = residuals[:3].T
     distance = np.zeros((len(Kind), len(problem.model)))
@@ -224,22 +251,16 @@ def _geo_fit(
         _summary(problem, result, residuals, outlier),
         _observations(problem, gravity),
         fixes.notes + fit_notes(problem, result, gravity, outlier, held_out[0]),
-        _residuals_of_control(problem, world_from_model, uncertainty, middle, size),
+        _residuals_of_control(fitted, uncertainty),
     )
 
 
-def _residuals_of_control(
-    problem: Problem,
-    world_from_model: Similarity,
-    uncertainty: Uncertainty,
-    middle: np.ndarray,
-    size: float,
-) -> tuple[PointResidual, ...]:
-    if problem.control is None:
+def _residuals_of_control(fitted: Fitted, uncertainty: Uncertainty) -> tuple[PointResidual, ...]:
+    if fitted.problem.control is None:
         return ()
-    control = problem.control.centred(
-        -middle / size, 1 / size
-    )  # back in the model's own coordinates
+    world_from_model = fitted.world_from_model
+    # Back in the model's own coordinates.
+    control = fitted.problem.control.centred(-fitted.middle / fitted.size, 1 / fitted.size)
     covariance = uncertainty.point_covariance(world_from_model.apply(control.model))
     return point_residuals(control, world_from_model, covariance)
 

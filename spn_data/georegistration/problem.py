@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -271,6 +271,10 @@ class Problem:
         residual = self._dense_residuals(state)[0]
         residual[Kind.LEVEL] = np.where(self.use_level, residual[Kind.LEVEL], np.nan)
         return residual
+
+    def moved(self, model: np.ndarray, cam_from_model: np.ndarray) -> Problem:
+        """Return the problem with other centred camera centres (N, 3) and rotations (N, 3, 3)."""
+        return replace(self, model=model, cam_from_model=cam_from_model)
 
     def without_level(self) -> Problem:
         """Return the problem without the level-camera assumption, using measurements only."""

@@ -80,19 +80,34 @@ class Uncertainty:
 
 
 def drift_covariance(problem: Problem, result: Estimate) -> np.ndarray:
-    """Return the covariance (7, 7) of the similarity due to the slow drift of the fixes' common bias.
-
-    The fit knows a constant bias of each group and errors of about a minute. What lies between, a first-order
-    Gauss-Markov process over a group's flights one after the other, is propagated through the fit as it is.
-    """
+    """Return the covariance (7, 7) of the similarity due to the slow drift of the fixes' common bias."""
     linear = problem.linearise(result.state, result.offset_sigma_m, result.bias_weight)
     inverse, _ = apply_inverse_covariance(
         problem.chains, result.levels, result.weights, linear.jacobian
     )
+    return drift_through(problem, result.covariance[:SHARED] @ inverse.T)
+
+
+def drift_through(problem: Problem, gain: np.ndarray) -> np.ndarray:
+    """Propagate the slow drift of the fixes' common bias through a fit.
+
+    The fit knows a constant bias of each group and errors of about a minute. What lies between, a first-order
+    Gauss-Markov process over a group's flights one after the other, is propagated through the fit as it is.
+
+    Parameters
+    ----------
+    problem : Problem
+        It has M observations.
+    gain : ndarray, shape (K, M)
+        Derivatives of K estimates by the observations.
+
+    Returns
+    -------
+    ndarray, shape (K, K)
+    """
     rows = np.flatnonzero(problem.kind <= Kind.UP)
     kind, frame = problem.kind[rows], problem.frame[rows]
     fixes = problem.fixes
-    gain = result.covariance[:SHARED] @ inverse[rows].T
     unit = BIAS_DRIFT_SHARE * fixes.bias_m[frame, kind]
     chains, order = Chains.build(
         fixes.bias_group[frame] * 3 + kind,
@@ -102,7 +117,7 @@ def drift_covariance(problem: Problem, result: Estimate) -> np.ndarray:
         unit,
         np.arange(len(rows)),
     )
-    moved = (gain[:, order] * chains.unit).T
+    moved = (gain[:, rows[order]] * chains.unit).T
     return moved.T @ cho_solve_banded((cholesky_banded(chains.precision), False), moved)
 
 

@@ -18,6 +18,7 @@ from spn_data.labels.labels import Labels
 from spn_data.telemetry.track import Telemetry
 
 _MIN_FIXES = 5
+_DOUBTFUL_FOCAL = 0.01  # relative error of the map's focal length, from which a witness is of use
 _CONTRADICTION = 3.0  # standard deviations of the offset, from GNSS and georegistration
 
 
@@ -152,6 +153,47 @@ def check_gnss(
         sigma_v_m=None if sigma_v is None else round(sigma_v, 4),
         contradicts=bool(too_far),
     )
+
+
+def focal_witness_notes(
+    check: GnssCheck, distance_m: float, lens_error: float, map_error: float
+) -> list[str]:
+    """Return what the heights of a flight say about the focal length of the map, if that is in doubt.
+
+    If the map's focal length is too short, what it shows is too near to its cameras, by the same share of the
+    viewing distance, and a flight whose own focal length is right is placed too high by as much.
+
+    Parameters
+    ----------
+    check : GnssCheck
+        Comparison of the flight's labels with its own fixes.
+    distance_m : float
+        Viewing distance of the map.
+    lens_error : float
+        Relative standard deviation of the flight's own focal length.
+    map_error : float
+        That of the map's.
+
+    Returns
+    -------
+    list of str
+        At most one sentence.
+    """
+    if check.offset_u_m is None or check.sigma_v_m is None or map_error < _DOUBTFUL_FOCAL:
+        return []
+    share = check.offset_u_m / distance_m
+    sigma = float(np.hypot(check.sigma_v_m / distance_m, lens_error))
+    verdict = (
+        "which contradicts that"
+        if abs(share) > 2 * np.hypot(sigma, map_error)
+        else "which agrees with that"
+    )
+    return [
+        f"a second witness of the map's focal length, which the map knows to {map_error:.1%}: this flight's "
+        f"GNSS heights, {check.offset_u_m:+.1f} m off at a viewing distance of {distance_m:.0f} m, make it "
+        f"{abs(share):.1%} too {'short' if share < 0 else 'long'} (sigma {sigma:.1%}), {verdict}. "
+        "Mapping both flights together (reconstruct --add) determines it better"
+    ]
 
 
 def _height(rows: Telemetry, origin: GeoOrigin) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from spn_data.area.area import Area
-from spn_data.area.names import CAMERAS, FRAMES, FRAMES_TABLE
+from spn_data.area.names import CAMERAS, FRAMES, FRAMES_TABLE, MODEL
 from spn_data.capture.frames import read_frames
 from spn_data.colmap.model import Scene
 from spn_data.geometry.initial_lens import InitialLens
@@ -56,5 +56,12 @@ def map_lens_priors(area: Area, scene: Scene) -> dict[int, LensPrior]:
     frames, lenses = read_frames(folder / FRAMES_TABLE), read_lenses(folder)
     key_of = dict(zip(frames.names.tolist(), frames.cameras.tolist(), strict=True))
     keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
+    doubts = _focal_doubts(area)
     with reporting_damage(folder / CAMERAS, "a list of the cameras of frames.csv"):
-        return {i: LensPrior.of(lenses[key]) for i, key in keys.items()}
+        return {i: LensPrior.of(lenses[key], doubts.get(key, 0.0)) for i, key in keys.items()}
+
+
+def _focal_doubts(area: Area) -> dict[str, float]:
+    """Return the error of each focal length by what contradicted the images when the map was made."""
+    cameras = area.record(MODEL).counts.get("cameras", {})
+    return {key: float(lens.get("focal_doubt_px", 0.0)) for key, lens in cameras.items()}

@@ -31,7 +31,7 @@ from spn_data.inputs.area_labels import read_geo, read_world_from_model
 from spn_data.inputs.evaluation_source import find_source, sample_frames
 from spn_data.inputs.flight_telemetry import check_telemetry
 from spn_data.inputs.frame_images import STORED
-from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.inputs.gnss_check import GnssCheck, check_gnss, focal_witness_notes
 from spn_data.inputs.lens_file import map_lens_priors, read_lenses
 from spn_data.inputs.source_fingerprints import fingerprints
 from spn_data.labels.labels import Labels, pose_sigmas, write_label_observations, write_labels
@@ -177,7 +177,7 @@ def _register(
     if labels.registered.any():
         notes += lens_notes(found.solution.camera, _mapping_lenses(area))
     if gnss is not None:
-        notes.append(gnss.describe())
+        notes += [gnss.describe(), *_focal_witness(area, found, gnss)]
     return work.finish(
         counts=_counts(labels, found.solution.camera, gnss),
         seconds=stopwatch.seconds,
@@ -283,6 +283,23 @@ def lens_notes(camera: Camera, mapping: Mapping[str, Camera]) -> list[str]:
                 "lens with --camera and --fixed-lens"
             ]
     return []
+
+
+def _focal_witness(area: Area, found: RegisteredSequence, gnss: GnssCheck) -> list[str]:
+    """Return what the flight's heights say about the least certain focal length of the map."""
+    counts = area.record(MODEL).counts
+    distance_m = counts.get("viewing_distance", 0.0) * read_world_from_model(area).scale
+    errors = [
+        float(np.hypot(lens.get("focal_error_px") or 0.0, lens.get("focal_doubt_px", 0.0)))
+        / lens["focal_px"]
+        for lens in counts.get("cameras", {}).values()
+    ]
+    if found.covariance is None or distance_m <= 0 or not errors:
+        return []
+    own = [name[0] == "f" for name in found.covariance.lens_names]
+    variance = np.diag(found.covariance.lens)[own]
+    lens_error = float(np.sqrt(variance.max(initial=0.0))) / found.solution.camera.focal_px[0]
+    return focal_witness_notes(gnss, distance_m, lens_error, max(errors))
 
 
 def _lens_json(covariance: SequenceCovariance) -> dict[str, Any]:

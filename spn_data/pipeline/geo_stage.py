@@ -145,13 +145,9 @@ def _georegister(
     with stopwatch.step("ground control"):  # first: a mistake in its file is told at once
         control, notes = _control(area, scene, options, tracks)
     with stopwatch.step("time offset"):
-        offsets = _time_offsets(scene, frames, tracks, options, progress)
-    shifted = {
-        name: track.shifted(offsets[name].applied_s if name in offsets else 0.0)
-        for name, track in tracks.items()
-    }
+        offsets = time_offsets(scene, frames, tracks, options, progress)
     with stopwatch.step("fit"):
-        telemetry = align_telemetry(shifted, frames.sequences.tolist(), frames.time_s)
+        telemetry = telemetry_of(frames, tracks, offsets)
         sequences = frames.sequences.tolist()
         result = fit(scene.poses, telemetry, sequences, frames.time_s, options.fit, control)
     with stopwatch.step("write"):
@@ -205,7 +201,18 @@ def registered_frames(area: Area, scene: Scene) -> Frames:
     return frames.select(np.array([row[name] for name in scene.names], dtype=np.int64))
 
 
-def _time_offsets(
+def telemetry_of(
+    frames: Frames, tracks: Mapping[str, Telemetry], offsets: Mapping[str, TimeOffset]
+) -> Telemetry:
+    """Return the telemetry at the times of some frames, with the time offset of each flight."""
+    shifted = {
+        name: track.shifted(offsets[name].applied_s if name in offsets else 0.0)
+        for name, track in tracks.items()
+    }
+    return align_telemetry(shifted, frames.sequences.tolist(), frames.time_s)
+
+
+def time_offsets(
     scene: Scene,
     frames: Frames,
     tracks: Mapping[str, Telemetry],

@@ -174,7 +174,14 @@ def _stages(
     added = [final.stored_path(path) for path in inputs]
     area.write_facts(Facts(sources=(*earlier, *added), evaluation=final.facts.evaluation))
     report(frames, before.get(FRAMES))
-    model = build_model(area, options.model, watcher.progress, extend=extended, overwrite=overwrite)
+    model = build_model(
+        area,
+        options.model,
+        watcher.progress,
+        geo=_geo_options(area, options),
+        extend=extended,
+        overwrite=overwrite,
+    )
     report(model, before.get(MODEL))
     if not has_fixes(area) and _geo_options(area, options).control is None:
         return

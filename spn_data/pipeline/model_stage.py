@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,14 +25,18 @@ from spn_data.errors import FormatError
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.inputs.lens_file import read_lenses
 from spn_data.labels.labels import write_label_observations, write_labels
+from spn_data.pipeline.geo_stage import GeoStageOptions
+from spn_data.pipeline.gnss_witness import focal_lengths_by_gnss
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.correspondences import FramesToMap
 from spn_data.reconstruction.diagnosis import missing_passages
-from spn_data.reconstruction.focal_trial import focal_trials
+from spn_data.reconstruction.focal_trial import FocalTrial, focal_trials
 from spn_data.reconstruction.mapping_labels import mapping_labels
 from spn_data.reconstruction.reconstruct import ReconstructResult, reconstruct
+from spn_data.reconstruction.refinement import RefinedModel
 from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
+from spn_data.reconstruction.view_variety import viewing_distance
 from spn_data.storage.stage_record import StageRecord, current_options
 from spn_data.work.timing import Progress, Stopwatch
 
@@ -41,6 +46,7 @@ def build_model(
     options: ReconstructOptions,
     progress: Progress,
     *,
+    geo: GeoStageOptions | None = None,
     extend: Area | None = None,
     overwrite: bool = False,
 ) -> StageRecord:
@@ -51,6 +57,8 @@ def build_model(
     area : Area
     options : ReconstructOptions
     progress : Progress
+    geo : GeoStageOptions or None
+        How fixes are used, which are compared with the focal lengths; None: the defaults.
     extend : Area or None
         Area whose features and matches are reused, if they were computed with the same options.
     overwrite : bool
@@ -78,11 +86,13 @@ def build_model(
     passages = missing_passages(result.registrations, chosen.sequences, chosen.time_s)
     shutters = _shutters(result, chosen, stopwatch)
     write_registration(work.path, result.registrations)
-    trials = focal_trials(result.refined.scene, result.refined.covariance, to_map)
-    _write_labels(work.path, result, chosen)
+    distance = viewing_distance(result.refined.scene, result.refined.observations)
+    with stopwatch.step("focal lengths"):
+        trials = _trials(area, result.refined, to_map, distance, geo or GeoStageOptions(), progress)
+    _write_labels(work.path, result, chosen, trials)
     _move_results(work.path, result)
     return work.finish(
-        counts=_counts(result, chosen, shutters),
+        counts=_counts(result, trials, distance, shutters),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=(
@@ -90,7 +100,7 @@ def build_model(
             *result.attempts,
             *passages,
             *_unlabelled(result),
-            *(note for trial in trials for note in trial.notes()),
+            *(note for trial in trials.values() for note in trial.notes()),
             *(note for shutter in shutters if (note := shutter.describe())),
         ),
     )
@@ -146,14 +156,32 @@ def rough_positions(frames: Frames) -> np.ndarray:
     return positions
 
 
-def _write_labels(work: Path, result: ReconstructResult, chosen: Frames) -> None:
+def _trials(
+    area: Area,
+    refined: RefinedModel,
+    frames: FramesToMap,
+    distance: float,
+    geo: GeoStageOptions,
+    progress: Progress,
+) -> dict[int, FocalTrial]:
+    """Compare what is known of the focal lengths, by camera id."""
+    scene, covariance = refined.scene, refined.covariance
+    gnss, metres = focal_lengths_by_gnss(area, scene, covariance, frames, geo, progress)
+    return focal_trials(scene, covariance, frames, gnss, distance, metres)
+
+
+def _write_labels(
+    work: Path, result: ReconstructResult, chosen: Frames, trials: Mapping[int, FocalTrial]
+) -> None:
     """Write labels of the mapping frames in the model's gauge, if they have covariances."""
     refined = result.refined
     if refined.covariance is None:
         return
+    doubts = {i: trial.doubt_px for i, trial in trials.items()}
+    covariance = refined.covariance.with_focal_errors(doubts)
     reasons = {row.name: row.reason for row in result.registrations}
     labels, seen = mapping_labels(
-        chosen, refined.scene, refined.observations, refined.points, reasons, refined.covariance
+        chosen, refined.scene, refined.observations, refined.points, reasons, covariance
     )
     write_labels(work / POSES, labels)
     write_label_observations(work / OBSERVATIONS, seen)
@@ -192,25 +220,23 @@ def _move_results(work: Path, result: ReconstructResult) -> None:
 
 
 def _counts(
-    result: ReconstructResult, chosen: Frames, shutters: tuple[ShutterDiagnosis, ...]
+    result: ReconstructResult,
+    trials: Mapping[int, FocalTrial],
+    distance: float,
+    shutters: tuple[ShutterDiagnosis, ...],
 ) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
     scene = result.refined.scene
-    key_of = dict(zip(chosen.names.tolist(), chosen.cameras.tolist(), strict=True))
-    keys = {int(i): key_of[name] for i, name in zip(scene.camera_ids, scene.names, strict=True)}
-    covariance = result.refined.covariance
-    of_images = {} if covariance is None else covariance.shared.focal_lengths
-    errors = {i: round(focal.error_px, 2) for i, focal in of_images.items()}
     cameras = {
-        key: {
-            "focal_px": round(scene.cameras[i].focal_px[0], 2),
-            "focal_error_px": errors.get(i),
-            "fov_deg": round(scene.cameras[i].horizontal_fov_deg, 2),
-            "model": scene.cameras[i].model,
-            "params": [round(float(p), 6) for p in scene.cameras[i].params],
+        trial.camera: {
+            "focal_px": round(trial.adjusted_px, 2),
+            "fov_deg": round(trial.adjusted.horizontal_fov_deg, 2),
+            "model": trial.adjusted.model,
+            "params": [round(float(p), 6) for p in trial.adjusted.params],
+            **trial.counts(),
         }
-        for i, key in keys.items()
+        for trial in trials.values()
     }
     return {
         "cameras": cameras,
@@ -221,6 +247,7 @@ def _counts(
         "pairs_tried": result.pairs_tried,
         "pairs_verified": result.pairs_verified,
         "points": len(scene.points),
+        "viewing_distance": round(distance, 6),
         "observations": observations,
         "mean_error_px": round(
             sum(r.error_px * r.observations for r in registered) / observations, 4

@@ -25,7 +25,7 @@ Huber 1967; White 1980; Liang and Zeger 1986, "Longitudinal data analysis using 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
@@ -39,6 +39,7 @@ from spn_data.uncertainty.bundle_jacobians import (
     Unknowns,
     linearize_bundle,
 )
+from spn_data.uncertainty.focal_changes import FocalChanges, focal_changes, with_focal_errors
 from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.lens_errors import BLOCKS
 from spn_data.uncertainty.shared_errors import (
@@ -213,6 +214,8 @@ class MapCovariance:
                 scene, unknowns, inverse, lens_scores, meat, factor, options.lenses
             )
             meat = shared.dependence * meat
+            doubts = {i: lens.focal_doubt_px for i, lens in options.lenses.items()}
+            shared = with_focal_errors(shared, inverse, unknowns, doubts)
         point_row = np.full(len(scene.points), -1)
         point_row[points] = np.arange(len(points))
         return cls(
@@ -228,6 +231,15 @@ class MapCovariance:
             sparse.vstack([part[2] for part in parts], format="csr"),
             own if options.clustered else variance * own,
         )
+
+    def with_focal_errors(self, errors_px: Mapping[int, float]) -> MapCovariance:
+        """Return the covariance with further errors of focal lengths, sigma in px by camera id."""
+        shared = with_focal_errors(self.shared, self._inverse, self._unknowns, errors_px)
+        return replace(self, shared=shared)
+
+    def focal_changes(self) -> FocalChanges:
+        """Return how the poses change with focal lengths, and by other errors of the lenses."""
+        return focal_changes(self._inverse, self._unknowns, self.shared, self._frames)
 
     def functional_covariances(
         self, functionals: Sequence[Functional]

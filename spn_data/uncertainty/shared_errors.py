@@ -19,7 +19,7 @@ from spn_data.uncertainty.inner_constraints import InnerConstraintInverse
 from spn_data.uncertainty.lens_errors import CONSTANT, TERMS, estimate_field, field_values
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class LensPrior:
     """What is known of a lens besides the measurements of the map.
 
@@ -29,19 +29,19 @@ class LensPrior:
         What mapping held.
     focal_sigma_px : float
         Standard deviation of a held focal length.
+    focal_doubt_px : float
+        Error of the focal length by what contradicts the measurements.
     """
 
     hold: Hold = Hold.NOTHING
     focal_sigma_px: float = 0.0
+    focal_doubt_px: float = 0.0
 
     @classmethod
-    def of(cls, lens: InitialLens) -> LensPrior:
+    def of(cls, lens: InitialLens, focal_doubt_px: float = 0.0) -> LensPrior:
         """Return what is known of a lens with which mapping began."""
-        if lens.hold is Hold.NOTHING:
-            return cls()
-        return cls(
-            hold=lens.hold, focal_sigma_px=lens.focal_sigma * float(np.mean(lens.camera.focal_px))
-        )
+        held = 0.0 if lens.hold is Hold.NOTHING else lens.focal_sigma
+        return cls(lens.hold, held * float(np.mean(lens.camera.focal_px)), focal_doubt_px)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from spn_data.geometry.geodesy import HeightReference
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_angles
 from spn_data.georegistration.result import GeoFit
-from spn_data.inputs.gnss_check import GnssCheck, check_gnss
+from spn_data.inputs.gnss_check import GnssCheck, check_gnss, focal_witness_notes
 from spn_data.labels.labels import Labels, LabelStatus
 from spn_data.telemetry.track import Telemetry
 from tests.worlds.report_data import geo_fit
@@ -147,3 +147,26 @@ def test_a_known_clock_is_not_estimated_again() -> None:
     found = check_gnss(labelled(), track(geo, (0.0, 0.0, 0.0), late_s=0.6), geo, time_is_known=True)
     assert found is not None
     assert found.time_offset_s == 0
+
+
+def test_heights_of_a_flight_are_a_witness_of_the_maps_focal_length():
+    """Labels 2.4 m above their fixes at 60 m make a doubtful focal length 4 % too short."""
+    check = GnssCheck(
+        fixes=90,
+        time_offset_s=0.0,
+        offset_e_m=0.0,
+        offset_n_m=0.0,
+        offset_u_m=-2.4,
+        scatter_h_m=0.3,
+        scatter_v_m=0.3,
+        max_h_m=1.0,
+        sigma_h_m=1.4,
+        sigma_v_m=1.2,
+        contradicts=False,
+    )
+    (note,) = focal_witness_notes(check, 60.0, 0.015, 0.065)
+    assert "make it 4.0% too short (sigma 2.5%), which agrees with that" in note
+    (note,) = focal_witness_notes(replace(check, offset_u_m=9.0), 60.0, 0.0, 0.02)
+    assert "15.0% too long (sigma 2.0%), which contradicts that" in note
+    assert focal_witness_notes(check, 60.0, 0.015, 0.002) == []
+    assert focal_witness_notes(replace(check, offset_u_m=None), 60.0, 0.015, 0.065) == []

@@ -83,7 +83,9 @@ def small(frames: int = 10, points: int = 300, window: int = 6) -> Small:
     return Small(scene, seen)
 
 
-def adjusted(scene: Scene, seen: MapObservations, pixels: np.ndarray) -> Small:
+def adjusted(
+    scene: Scene, seen: MapObservations, pixels: np.ndarray, *, hold_focal: bool = False
+) -> Small:
     """Run COLMAP's bundle adjustment on measurements, starting from the given scene."""
     tracks: list[list[tuple[int, int]]] = [[] for _ in scene.points]
     measured = []
@@ -102,6 +104,7 @@ def adjusted(scene: Scene, seen: MapObservations, pixels: np.ndarray) -> Small:
     )
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.num_threads = 1
+    options.refine_focal_length = not hold_focal
     pycolmap.bundle_adjustment(model, options)
     return Small(*_observed(model))
 
