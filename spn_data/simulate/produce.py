@@ -192,6 +192,7 @@ def render_frame(
     renderer: SceneRenderer, path: FlightPath, frame: int, readout_s: float = 0.0
 ) -> np.ndarray:
     """Render one frame (H, W, 3) uint8 RGB of a flight, before exposure and noise."""
+    renderer.set_time(path.clock_s + path.time_s[frame], path.sunlight)
     blurred = bool(path.blurred[frame])
     if readout_s == 0.0:
         if blurred:
