@@ -199,7 +199,7 @@ def _lines(
     north: bool = False,
 ) -> list[tuple[float, ...]]:
     """Return stations of `count` parallel lines, east-west unless `north`, with one heading."""
-    stations = []
+    stations: list[tuple[float, ...]] = []
     for k, offset in enumerate(np.linspace(-across_m, across_m, count)):
         for end in (-reach_m, reach_m) if k % 2 == 0 else (reach_m, -reach_m):
             x, y = (offset, end) if north else (end, offset)

@@ -24,9 +24,10 @@ from spn_data.simulate.flight import (
     simulate_paths,
     simulate_telemetry,
 )
+from spn_data.simulate.place import SceneFaces
 from spn_data.simulate.presets import SimulateOptions
 from spn_data.simulate.render import BAND_PX, SceneRenderer
-from spn_data.simulate.scene import SceneFaces, build_scene, paint
+from spn_data.simulate.scene import build_scene, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
