@@ -21,8 +21,9 @@ from rich.console import Console
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
 from spn_data.geometry.rotations import rotations_from_angles
+from spn_data.simulate.place import SceneOptions
 from spn_data.simulate.render import SceneRenderer
-from spn_data.simulate.scene import SceneOptions, build_scene, paint_all
+from spn_data.simulate.scene import build_scene, paint_all
 from spn_data.simulate.video_out import develop, noise_field
 
 _SEEN_M = 44.0  # width of the image at the courtyard

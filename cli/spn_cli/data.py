@@ -154,10 +154,12 @@ def status(area_folder: Path) -> None:
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
     "--preset",
-    type=click.Choice(["standard", "demo"]),
+    type=click.Choice(["standard", "demo", "look-alike", "modern", "street", "village"]),
     default="standard",
     show_default=True,
-    help="Size of the videos. standard: 1280x720 at 10 fps; demo: the same flights at 960x540 and 5 fps.",
+    help="Place and flights. standard: a brick courtyard, 1280x720 at 10 fps; demo: the same at 960x540 and "
+    "5 fps; look-alike: another courtyard with the same windows; modern: a courtyard of plaster, panels and "
+    "glass.",
 )
 @click.option(
     "--seed", default=1, show_default=True, help="Random seed of scene, flights and errors."
@@ -173,7 +175,7 @@ def status(area_folder: Path) -> None:
     type=click.Choice(["courtyard", "nadir", "straight"]),
     default="courtyard",
     show_default=True,
-    help="Paths of the mapping flights.",
+    help="Paths of the mapping flights in the brick courtyard.",
 )
 @click.option(
     "--rtk",
@@ -200,7 +202,7 @@ def status(area_folder: Path) -> None:
     "--length-factor", default=1.0, show_default=True, help="Factor of the duration of the flights."
 )
 def simulate(out: Path, preset: str, seed: int, **chosen: Any) -> None:
-    """Render simulated flights over a courtyard, with telemetry and exact ground truth.
+    """Render simulated flights over a place, with telemetry and exact ground truth.
 
     \b
     Example:

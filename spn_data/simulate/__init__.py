@@ -1,4 +1,4 @@
-"""Simulated flights in a courtyard with exact ground truth, for the demo, tests and what-if studies."""
+"""Simulated flights over four places with exact ground truth, for the demo, tests and what-if studies."""
 
 from spn_data.simulate.flight import (
     FlightPath,

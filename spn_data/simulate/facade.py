@@ -63,6 +63,27 @@ def target_texel(canvas: Canvas) -> tuple[int, int]:
     return canvas.shape[0] - canvas.texel(4.2), canvas.texel(pier)
 
 
+def paint_target(image: np.ndarray, canvas: Canvas) -> None:
+    """Paint the survey target of a wall, in place."""
+    r, c = target_texel(canvas)
+    half = canvas.texel(0.2)
+    image[r - half : r + half, c - half : c + half] = 235
+    image[r - half : r, c - half : c] = image[r : r + half, c : c + half] = 25
+
+
+def paint_windows(image: np.ndarray, alpha: np.ndarray, canvas: Canvas) -> None:
+    """Paint the window grid with its shadow gaps and reflectance, in place."""
+    sprite = window_sprite(canvas)
+    for x, y in window_corners_m(*canvas.size_m):
+        r, c = canvas.texel(y), canvas.texel(x)
+        shadow = canvas.texel(0.06)
+        image[
+            r - shadow : r + len(sprite) + shadow, c - shadow : c + sprite.shape[1] + shadow
+        ] //= 2
+        image[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, :3]
+        alpha[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, 3]
+
+
 def paint_facade(canvas: Canvas) -> np.ndarray:
     """Paint a brick wall (H, W, 4) with the common window grid, weathering, and details of its own."""
     rng = canvas.rng
@@ -91,15 +112,7 @@ def paint_facade(canvas: Canvas) -> np.ndarray:
                 1 + 0.08 * weather[band : band + canvas.texel(0.16)],
             )
     alpha = np.zeros((rows, columns), np.uint8)
-    sprite = window_sprite(canvas)
-    for x, y in window_corners_m(*canvas.size_m):
-        r, c = canvas.texel(y), canvas.texel(x)
-        shadow = canvas.texel(0.06)
-        image[
-            r - shadow : r + len(sprite) + shadow, c - shadow : c + sprite.shape[1] + shadow
-        ] //= 2
-        image[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, :3]
-        alpha[r : r + len(sprite), c : c + sprite.shape[1]] = sprite[:, :, 3]
+    paint_windows(image, alpha, canvas)
     _paint_unique_details(image, alpha, canvas, rng)
     return np.dstack([image, alpha])
 
@@ -152,9 +165,6 @@ def _paint_unique_details(
         image[:, x : x + width] = np.repeat(tone[:, None], 3, axis=1).astype(np.uint8)
         for joint in range(canvas.texel(1.1), rows, canvas.texel(2.7)):
             image[joint : joint + canvas.texel(0.06), x - 2 : x + width + 2] = (60, 62, 64)
-    r, c = target_texel(canvas)
-    half = canvas.texel(0.2)
-    image[r - half : r + half, c - half : c + half] = 235
-    image[r - half : r, c - half : c] = image[r : r + half, c : c + half] = 25
+    paint_target(image, canvas)
     sign = poster(rng, canvas.texel(1.5), canvas.texel(0.8))
     paste(sign, gaps_m[picks[-1]] + 0.12, height_m - rng.uniform(6.0, 9.0))

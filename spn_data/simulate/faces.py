@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -29,6 +30,25 @@ class Texture:
         return cls(tuple(levels))
 
 
+class Placement(NamedTuple):
+    """Where a body is at one moment.
+
+    rotation : (3, 3), and shift : (3,) metres, from the position of its faces at rest. scroll : shift of its
+    textures as fractions of their width and height.
+    """
+
+    rotation: np.ndarray
+    shift: np.ndarray
+    scroll: tuple[float, float] = (0.0, 0.0)
+
+
+class Body(Protocol):
+    """Something that moves, as a function of the time of day."""
+
+    def at(self, time_s: float) -> Placement:
+        """Return its placement at a time."""
+
+
 @dataclass(frozen=True, eq=False)
 class Face:
     """Parallelogram, or a convex polygon in its plane, with a texture on its front.
@@ -41,6 +61,7 @@ class Face:
         None for the whole parallelogram.
     mirrored : what the reflecting parts of the texture show, as a face at its mirror image behind this one.
     at_infinity : whether the face moves with the eye (sky).
+    body : what the face moves with; None if it is static.
     """
 
     texture: str
@@ -51,6 +72,14 @@ class Face:
     polygon: np.ndarray | None = None
     mirrored: Face | None = None
     at_infinity: bool = False
+    body: Body | None = None
+
+    def corners(self) -> np.ndarray:
+        """Return the corners (K, 3) in metres."""
+        flat = self.polygon
+        if flat is None:
+            flat = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        return np.asarray(self.origin + flat @ np.stack([self.u_edge, self.v_edge]))
 
     def edges(self) -> np.ndarray:
         """Return lines (K, 3) with ``a s + b t + c >= 0`` inside, in units of the two edges."""

@@ -12,8 +12,10 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.simulate.gnss import gnss_errors
-from spn_data.simulate.paths import Motion, courtyard_loop, nadir_lines, straight_line
-from spn_data.simulate.presets import MappingPaths, SimulateOptions
+from spn_data.simulate.light import Sunlight
+from spn_data.simulate.paths import Motion
+from spn_data.simulate.plans import planned
+from spn_data.simulate.presets import SimulateOptions
 
 ROLES = ("mapping", "evaluation")
 
@@ -43,6 +45,10 @@ class FlightPath:
         Exposure of the frames, in EV.
     motion : Motion
         Poses at any time, also between frames and a few seconds beyond both ends.
+    clock_s : float
+        Time of day at the first frame, on which the places of moving things depend.
+    sunlight : Sunlight or None
+        Light during the flight; None if surfaces look as they are painted.
     """
 
     name: str
@@ -54,6 +60,8 @@ class FlightPath:
     blur_vectors: np.ndarray
     exposure_ev: np.ndarray
     motion: Motion
+    clock_s: float = 0.0
+    sunlight: Sunlight | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,50 +116,7 @@ def simulate_paths(options: SimulateOptions) -> dict[str, FlightPath]:
     InputError
         If `only` names an unknown flight or role.
     """
-    half_m = options.scene.half_m
-    side = float(np.sqrt(options.area_factor)) * options.length_factor
-    laps = options.length_factor
-    motions: dict[str, tuple[str, float, Motion]] = {}
-
-    def add(name: str, role: str, motion: Motion, duration_s: float) -> None:
-        motions[name] = (role, duration_s, motion)
-
-    def rng(name: str) -> np.random.Generator:
-        return flight_rng(options, name, 0)
-
-    if options.mapping_paths == MappingPaths.NADIR:
-        motion, duration_s = nadir_lines(rng("nadir"), half_m, options.length_factor)
-        add("nadir", "mapping", motion, duration_s)
-    elif options.mapping_paths == MappingPaths.STRAIGHT:
-        motion, duration_s = straight_line(rng("straight"), half_m, options.length_factor)
-        add("straight", "mapping", motion, duration_s)
-    else:
-        # The first flight looks across the courtyard briefly, then at the facades ahead. The second one goes
-        # the other way round and looks across for longer before it turns to the facades. Both see everything
-        # from near and far.
-        motion = courtyard_loop(
-            rng("flight1"), half_m, duration_s=75 * side, margin_m=8.0, laps=1.25 * laps, turn=1,
-            offsets_deg=[(0.0, 150.0), (0.1, 140.0), (0.32, 40.0), (0.75, 25.0), (1.0, 40.0)],
-            height_m=(1.7, 8.8), pitch_deg=(-9.3, 14.3),
-        )  # fmt: skip
-        add("flight1", "mapping", motion, 75 * side)
-        motion = courtyard_loop(
-            rng("flight2"), half_m, duration_s=60 * side, margin_m=5.5, laps=1.0 * laps, turn=-1,
-            offsets_deg=[(0.0, 165.0), (0.5, 190.0), (0.8, 45.0), (1.0, 30.0)],
-            height_m=(1.7, 8.0), pitch_deg=(-9.3, 14.3),
-        )  # fmt: skip
-        add("flight2", "mapping", motion, 60 * side)
-    motion = courtyard_loop(
-        rng("medium"), half_m, duration_s=30 * side, margin_m=7.2, laps=0.5 * laps, turn=1,
-        offsets_deg=[(0.0, 40.0), (1.0, 28.0)], height_m=(2.5, 6.0), pitch_deg=(-9.0, 13.0),
-    )  # fmt: skip
-    add("medium", "evaluation", motion, 30 * side)
-    motion = courtyard_loop(
-        rng("low"), half_m, duration_s=25 * side, margin_m=9.0, laps=0.62 * laps, turn=-1,
-        offsets_deg=[(0.0, 160.0), (0.5, 195.0), (1.0, 165.0)], height_m=(12.4, 20.6),
-        pitch_deg=(-68.5, -47.0),
-    )  # fmt: skip
-    add("low", "evaluation", motion, 25 * side)
+    motions = planned(options, lambda name: flight_rng(options, name, 0))
     wanted = options.only or ROLES
     for name in wanted:
         if name not in motions and name not in ROLES:
@@ -192,6 +157,8 @@ def _flight_path(
         np.where(blurred[:, None], angles * axes, 0.0),
         options.exposure_sigma_ev * np.sqrt(2 / 3) * slow,
         motion,
+        float(flight_rng(options, name, 3).uniform(0, 3600)),
+        Sunlight.draw(options.light, flight_rng(options, name, 4)) if options.light.sun else None,
     )
 
 
@@ -219,6 +186,7 @@ def simulate_telemetry(path: FlightPath, options: SimulateOptions) -> FlightTele
     true_s = path.time_s + options.time_offset_s
     centers, angles_deg = path.motion.at(true_s)
     errors_m, is_burst = gnss_errors(true_s, options.gnss, rng)
+    errors_m += options.gnss.draw_constant(flight_rng(options, "day", 5))
     bias_deg = rng.standard_normal(3) * options.gimbal_sigma_deg
     measured = centers + errors_m
     gimbal = angles_deg + bias_deg if options.gimbal_angles else np.full((len(true_s), 3), np.nan)

@@ -1,4 +1,4 @@
-"""Error model of a drone's GNSS positions: a drifting bias, white noise, and multipath bursts."""
+"""Error model of a drone's GNSS positions: a lasting and a drifting bias, white noise, multipath bursts."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ class GnssOptions:
         Duration of a burst.
     burst_m : float
         Magnitude of the error during a burst, in a random direction.
+    constant_sigma_m : tuple of float
+        Standard deviation east, north and up of an error that all flights of the day share.
     """
 
     bias_sigma_m: tuple[float, float, float] = (0.7, 0.7, 1.1)
@@ -33,6 +35,11 @@ class GnssOptions:
     burst_interval_s: float = 30.0
     burst_length_s: float = 1.0
     burst_m: float = 12.0
+    constant_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def draw_constant(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw the error (3,) in metres that all flights of a day share."""
+        return rng.standard_normal(3) * self.constant_sigma_m
 
     @classmethod
     def rtk(cls) -> GnssOptions:

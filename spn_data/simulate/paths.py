@@ -202,3 +202,44 @@ def straight_line(
     heading = 15.0 + 8.0 * _wander(rng, time_s, (8.0, 13.0))
     angles = np.stack([heading, np.full(n, 3.0), np.zeros(n)], axis=1)
     return _with_shake(rng, time_s, centers, angles), duration_s
+
+
+def guided(
+    rng: np.random.Generator,
+    stations: np.ndarray,
+    *,
+    speed_m_s: float,
+    length_factor: float,
+    sway_deg: float = 4.0,
+) -> tuple[Motion, float]:
+    """Fly through stations at constant speed.
+
+    Parameters
+    ----------
+    rng : Generator
+        Source of random numbers.
+    stations : ndarray, shape (K, 5)
+        East, north and up in metres, and heading and pitch of the camera in degrees; headings are unwrapped.
+    speed_m_s : float
+        Speed.
+    length_factor : float
+        Share of the path to fly, at most all of it.
+    sway_deg : float
+        Slow changes of the heading.
+
+    Returns
+    -------
+    Motion, float
+        The motion and its duration in seconds.
+    """
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(stations[:, :3], axis=0), axis=1))])
+    total_m = arc[-1] * min(1.0, length_factor)
+    duration_s = total_m / speed_m_s
+    time_s = _times(duration_s)
+    travelled = np.clip(time_s * speed_m_s, 0, total_m)
+    values = np.stack([np.interp(travelled, arc, column) for column in stations.T], axis=1)
+    values = gaussian_filter1d(values, 1.2 / STEP_S, axis=0, mode="nearest")
+    sway = sway_deg * _wander(rng, time_s, (9.0, 16.0))
+    roll = 0.3 * _wander(rng, time_s, (9.0, 15.0))
+    angles = np.stack([values[:, 3] + sway, values[:, 4], roll], axis=1)
+    return _with_shake(rng, time_s, values[:, :3], angles), duration_s

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
+
+import numpy as np
 
 from spn_data.errors import InputError
-from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera import MODELS, Camera
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.simulate.gnss import GnssOptions
-from spn_data.simulate.scene import SceneOptions
+from spn_data.simulate.light import LightOptions
+from spn_data.simulate.place import Place, SceneOptions
 
 
 class MappingPaths(StrEnum):
-    """Flight patterns of the mapping flights."""
+    """Flight patterns of the mapping flights in the courtyard; other places have their own."""
 
     COURTYARD = "courtyard"  # two flights inside the courtyard, 1.5-9 m high
     NADIR = "nadir"  # one flight in parallel lines above the building, looking down
     STRAIGHT = "straight"  # one flight along a straight line parallel to the north facade
+
+
+LOOK_ALIKE_SEED = 1_000_000  # added to the seed of the scene, not of the flights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,10 +33,14 @@ class LensOptions:
 
     fov_deg: float  # horizontal, of the undistorted image
     distortion: tuple[float, ...] = ()  # none, (k1,), (k1, k2) or (k1, k2, p1, p2) as in COLMAP
+    shift: tuple[float, float] = (0.0, 0.0)  # of the principal point, as shares of width and height
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera for an image size."""
-        return Camera.from_horizontal_fov(width, height, self.fov_deg, self.distortion)
+        camera = Camera.from_horizontal_fov(width, height, self.fov_deg, self.distortion)
+        at = MODELS[camera.model].index("cx")
+        camera.params[at : at + 2] += np.array(self.shift) * (width, height)
+        return camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +52,7 @@ class SimulateOptions:
     width: int = 1280
     height: int = 720
     fps: float = 10.0  # of the video; telemetry has one record per frame
+    place: Place = Place.COURTYARD
     only: tuple[str, ...] = ()  # flights or roles (mapping, evaluation) to render; empty for all
     mapping_paths: MappingPaths = MappingPaths.COURTYARD
     area_factor: float = 1.0  # factor on the courtyard's ground area; flights grow with its side
@@ -74,6 +86,12 @@ class SimulateOptions:
     geoid_m: float = 48.3  # height of mean sea level, to which abs_alt refers, above the ellipsoid
     texels_per_m: float = 140.0  # resolution of the painted surfaces
     houses_per_hectare: float = 0.0  # on the courtyard's ground
+    size_m: tuple[float, float] = (39.0, 36.0)  # of the ground, east-west and north-south
+    people: int = 0  # that walk
+    cars: int = 0  # that drive
+    wind_m: float = 0.0  # how far crowns of trees 5 m high sway
+    light: LightOptions = field(default_factory=LightOptions)
+    look_alike: bool = False  # same grid of windows and same objects, all else is different
     crf: int = 18  # H.264 quality; lower is better
 
     def __post_init__(self) -> None:
@@ -85,6 +103,10 @@ class SimulateOptions:
             raise InputError("fps, area factor and length factor must be above zero")
         if not 0 <= self.blur_share <= 1:
             raise InputError(f"blur share {self.blur_share} is outside 0 to 1")
+        if self.place != Place.COURTYARD and self.mapping_paths != MappingPaths.COURTYARD:
+            raise InputError(
+                f"paths {self.mapping_paths} are flown in the courtyard only, not over {self.place}"
+            )
         if abs(self.time_offset_s) > 5:
             raise InputError(f"time offset {self.time_offset_s} s is outside -5 to 5 s")
         # The ground is one texture, which limits its number of texels.
@@ -97,16 +119,57 @@ class SimulateOptions:
     def scene(self) -> SceneOptions:
         """Options of the scene."""
         return SceneOptions(
+            place=self.place,
+            size_m=self.size_m,
+            people=self.people,
+            cars=self.cars,
+            wind_m=self.wind_m,
             area_factor=self.area_factor,
             texels_per_m=self.texels_per_m,
             houses_per_hectare=self.houses_per_hectare,
-            seed=self.seed,
+            seed=self.seed + LOOK_ALIKE_SEED * self.look_alike,
         )
 
+
+# What real flights have and `standard` does not: a principal point off the centre, the distortion of a wide
+# lens, a GNSS error that lasts, brightness and shadows that change.
+_REAL: dict[str, Any] = {
+    "mapping_lens": LensOptions(
+        fov_deg=72.0, distortion=(-0.09, 0.03, 0.0006, -0.0004), shift=(0.008, -0.006)
+    ),
+    "evaluation_lens": LensOptions(
+        fov_deg=90.0, distortion=(-0.24, 0.07, -0.0005, 0.0007), shift=(-0.009, 0.007)
+    ),
+    "exposure_sigma_ev": 0.45,
+    "gnss": GnssOptions(constant_sigma_m=(0.9, 0.9, 2.3)),
+    "light": LightOptions(sun=1.0),
+}
 
 PRESETS: dict[str, SimulateOptions] = {
     "standard": SimulateOptions(),
     "demo": SimulateOptions(preset="demo", width=960, height=540, fps=5.0),
+    "look-alike": SimulateOptions(preset="look-alike", look_alike=True),
+    "modern": SimulateOptions(
+        preset="modern", place=Place.MODERN, people=8, cars=1, wind_m=0.12, **_REAL
+    ),
+    "street": SimulateOptions(
+        preset="street",
+        place=Place.STREET,
+        size_m=(96.0, 17.0),
+        people=14,
+        cars=10,
+        wind_m=0.12,
+        **_REAL,
+    ),
+    "village": SimulateOptions(
+        preset="village",
+        place=Place.VILLAGE,
+        size_m=(110.0, 90.0),
+        people=16,
+        cars=6,
+        wind_m=0.15,
+        **_REAL,
+    ),
 }
 
 

@@ -23,9 +23,10 @@ from spn_data.simulate.flight import (
     simulate_paths,
     simulate_telemetry,
 )
+from spn_data.simulate.place import SceneFaces
 from spn_data.simulate.presets import SimulateOptions
 from spn_data.simulate.render import BAND_PX, SceneRenderer
-from spn_data.simulate.scene import SceneFaces, build_scene, paint
+from spn_data.simulate.scene import build_scene, paint
 from spn_data.simulate.srt import srt_text
 from spn_data.simulate.truth import write_options, write_truth
 from spn_data.simulate.video_out import develop, noise_field, write_video
@@ -191,6 +192,7 @@ def render_frame(
     renderer: SceneRenderer, path: FlightPath, frame: int, readout_s: float = 0.0
 ) -> np.ndarray:
     """Render one frame (H, W, 3) uint8 RGB of a flight, before exposure and noise."""
+    renderer.set_time(path.clock_s + path.time_s[frame], path.sunlight)
     blurred = bool(path.blurred[frame])
     if readout_s == 0.0:
         if blurred:

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from spn_data.geometry.camera import OPENCV_FROM_COLMAP, Camera
-from spn_data.simulate.faces import MAX_CORNERS, Face, Texture
+from spn_data.simulate.faces import MAX_CORNERS, Body, Face, Texture
+from spn_data.simulate.light import GAIN_UNIT, Sunlight, cast_shadows, normals
 from spn_data.simulate.rays import TILE_PX, RayGrid
 
 BAND_PX = 8  # rows that share one pose under a rolling shutter
@@ -61,6 +62,37 @@ class SceneRenderer:
                 [0, 0, 1],
             ]
         self._grids: dict[str, list[RayGrid]] = {}
+        self._faces = faces
+        bodies: dict[int, tuple[Body, list[int]]] = {}
+        for i, face in enumerate(faces):
+            if face.body is not None:
+                bodies.setdefault(id(face.body), (face.body, []))[1].append(i)
+        self._bodies = list(bodies.values())
+        self._texture_sizes = np.array([t.levels[0].shape[1::-1] for t in self._textures])
+        self._at_rest = self._origins.copy(), self._axes.copy(), self._texel_from_face.copy()
+        self._sunlight: Sunlight | None = None
+        self._shadows: dict[int, np.ndarray] = {}
+        self._incidence = np.zeros(len(faces))
+        self._gains: np.ndarray | None = None  # by face; None if all are one
+        self._gain_images: dict[int, np.ndarray] = {}
+
+    def set_time(self, time_s: float, sunlight: Sunlight | None = None) -> None:
+        """Move the bodies to where they are at a time, and let the sun shine as it does then."""
+        origins, axes, texel_from_face = self._at_rest
+        for body, idx in self._bodies:
+            place = body.at(time_s)
+            self._origins[idx] = origins[idx] @ place.rotation.T + place.shift
+            self._axes[idx] = axes[idx] @ place.rotation.T
+            scroll = self._texture_sizes[idx] * place.scroll
+            self._texel_from_face[idx, :2, 2] = texel_from_face[idx, :2, 2] + scroll
+        if sunlight is None:
+            self._gains, self._gain_images = None, {}
+            return
+        if sunlight is not self._sunlight:
+            self._sunlight = sunlight
+            self._shadows = cast_shadows(self._faces, sunlight.toward_sun)
+            self._incidence = np.maximum(normals(self._faces) @ sunlight.toward_sun, 0.0)
+        self._gains, self._gain_images = sunlight.gains(self._shadows, self._incidence, time_s)
 
     def render(self, center: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
         """Render a sharp image (H, W, 3) uint8 RGB from one pose: centre (3,) and rotation (3, 3)."""
@@ -222,7 +254,22 @@ class SceneRenderer:
     def _shade(
         self, face_from_ray: np.ndarray, face: int, level: int, mirror_level: int, rays: np.ndarray
     ) -> np.ndarray:
-        """Return the colours (h, w, 3) of a face along rays (h, w, 2), including its reflections."""
+        """Return the colours (h, w, 3) of a face along rays (h, w, 2), with its reflections and the light."""
+        colours = self._surface(face_from_ray, face, level, mirror_level, rays)
+        if self._gains is None or self._at_infinity[face]:
+            return colours
+        if face not in self._gain_images:
+            return cv2.convertScaleAbs(colours, alpha=float(self._gains[face]))
+        image = self._gain_images[face]
+        scale = np.diag([image.shape[1], image.shape[0], 1.0])
+        texels = cv2.perspectiveTransform(rays, OPENCV_FROM_COLMAP @ scale @ face_from_ray[face])
+        gain = cv2.remap(image, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.multiply(colours, gain, scale=1 / GAIN_UNIT)
+
+    def _surface(
+        self, face_from_ray: np.ndarray, face: int, level: int, mirror_level: int, rays: np.ndarray
+    ) -> np.ndarray:
+        """Return the colours (h, w, 3) of a face along rays (h, w, 2) as painted, with its reflections."""
         own = self._sample(face_from_ray, face, level, rays)
         if own.shape[2] == 3:
             return own

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from spn_data.simulate.faces import Face
+from spn_data.simulate.bodies import Sway
+from spn_data.simulate.faces import Body, Face
 from spn_data.simulate.textures import Canvas
 
 # Size in metres and texels per metre by painter; shared by the objects, each face uses its own region.
@@ -27,8 +31,9 @@ def vector(*values: float) -> np.ndarray:
 class Builder:
     """Collector of the faces, textures and obstacles of a scene."""
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: int, *, wind_m: float = 0.0):
         self.seed = seed
+        self.wind_m = wind_m
         self.rng = np.random.default_rng([seed, 77])
         self.faces: list[Face] = []
         self.canvases: dict[str, tuple[str, Canvas]] = {}
@@ -69,6 +74,14 @@ class Builder:
                 texture, float(np.linalg.norm(u_edge)), float(np.linalg.norm(v_edge))
             )
         self.faces.append(Face(texture, origin, u_edge, v_edge, region))
+
+    @contextmanager
+    def moving(self, body: Body) -> Iterator[None]:
+        """Let the faces added in the context move with a body; they are no obstacles."""
+        faces, obstacles = len(self.faces), len(self.obstacles)
+        yield
+        self.faces[faces:] = [replace(face, body=body) for face in self.faces[faces:]]
+        del self.obstacles[obstacles:]
 
     def polygon(self, texture: str, points: np.ndarray) -> None:
         """Add a convex planar polygon (K, 3), clockwise as seen from its front."""
@@ -124,15 +137,38 @@ class Builder:
         )
 
     def tree(self, x: float, y: float, height: float, radius: float) -> None:
-        """Add a tree with a trunk and a crown."""
-        self.rings("bark", x, y, [(height * 0.5, 0.14), (0.0, 0.22)], 6)
-        low = height * 0.42
+        """Add a tree with a trunk and a crown, which sways if there is wind."""
         profile = [(1.0, 0.2), (0.85, 0.7), (0.5, 1.0), (0.15, 0.75), (0.0, 0.3)]
+        self._tree((x, y), height, radius, profile, sides=(6, 8))
+
+    def small_tree(self, x: float, y: float, height: float, radius: float) -> None:
+        """Add a tree with fewer faces, to be seen from afar."""
+        profile = [(1.0, 0.25), (0.6, 1.0), (0.0, 0.5)]
+        self._tree((x, y), height, radius, profile, sides=(4, 6))
+
+    def _tree(
+        self,
+        place: tuple[float, float],
+        height: float,
+        radius: float,
+        profile: list[tuple[float, float]],
+        sides: tuple[int, int],
+    ) -> None:
+        """Add a tree with the numbers of sides of its trunk and of its crown."""
+        x, y = place
+        self.rings("bark", x, y, [(height * 0.5, 0.14), (0.0, 0.22)], sides[0])
+        low = height * 0.42
+        faces = len(self.faces)
         rings = [(low + f * (height - low), r * radius) for f, r in profile]
-        self.rings("leaves", x, y, rings, 8)
-        angles = np.arange(8) * 2 * np.pi / 8 + 0.2
+        self.rings("leaves", x, y, rings, sides[1])
+        angles = np.arange(sides[1]) * 2 * np.pi / sides[1] + 0.2
         r = rings[-1][1]
         self.polygon(
             "leaves",
-            np.stack([x + r * np.cos(angles), y + r * np.sin(angles), np.full(8, low)], axis=1),
+            np.stack(
+                [x + r * np.cos(angles), y + r * np.sin(angles), np.full(sides[1], low)], axis=1
+            ),
         )
+        if self.wind_m:
+            sway = Sway(self.wind_m * height / 5, phase=x + 0.7 * y)
+            self.faces[faces:] = [replace(face, body=sway) for face in self.faces[faces:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -200,13 +201,14 @@ def _sky(canvas: Canvas) -> np.ndarray:
     return np.rint(inner * blue + (1 - inner) * np.array([208, 214, 220])).astype(np.uint8)
 
 
+Painter = Callable[[Canvas], np.ndarray]
 REFLECTION_PARTS = (2, 1)  # sky above and ground below the facade, in facade heights
 
 
-def _reflection(canvas: Canvas) -> np.ndarray:
-    """Paint the view across the courtyard (H, W, 3): the facade of that name, sky above, ground below."""
+def paint_reflection(canvas: Canvas, painter: Painter) -> np.ndarray:
+    """Paint the view across the courtyard (H, W, 3): the wall of that name, sky above, ground below."""
     height_m = canvas.size_m[1] / (1 + sum(REFLECTION_PARTS))
-    facade = paint_facade(replace(canvas, size_m=(canvas.size_m[0], height_m)))
+    facade = painter(replace(canvas, size_m=(canvas.size_m[0], height_m)))
     wall = cv2.GaussianBlur(cv2.cvtColor(facade, cv2.COLOR_RGBA2RGB), (0, 0), 0.8)
     field = clouds(canvas.rng, canvas, largest_m=14.0, smallest_m=0.5)[:, :, None]
     above = len(wall) * REFLECTION_PARTS[0]
@@ -218,7 +220,7 @@ def _reflection(canvas: Canvas) -> np.ndarray:
     return np.vstack([np.clip(part, 0, 255).astype(np.uint8) for part in parts])
 
 
-PAINTERS: dict[str, Callable[[Canvas], np.ndarray]] = {
+PAINTERS: dict[str, Painter] = {
     "facade": paint_facade,
     "plaza": paint_plaza,
     "roof": paint_roof,
@@ -230,5 +232,5 @@ PAINTERS: dict[str, Callable[[Canvas], np.ndarray]] = {
     "posters": _posters,
     "bark": _bark,
     "sky": _sky,
-    "reflection": _reflection,
+    "reflection-facade": partial(paint_reflection, painter=paint_facade),
 }

@@ -15,8 +15,9 @@ from spn_data.geometry.rendering import (
     undistorted_camera,
 )
 from spn_data.geometry.rotations import rotations_from_angles
+from spn_data.simulate.place import SceneOptions
 from spn_data.simulate.render import SceneRenderer as Simulator
-from spn_data.simulate.scene import SceneOptions, build_scene, paint_all
+from spn_data.simulate.scene import build_scene, paint_all
 
 MAPPING = Camera("OPENCV", 1280, 720, np.array([880.9, 881.5, 645, 356, -0.12, 0.03, 1e-3, -5e-4]))
 SLANTED = Camera("SIMPLE_RADIAL", 1280, 720, np.array([930.0, 620.0, 371.0, -0.06]))

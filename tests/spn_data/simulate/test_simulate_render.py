@@ -14,9 +14,10 @@ from spn_data.simulate import preset, simulate_paths
 from spn_data.simulate.faces import Face, Texture, mirror_face
 from spn_data.simulate.flight import exposure_poses
 from spn_data.simulate.paths import Motion
+from spn_data.simulate.place import SceneFaces, SceneOptions
 from spn_data.simulate.produce import render_frame
 from spn_data.simulate.render import HAZE_RGB, SceneRenderer
-from spn_data.simulate.scene import SceneFaces, SceneOptions, build_scene, paint_all
+from spn_data.simulate.scene import build_scene, paint_all
 
 CELLS = 16
 LENSES = {
