@@ -6,7 +6,6 @@ docs/export.md specifies the format, also for programs in other languages.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
-from spn_data.geometry.json_values import parse_file
+from spn_data.geometry.json_values import bounded, parse_file
 from spn_model.onboard.decoding import DecodingOptions
 from spn_model.onboard.graph_check import check_self_contained
 from spn_model.onboard.view import View
@@ -81,11 +80,11 @@ class CellDecoding:
         options: dict[str, Any] = {}
         for own in fields(DecodingOptions):
             low, high = _LIMITS.get(own.name, _SIZES)
-            number = _number(given[own.name], low, high)
+            number = bounded(given[own.name], low, high)
             options[own.name] = int(number) if isinstance(own.default, int) else number
         return cls(
-            first_px=_number(value["first_px"], 0, 1000),
-            stride_px=_number(value["stride_px"], 1, 1000),
+            first_px=bounded(value["first_px"], 0, 1000),
+            stride_px=bounded(value["stride_px"], 1, 1000),
             options=DecodingOptions(**options),
         )
 
@@ -117,7 +116,7 @@ class PoseDecoding:
         center = value["center"]
         if not isinstance(center, list) or len(center) != 3:
             raise ValueError(f"its centre is {center!r}")
-        return cls(center=np.array([_number(v, -1e9, 1e9) for v in center]))
+        return cls(center=np.array([bounded(v, -1e9, 1e9) for v in center]))
 
 
 Decoding = CellDecoding | PoseDecoding
@@ -267,14 +266,7 @@ def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> GraphFile:
     digest = str(entry["sha256"])
     return GraphFile(
         path=folder / GRAPHS[precision],
-        bytes=int(_number(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
+        bytes=int(bounded(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
         sha256=digest,
     )
 
-
-def _number(value: Any, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is not a number")
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{value!r} is outside {low} to {high}")
-    return float(value)
