@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from spn_data.geometry.pose import to_camera
+from spn_model.integrity.judgement import Witness
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import (
     STRONGEST,
@@ -23,13 +24,17 @@ from spn_model.landmarks.solver import (
     SolvedPose,
     first_pose,
     solve,
+    vertical_terms,
 )
 
 FIRST_PX = 4.0  # of RANSAC
 SEARCH_PX = 12.0  # around a projection, once there is a pose
-AGREE_PX = 3.0
 _MIN_FIRST = 8  # sightings that agree with a first pose
-_ROUNDS = 2  # of matching around the projections
+_ROUNDS = 6  # of matching around the projections
+_SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
+ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
+WEAK = 120  # landmarks that agree below which other poses are looked for
+MAP = "map"
 _MARGIN = 1.25  # on the field of view of an uncertain hypothesis
 
 
@@ -73,59 +78,135 @@ class Candidate:
     seen: Sightings
     candidates: Expected
 
+    @property
+    def agreeing(self) -> int:
+        """Number of landmarks that agree with the pose."""
+        return int(self.pose.inliers.sum())
 
-def candidate(
+    def is_elsewhere(self, other: Candidate) -> bool:
+        """Return whether the pose is another one than that of `other`."""
+        turn = np.trace(self.pose.rotation @ other.pose.rotation.T)
+        return bool(
+            np.linalg.norm(self.pose.center - other.pose.center) > ELSEWHERE_M
+            or np.rad2deg(np.arccos(np.clip((turn - 1) / 2, -1, 1))) > ELSEWHERE_DEG
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Result of a search: the best pose, and how many landmarks agree with the best pose elsewhere.
+
+    Attributes
+    ----------
+    best : Candidate
+    rival_inliers : int
+        0 if no other pose was found.
+    """
+
+    best: Candidate
+    rival_inliers: int
+
+
+def search(
     landmarks: LandmarkMap,
     features: ImageFeatures,
-    guess: Hypothesis | None,
+    hypotheses: Sequence[Hypothesis] = (),
     vertical: KnownVertical | None = None,
-) -> Candidate | None:
-    """Find and refine a pose from a hypothesis, or from a comparison with all landmarks.
+) -> Found | None:
+    """Find the pose of an image.
+
+    The features are compared with all landmarks of the map, and with those that each hypothesis sees. Where
+    few landmarks agree with the best pose, what does not agree with it is asked for another one.
 
     Parameters
     ----------
     landmarks : LandmarkMap
     features : ImageFeatures
-    guess : Hypothesis or None
-        None to compare with all landmarks.
+    hypotheses : sequence of Hypothesis
     vertical : KnownVertical, optional
 
     Returns
     -------
-    Candidate or None
-        None if too few landmarks agree on a pose.
+    Found or None
+        None if too few landmarks agree on any pose.
     """
-    first = None
-    if guess is None:
-        for strongest in (
-            STRONGEST,
-            len(features),
-        ):  # all of them only where the strongest do not do
-            first = first_pose(match_all(features, landmarks, strongest), FIRST_PX, _MIN_FIRST)
-            if first is not None:
-                break
-    else:
-        wide = _MARGIN if guess.radius_px is None else 1.0
-        wanted = _seen_from(landmarks, features, guess.center, guess.rotation, wide)
-        seen = (
-            match(features, landmarks, wanted)
-            if guess.radius_px is None
-            else match_near(features, landmarks, wanted, guess.radius_px)
-        )
-        first = first_pose(seen, FIRST_PX, _MIN_FIRST)
-    if first is None:
+    found = [
+        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess), vertical)
+        for guess in hypotheses
+    ]
+    strong = match_all(features, landmarks)
+    found.append(_candidate(landmarks, features, MAP, strong, vertical))
+    if max((c.agreeing for c in found if c), default=0) < WEAK:
+        everything = match_all(features, landmarks, len(features))
+        found.append(_candidate(landmarks, features, MAP, everything, vertical))
+        best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
+        if best is not None:
+            used = best.seen.features[best.pose.inliers]
+            rest = everything.select(~np.isin(everything.features, used))
+            found.append(_candidate(landmarks, features, MAP, rest, vertical))
+    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
+    if not poses:
         return None
-    center, rotation = first
+    rivals = [c.agreeing for c in poses[1:] if c.is_elsewhere(poses[0])]
+    return Found(poses[0], max(rivals, default=0))
+
+
+def follow(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    guess: Hypothesis,
+    vertical: KnownVertical | None = None,
+) -> Found | None:
+    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there."""
+    seen = _guided(landmarks, features, guess)
+    found = _candidate(landmarks, features, guess.source, seen, vertical)
+    return None if found is None else Found(found, 0)
+
+
+def _guided(landmarks: LandmarkMap, features: ImageFeatures, guess: Hypothesis) -> Sightings:
+    if guess.radius_px is None:
+        wanted = _seen_from(landmarks, features, guess.center, guess.rotation, _MARGIN)
+        return match(features, landmarks, wanted)
+    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, 1.0)
+    return match_near(features, landmarks, wanted, guess.radius_px)
+
+
+def _candidate(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    source: str,
+    seen: Sightings,
+    vertical: KnownVertical | None,
+) -> Candidate | None:
+    first = first_pose(seen, FIRST_PX, _MIN_FIRST)
+    return None if first is None else _refine(landmarks, features, source, *first, vertical)
+
+
+def _refine(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    source: str,
+    center: np.ndarray,
+    rotation: np.ndarray,
+    vertical: KnownVertical | None,
+) -> Candidate | None:
+    """Match around the projections and solve, until no more landmarks agree."""
+    best, agreeing = None, 0
     for _ in range(_ROUNDS):
         wanted = _seen_from(landmarks, features, center, rotation, 1.0)
         seen = match_near(features, landmarks, wanted, SEARCH_PX)
         pose = solve(seen, center, rotation, vertical) if len(seen) >= _MIN_FIRST else None
         if pose is None:
-            return None
-        center, rotation = pose.center, pose.rotation
-    return Candidate(
-        source="map" if guess is None else guess.source, pose=pose, seen=seen, candidates=wanted
-    )
+            break
+        count = int(pose.inliers.sum())
+        if count <= agreeing:
+            break
+        settled = best is not None and count <= _SETTLED * agreeing
+        best = Candidate(source=source, pose=pose, seen=seen, candidates=wanted)
+        center, rotation, agreeing = pose.center, pose.rotation, count
+        if settled:
+            break
+    return best
 
 
 def _seen_from(
@@ -140,10 +221,21 @@ def _seen_from(
     )
 
 
-def projections(
-    landmarks: LandmarkMap, rows: np.ndarray, pose: SolvedPose, focal_px: float
-) -> np.ndarray:
-    """Return where landmarks (K,) are in the image of a pose, in pixels from the principal point."""
-    x = to_camera(landmarks.xyz[rows], pose.center, pose.rotation)
-    found: np.ndarray = x[:, :2] / x[:, 2:] * focal_px
-    return found
+def witness_of(
+    found: Found, features: ImageFeatures, vertical: KnownVertical | None = None
+) -> Witness:
+    """Return what is known about the pose of a candidate, for its judgement."""
+    best, tilt = found.best, 0.0
+    if vertical is not None:
+        tilt = float(np.linalg.norm(vertical_terms(vertical, best.pose.rotation)[1]))
+    return Witness(
+        at=best.seen.at / features.focal_px / features.half_view,
+        xyz=best.seen.xyz,
+        residuals=best.pose.residuals,
+        jacobian=best.pose.jacobian,
+        weights=best.pose.weights,
+        inliers=best.pose.inliers,
+        information=best.pose.information,
+        tilt_sigmas=tilt,
+        rival_inliers=found.rival_inliers,
+    )
