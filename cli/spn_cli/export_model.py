@@ -35,6 +35,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="Number of training images that calibrate the 8-bit activations.",
 )
+@click.option(
+    "--map-mb",
+    type=click.FloatRange(0, 200),
+    default=10.0,
+    show_default=True,
+    help="Largest size of the landmark map, which fixes of centimetres need; 0 for none.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing bundle.")
 def export(
     dataset: Path | None,
@@ -44,6 +51,7 @@ def export(
     target: Path | None,
     int8: bool,
     calibration_images: int,
+    map_mb: float,
     overwrite: bool,
 ) -> None:
     """Export a network as a bundle for the drone: ONNX graphs and the parameters of pose decoding.
@@ -66,7 +74,8 @@ def export(
             run,
             dataset or area.folder(SPLIT) / DATASET,
             progress,
-            BundleOptions(int8=int8, calibration_images=calibration_images),
+            BundleOptions(int8=int8, calibration_images=calibration_images, map_mb=map_mb),
+            area=area,
             target=target,
             overwrite=overwrite,
         )

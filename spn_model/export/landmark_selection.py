@@ -1,4 +1,4 @@
-"""Selection of the landmarks of a bundle from the map of an area: training frames alone, all places, few bytes."""
+"""Selection of landmarks for a bundle from the map of an area: seen by training frames, everywhere, few bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from spn_model.landmarks.landmark_map import LandmarkFacts, LandmarkMap
 
 _MIN_FRAMES = 3  # training frames that see a landmark
 _VIEWS = 4  # descriptors of a landmark
-_NEW_VIEW = 0.8  # difference of views from which another descriptor is kept: 30 degrees or a factor of two are 1
+_NEW_VIEW = (
+    0.8  # difference of views that needs another descriptor; 30 degrees or a factor of two are 1
+)
 _SIGMA_PX = 0.5  # of a measurement in a mapping frame, for the covariance of a landmark
 _FLOOR_M = 1e-3
 _CELLS = (10, 6)  # of a frame, in each of which landmarks are wanted

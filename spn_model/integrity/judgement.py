@@ -1,4 +1,4 @@
-"""Judgement of a pose from landmarks: whether it may be published, with which covariance and protection levels."""
+"""Judgement of a pose from landmarks: may it be published, with which covariance and protection levels."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class IntegrityLimits:
     max_rival: float = 0.5
     max_chi: float = 2.0
     max_contradiction: float = 6.0
-    alarm_m: float = 0.5
+    alarm_m: float = 0.75
     max_sigma_deg: float = 0.5
     max_tilt_sigmas: float = 5.0
-    protection_sigmas: float = 5.0
+    protection_sigmas: float = 4.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -139,15 +139,22 @@ def judge(witness: Witness, factor: float, limits: IntegrityLimits) -> Judgement
     if count < limits.min_inliers:
         reason = f"{count} landmarks agree, {limits.min_inliers} are needed"
     elif len(cells) < limits.min_cells:
-        reason = f"landmarks in {len(cells)} of {_COLUMNS * _ROWS} parts of the image, {limits.min_cells} are needed"
+        parts = f"{len(cells)} of {_COLUMNS * _ROWS} parts of the image"
+        reason = f"landmarks in {parts}, {limits.min_cells} are needed"
     elif share < limits.min_share:
-        reason = f"{100 * share:.0f} % of the landmarks agree, {100 * limits.min_share:.0f} % are needed"
+        reason = (
+            f"{100 * share:.0f} % of the landmarks agree, {100 * limits.min_share:.0f} % are needed"
+        )
     elif witness.rival_inliers > limits.max_rival * count:
         reason = f"{count} landmarks agree, but {witness.rival_inliers} with a pose elsewhere"
     elif chi > limits.max_chi:
-        reason = f"residuals are {chi:.1f} times as large as expected, {limits.max_chi:g} is allowed"
+        reason = (
+            f"residuals are {chi:.1f} times as large as expected, {limits.max_chi:g} is allowed"
+        )
     elif sigma_deg > limits.max_sigma_deg:
-        reason = f"the orientation is known to {sigma_deg:.2f} deg, {limits.max_sigma_deg:g} is needed"
+        reason = (
+            f"the orientation is known to {sigma_deg:.2f} deg, {limits.max_sigma_deg:g} is needed"
+        )
     elif witness.tilt_sigmas > limits.max_tilt_sigmas:
         reason = f"contradicts the known vertical by {witness.tilt_sigmas:.1f} standard deviations"
     else:

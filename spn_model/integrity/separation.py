@@ -1,15 +1,15 @@
-"""Solution separation: what the pose would be without each group of landmarks, and the protection levels that follow.
+"""Solution separation: the pose without each group of landmarks, and the protection levels that follow.
 
-A wrong match rarely comes alone: a moved car, a repeated window or a wrong part of the map gives a whole group
-of landmarks that agree with each other. For each group k, the pose is solved again without it. With the normal
-matrix N over all landmarks and the part N_k and gradient g_k of the group at the solution,
+A wrong match rarely comes alone: a moved car, a repeated window or a wrong part of the map gives a whole
+group of landmarks that agree with each other. For each group k, the pose is solved again without it. With the
+normal matrix N over all landmarks and the part N_k and gradient g_k of the group at the solution,
 
     d_k = (N - N_k)^-1 g_k,    C_k = (N - N_k)^-1,    C = N^-1,
 
-d_k is the change of the pose, and C_k - C its covariance if nothing is wrong. A group that changes the pose by
-more than that contradicts the rest. If it is the group that is wrong, the pose without it is right, so the error
-of the pose is at most |d_k| plus K standard deviations of C_k. The protection level is the largest of these
-bounds over all groups.
+d_k is the change of the pose, and C_k - C its covariance if nothing is wrong. A group that changes the pose
+by more than that contradicts the rest. If it is the group that is wrong, the pose without it is right, so the
+error of the pose is at most |d_k| plus K standard deviations of C_k. The protection level is the largest of
+these bounds over all groups.
 
 References
 ----------

@@ -22,7 +22,7 @@ DESCRIPTOR_BYTES = 128
 _MAX_FILE_BYTES = 200_000_000
 _MAX_ROWS = 2_000_000
 _MM = 1e-3  # factors of covariances are stored in millimetres, which float16 resolves
-# Kind and trailing shape of each array of the file; the first side of `landmark`, `sizes` and so on is checked too.
+# Kind and shape of each array of the file; None for a side that may have any length.
 _ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     "facts": ("u1", (None,)),
     "middle": ("f8", (3,)),
@@ -168,7 +168,8 @@ class LandmarkMap:
             "basis": self.basis,
         }
         with path.open("wb") as handle:
-            np.savez(handle, **{n: np.asarray(a).astype(_ARRAYS[n][0]) for n, a in arrays.items()})
+            stored = {n: np.asarray(a).astype(_ARRAYS[n][0]) for n, a in arrays.items()}
+            np.savez(handle, allow_pickle=False, **stored)
 
     @classmethod
     def load(cls, path: Path) -> LandmarkMap:

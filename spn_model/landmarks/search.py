@@ -10,7 +10,6 @@ import numpy as np
 from spn_model.integrity.judgement import Witness
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import (
-    STRONGEST,
     Expected,
     ImageFeatures,
     expected,
@@ -34,18 +33,18 @@ _ROUNDS = 6  # of matching around the projections
 _SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
 ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
 WEAK = 120  # landmarks that agree below which other poses are looked for
-MAP = "map"
+MAP = "retrieval"  # among all landmarks
 _MARGIN = 1.25  # on the field of view of an uncertain hypothesis
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A supposed pose: which landmarks to look for.
 
     Attributes
     ----------
     source : str
-        "network", "prior" or "track".
+        "network", "retrieval", "prior" or "track", as in `FixSource`.
     center : ndarray, shape (3,)
     rotation : ndarray, shape (3, 3)
     radius_px : float or None

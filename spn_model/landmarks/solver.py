@@ -1,4 +1,4 @@
-"""Pose of one image from matched landmarks: P3P in RANSAC, then robust least squares with whitened residuals."""
+"""Pose of one image from matched landmarks: P3P in RANSAC, then robust least squares."""
 
 from __future__ import annotations
 

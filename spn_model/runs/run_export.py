@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from spn_data.area.area import Area
 from spn_data.area.names import GEO, MODEL
 from spn_data.errors import FormatError
 from spn_data.storage.fingerprints import content_fingerprint
@@ -46,6 +47,7 @@ def export_run(
     progress: Progress,
     options: BundleOptions,
     *,
+    area: Area | None = None,
     target: Path | None = None,
     overwrite: bool = False,
 ) -> ExportedRun:
@@ -61,6 +63,8 @@ def export_run(
         Receives the step, items done, and items in total.
     options : BundleOptions
         Content and checks of the bundle.
+    area : Area, optional
+        Area whose map gives the landmarks of the bundle.
     target : Path, optional
         Folder of the bundle; by default in the folder of the run.
     overwrite : bool
@@ -97,6 +101,7 @@ def export_run(
             options,
             world_names=(MODEL, GEO),
             metrics=metrics,
+            area=area,
             overwrite=overwrite,
         )
     return ExportedRun(
