@@ -1,4 +1,4 @@
-"""Selection of landmarks for a bundle from the map of an area: seen by training frames, everywhere, few bytes."""
+"""Selection of landmarks for a bundle from the map of an area: from training frames, everywhere."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def select_landmarks(
     facts: LandmarkFacts,
     *,
     max_bytes: int,
-) -> LandmarkMap:
+) -> tuple[LandmarkMap, int]:
     """Choose landmarks that cover all training frames evenly, and describe them from different directions.
 
     Parameters
@@ -70,6 +70,8 @@ def select_landmarks(
     Returns
     -------
     LandmarkMap
+    int
+        Number of training frames that it was made from.
 
     Raises
     ------
@@ -109,13 +111,14 @@ def select_landmarks(
     count = np.bincount(seen.point, minlength=len(points.xyz))
     covariance = _covariances(seen, len(points.xyz))
     chosen, rows = _within(seen, _order(seen, count, covariance), max_bytes - _OTHER_BYTES)
-    return LandmarkMap(
+    found = LandmarkMap(
         facts=facts,
         xyz=points.xyz[chosen] - offset,
         covariance=covariance[chosen],
         basis=_basis(rows["descriptors"]),
         **rows,
     )
+    return found, len(frames)
 
 
 def _covariances(seen: _Seen, count: int) -> np.ndarray:

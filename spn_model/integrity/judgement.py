@@ -112,14 +112,12 @@ class Judgement:
     inliers: int
 
 
-def judge(witness: Witness, factor: float, limits: IntegrityLimits) -> Judgement:
+def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
     """Judge a pose.
 
     Parameters
     ----------
     witness : Witness
-    factor : float
-        Factor on the covariance that frames of known pose have shown to be needed.
     limits : IntegrityLimits
 
     Returns
@@ -130,7 +128,7 @@ def judge(witness: Witness, factor: float, limits: IntegrityLimits) -> Judgement
     inliers = witness.inliers
     count = int(inliers.sum())
     chi = float(np.sqrt((witness.residuals[inliers] ** 2).mean())) if count else np.inf
-    factor = factor * max(1.0, chi**2)
+    factor = max(1.0, chi**2)  # residuals larger than stated
     covariance = np.linalg.inv(witness.information) * factor
     share = count / max(len(inliers), 1)
     cells = np.unique(np.floor((witness.at[inliers] + 1) / 2 * [_COLUMNS, _ROWS]), axis=0)

@@ -39,7 +39,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class LandmarkFacts:
-    """What a landmark map is bound to, and what was measured when it was made.
+    """What a landmark map is bound to, and how its features are detected.
 
     Attributes
     ----------
@@ -47,8 +47,6 @@ class LandmarkFacts:
         Options with which features are detected on board, as for the descriptors of the map.
     noise_px : float
         Standard deviation of a measurement along one axis, at the width that features are detected at.
-    covariance_factor : float
-        Factor on covariances of poses, measured on frames that are not in the map.
     map_hash : str
         Hash of the map that the landmarks are from.
     network : str
@@ -57,7 +55,6 @@ class LandmarkFacts:
 
     features: FeatureOptions
     noise_px: float
-    covariance_factor: float
     map_hash: str
     network: str
 
@@ -70,7 +67,6 @@ class LandmarkFacts:
             "contrast_threshold": self.features.contrast_threshold,
             "edge_threshold": self.features.edge_threshold,
             "noise_px": self.noise_px,
-            "covariance_factor": self.covariance_factor,
             "map_hash": self.map_hash,
             "network": self.network,
         }
@@ -88,7 +84,6 @@ class LandmarkFacts:
                 edge_threshold=bounded(value["edge_threshold"], 1, 1000),
             ),
             noise_px=bounded(value["noise_px"], 0.01, 100),
-            covariance_factor=bounded(value["covariance_factor"], 0.01, 1e4),
             map_hash=str(value["map_hash"]),
             network=str(value["network"]),
         )

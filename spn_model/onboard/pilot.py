@@ -185,8 +185,7 @@ class Pilot:
     ) -> Judgement | None:
         if found is None:
             return None
-        factor = self.landmarks.facts.covariance_factor
-        return judge(witness_of(found, features, vertical), factor, self.options.limits)
+        return judge(witness_of(found, features, vertical), self.options.limits)
 
     def _features(self, image: np.ndarray) -> ImageFeatures:
         height, width = image.shape[:2]
