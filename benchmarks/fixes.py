@@ -51,7 +51,7 @@ def spoilt(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, np.ndarray,
     yield "focal length 5 % wrong", image, replace(camera, params=params)
     changed = image.copy()
     third = changed[:, width // 3 : 2 * width // 3]
-    third[:] = third[::-1, ::-1].copy()
+    third[:] = third[:, ::-1].copy()
     yield "a third changed", changed, camera
 
 
@@ -112,7 +112,13 @@ def main() -> None:
                 count[0] += 1
                 if isinstance(fix, Fix):
                     count[1] += 1
-                    count[2] += errors(fix, labels, row)[3]
+                    away, turn, _, wrong = errors(fix, labels, row)
+                    count[2] += wrong
+                    if wrong:
+                        print(
+                            f"  {labels.names[row]}, {kind}: {away:.3f} m, {turn:.2f} deg, protection "
+                            f"{fix.horizontal_protection_m:.3f} m, {fix.vertical_protection_m:.3f} m"
+                        )
         for kind, (of, usable, wrong) in kinds.items():
             print(f"{name + ', ' + kind:34} {usable:5} {of:5} {'':41} {wrong:8}", flush=True)
     for folder in given.foreign:

@@ -35,6 +35,10 @@ class IntegrityLimits:
         Standard deviation of the orientation.
     max_tilt_sigmas : float
         Difference from a known vertical, in standard deviations.
+    focal_sigma : float
+        Standard deviation of the stated focal length, relative.
+    max_focal_sigmas : float
+        Difference between the focal length that the landmarks fit and the stated one, in standard deviations.
     protection_sigmas : float
         Standard deviations in a protection level.
     """
@@ -48,6 +52,8 @@ class IntegrityLimits:
     alarm_m: float = 0.75
     max_sigma_deg: float = 0.5
     max_tilt_sigmas: float = 5.0
+    focal_sigma: float = 0.002
+    max_focal_sigmas: float = 5.0
     protection_sigmas: float = 4.0
 
 
@@ -65,6 +71,8 @@ class Witness:
         Whitened.
     jacobian : ndarray, shape (K, 2, 6)
         Of the whitened residuals.
+    by_focal : ndarray, shape (K, 2)
+        Derivatives of the whitened residuals by the logarithm of the focal length.
     weights : ndarray, shape (K,)
         Robust weights.
     inliers : ndarray of bool, shape (K,)
@@ -74,17 +82,21 @@ class Witness:
         Difference from a known vertical, in its standard deviations; 0 without one.
     rival_inliers : int
         Landmarks that agree with the best pose elsewhere; 0 if there is none.
+    focal_change : tuple of float
+        Relative change of the focal length that the landmarks fit, and its standard deviation.
     """
 
     at: np.ndarray
     xyz: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
+    by_focal: np.ndarray
     weights: np.ndarray
     inliers: np.ndarray
     information: np.ndarray
     tilt_sigmas: float = 0.0
     rival_inliers: int = 0
+    focal_change: tuple[float, float] = (0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,7 +141,9 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
     count = int(inliers.sum())
     chi = float(np.sqrt((witness.residuals[inliers] ** 2).mean())) if count else np.inf
     factor = max(1.0, chi**2)  # residuals larger than stated
-    covariance = np.linalg.inv(witness.information) * factor
+    jacobian, information = _with_focal(witness, factor, limits.focal_sigma)
+    focal, focal_sigma = witness.focal_change
+    covariance = (np.linalg.inv(information) * factor)[:6, :6]
     share = count / max(len(inliers), 1)
     cells = np.unique(np.floor((witness.at[inliers] + 1) / 2 * [_COLUMNS, _ROWS]), axis=0)
     reason, horizontal, vertical = "", np.inf, np.inf
@@ -155,12 +169,17 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         )
     elif witness.tilt_sigmas > limits.max_tilt_sigmas:
         reason = f"contradicts the known vertical by {witness.tilt_sigmas:.1f} standard deviations"
+    elif abs(focal) > limits.max_focal_sigmas * np.hypot(focal_sigma, limits.focal_sigma):
+        reason = (
+            f"the landmarks fit a focal length that is {100 * focal:+.1f} % from the stated one; "
+            "give the camera of these images"
+        )
     else:
         separation = separate(
-            witness.jacobian[inliers],
+            jacobian[inliers],
             witness.residuals[inliers],
             witness.weights[inliers],
-            witness.information,
+            information,
             groups_of(witness.at[inliers], witness.xyz[inliers]),
             factor=factor,
             sigmas=limits.protection_sigmas,
@@ -184,3 +203,20 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         quality=int(np.clip(round(100 * share), 1, 100)),
         inliers=count,
     )
+
+
+def _with_focal(witness: Witness, factor: float, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Add the logarithm of the focal length as a seventh unknown, with its standard deviation.
+
+    Returns the Jacobian (K, 2, 7) and the normal matrix (7, 7).
+    """
+    jacobian = np.concatenate([witness.jacobian, witness.by_focal[:, :, None]], axis=2)
+    kept = witness.inliers
+    weights, by_focal = witness.weights[kept], witness.by_focal[kept]
+    information = np.zeros((7, 7))
+    information[:6, :6] = witness.information
+    information[6, :6] = information[:6, 6] = np.einsum(
+        "n,nij,ni->j", weights, witness.jacobian[kept], by_focal
+    )
+    information[6, 6] = np.einsum("n,ni,ni->", weights, by_focal, by_focal) + factor / sigma**2
+    return jacobian, information

@@ -83,13 +83,13 @@ def separate(
 
     Parameters
     ----------
-    jacobian : ndarray, shape (K, 2, 6)
-        Of the whitened residuals, by the centre (world axes, z up) and a rotation vector.
+    jacobian : ndarray, shape (K, 2, D)
+        Of the whitened residuals, by the centre (world axes, z up) and other unknowns.
     residuals : ndarray, shape (K, 2)
         Whitened.
     weights : ndarray, shape (K,)
         Robust weights.
-    information : ndarray, shape (6, 6)
+    information : ndarray, shape (D, D)
         Normal matrix at the solution, with what else was observed.
     groups : ndarray of bool, shape (G, K)
     factor : float

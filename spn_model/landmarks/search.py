@@ -22,6 +22,7 @@ from spn_model.landmarks.solver import (
     Sightings,
     SolvedPose,
     first_pose,
+    fit_focal_length,
     solve,
     vertical_terms,
 )
@@ -232,9 +233,11 @@ def witness_of(
         xyz=best.seen.xyz,
         residuals=best.pose.residuals,
         jacobian=best.pose.jacobian,
+        by_focal=best.pose.by_focal,
         weights=best.pose.weights,
         inliers=best.pose.inliers,
         information=best.pose.information,
         tilt_sigmas=tilt,
         rival_inliers=found.rival_inliers,
+        focal_change=fit_focal_length(best.seen, best.pose),
     )

@@ -18,6 +18,7 @@ _CONVERGED = (
 )
 _MAX_LAST = 0.1
 GATE = 3.5  # whitened residual up to which a landmark is an inlier
+_FOCAL_SCALES = (8.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 _SCALES = (
     4.0,
     2.0,
@@ -101,6 +102,8 @@ class SolvedPose:
         Whitened: of unit variance where the stated noise is true.
     jacobian : ndarray, shape (K, 2, 6)
         Of the whitened residuals.
+    by_focal : ndarray, shape (K, 2)
+        Derivatives of the whitened residuals by the logarithm of the focal length.
     weights : ndarray, shape (K,)
         Robust weights, at most 1.
     """
@@ -110,6 +113,7 @@ class SolvedPose:
     information: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
+    by_focal: np.ndarray
     weights: np.ndarray
 
     @property
@@ -182,7 +186,7 @@ def solve(
         x = to_camera(seen.xyz, center, rotation)
         if np.count_nonzero(x[:, 2] > 0) < 4:
             return None
-        residuals, jacobian = _whitened(seen, x, matrix, rotation)
+        residuals, jacobian, by_focal = _whitened(seen, x, matrix, rotation)
         weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
         weights[x[:, 2] <= 0] = 0
         information = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
@@ -204,7 +208,40 @@ def solve(
             break
     if moved > _MAX_LAST:
         return None
-    return SolvedPose(center, rotation, information, residuals, jacobian, weights)
+    return SolvedPose(center, rotation, information, residuals, jacobian, by_focal, weights)
+
+
+def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
+    """Fit pose and focal length together, starting from a pose with the stated focal length.
+
+    Parameters
+    ----------
+    seen : Sightings
+    pose : SolvedPose
+
+    Returns
+    -------
+    change : float
+        Relative change of the focal length.
+    sigma : float
+        Its standard deviation for the stated noise, or larger where residuals are.
+    """
+    center, rotation, factor = pose.center, pose.rotation, 1.0
+    for scale in 2.0 * np.array(_FOCAL_SCALES):
+        x = to_camera(seen.xyz, center, rotation)
+        matrix = np.diag([seen.focal_px * factor, seen.focal_px * factor, 1.0])
+        residuals, jacobian, by_focal = _whitened(seen, x, matrix, rotation)
+        by = np.concatenate([jacobian, by_focal[:, :, None]], axis=2)
+        weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
+        weights[x[:, 2] <= 0] = 0
+        information = np.einsum("n,nij,nik->jk", weights, by, by) + np.diag([0.0] * 6 + [1.0])
+        step = -np.linalg.solve(information, np.einsum("n,nij,ni->j", weights, by, residuals))
+        center = center + step[:3]
+        rotation = rotations_from_vectors(step[None, 3:6])[0] @ rotation
+        factor *= float(np.exp(np.clip(step[6], -0.1, 0.1)))
+    inliers = (residuals**2).sum(axis=1) < GATE**2
+    chi_sq = max(1.0, float((residuals[inliers] ** 2).mean())) if inliers.any() else np.inf
+    return factor - 1, float(np.sqrt(np.linalg.inv(information)[6, 6] * chi_sq))
 
 
 def vertical_terms(vertical: KnownVertical, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -221,8 +258,10 @@ def vertical_terms(vertical: KnownVertical, rotation: np.ndarray) -> tuple[np.nd
 
 def _whitened(
     seen: Sightings, x: np.ndarray, matrix: np.ndarray, rotation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals (K, 2) and Jacobian (K, 2, 6) divided by the standard deviation of each sighting.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return residuals (K, 2), Jacobian (K, 2, 6), derivatives by the logarithm of the focal length (K, 2).
+
+    They are divided by the standard deviation of each sighting.
 
     The covariance of a landmark is projected into the image and added to that of the measurement; its larger
     axis counts.
@@ -234,4 +273,9 @@ def _whitened(
     a, b, c = projected[:, 0, 0], projected[:, 0, 1], projected[:, 1, 1]
     largest = (a + c) / 2 + np.sqrt((a - c) ** 2 / 4 + b**2)
     sigma = np.sqrt(seen.sigma_px**2 + largest)
-    return residuals / sigma[:, None], jacobian / sigma[:, None, None]
+    projected_px = residuals + seen.at
+    return (
+        residuals / sigma[:, None],
+        jacobian / sigma[:, None, None],
+        projected_px / sigma[:, None],
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -16,13 +16,15 @@ from spn_data.geometry.pose import Poses
 from spn_data.matching.features import extract
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
-from spn_model.integrity.judgement import IntegrityLimits, Judgement, judge
+from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import Candidate, Found, Hypothesis, follow, search, witness_of
 from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.bundle import verified_landmarks
 from spn_model.onboard.localizer import Localizer
+
+_FORGET = 0.95  # weight of the images before, for each new one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +97,7 @@ class Pilot:
         self._last: tuple[int, np.ndarray, np.ndarray] | None = None  # time, centre, rotation
         self._velocity = np.zeros(3)
         self._searched_us = 0
+        self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
 
     def fix(
         self, image: np.ndarray, time_us: int, vertical: KnownVertical | None = None
@@ -185,7 +188,24 @@ class Pilot:
     ) -> Judgement | None:
         if found is None:
             return None
-        return judge(witness_of(found, features, vertical), self.options.limits)
+        witness = witness_of(found, features, vertical)
+        verdict = judge(witness, self.options.limits)
+        reason = verdict.reason or (self._lens_over_time(witness) if self.options.sequence else "")
+        return replace(verdict, reason=reason)
+
+    def _lens_over_time(self, witness: Witness) -> str:
+        """Return why the stated lens cannot be right, from all images so far that determine it together."""
+        change, sigma = witness.focal_change
+        weight = 1 / (sigma**2 + self.options.limits.focal_sigma**2)
+        kept = np.array([weight, weight * change]) + _FORGET * self._focal
+        self._focal = kept
+        mean = kept[1] / kept[0]
+        allowed = self.options.limits.max_focal_sigmas * max(
+            kept[0] ** -0.5, self.options.limits.focal_sigma
+        )
+        if abs(mean) <= allowed:
+            return ""
+        return f"the landmarks of many images fit a focal length {100 * mean:+.1f} % from the stated one"
 
     def _features(self, image: np.ndarray) -> ImageFeatures:
         height, width = image.shape[:2]
