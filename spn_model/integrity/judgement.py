@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_model.integrity.separation import groups_of, separate
 
+_LEAST_FACTOR = 0.5  # on a covariance, where residuals are small
 _COLUMNS, _ROWS = 8, 5  # of the grid over the image that inliers must spread over
 
 
@@ -46,13 +47,13 @@ class IntegrityLimits:
     min_inliers: int = 40
     min_cells: int = 8
     min_share: float = 0.5
-    max_rival: float = 0.5
+    max_rival: float = 0.33
     max_chi: float = 2.0
     max_contradiction: float = 6.0
     alarm_m: float = 0.75
     max_sigma_deg: float = 0.5
     max_tilt_sigmas: float = 5.0
-    focal_sigma: float = 0.002
+    focal_sigma: float = 0.001
     max_focal_sigmas: float = 5.0
     protection_sigmas: float = 4.0
 
@@ -140,7 +141,7 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
     inliers = witness.inliers
     count = int(inliers.sum())
     chi = float(np.sqrt((witness.residuals[inliers] ** 2).mean())) if count else np.inf
-    factor = max(1.0, chi**2)  # residuals larger than stated
+    factor = max(_LEAST_FACTOR, chi**2)  # residuals larger or smaller than stated
     jacobian, information = _with_focal(witness, factor, limits.focal_sigma)
     focal, focal_sigma = witness.focal_change
     covariance = (np.linalg.inv(information) * factor)[:6, :6]

@@ -33,7 +33,7 @@ _MIN_FIRST = 8  # sightings that agree with a first pose
 _ROUNDS = 6  # of matching around the projections
 _SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
 ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
-WEAK = 120  # landmarks that agree below which other poses are looked for
+WEAK = 120  # landmarks that agree below which all features are compared, not only the strongest
 MAP = "retrieval"  # among all landmarks
 _MARGIN = 1.25  # on the field of view of an uncertain hypothesis
 
@@ -115,8 +115,8 @@ def search(
 ) -> Found | None:
     """Find the pose of an image.
 
-    The features are compared with all landmarks of the map, and with those that each hypothesis sees. Where
-    few landmarks agree with the best pose, what does not agree with it is asked for another one.
+    The features are compared with all landmarks of the map, and with those that each hypothesis sees. What
+    does not agree with the best pose is asked for another one.
 
     Parameters
     ----------
@@ -134,16 +134,16 @@ def search(
         _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess), vertical)
         for guess in hypotheses
     ]
-    strong = match_all(features, landmarks)
-    found.append(_candidate(landmarks, features, MAP, strong, vertical))
+    compared = match_all(features, landmarks)
+    found.append(_candidate(landmarks, features, MAP, compared, vertical))
     if max((c.agreeing for c in found if c), default=0) < WEAK:
-        everything = match_all(features, landmarks, len(features))
-        found.append(_candidate(landmarks, features, MAP, everything, vertical))
-        best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
-        if best is not None:
-            used = best.seen.features[best.pose.inliers]
-            rest = everything.select(~np.isin(everything.features, used))
-            found.append(_candidate(landmarks, features, MAP, rest, vertical))
+        compared = match_all(features, landmarks, len(features))
+        found.append(_candidate(landmarks, features, MAP, compared, vertical))
+    best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
+    if best is not None:
+        used = best.seen.features[best.pose.inliers]
+        rest = compared.select(~np.isin(compared.features, used))
+        found.append(_candidate(landmarks, features, MAP, rest, vertical))
     poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
     if not poses:
         return None
