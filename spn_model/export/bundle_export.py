@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from spn_data.area.area import Area
 from spn_data.dataset.hdf5_reader import Dataset, DatasetGroup
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, SpnError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
+from spn_data.inputs.landmark_source import LandmarkSource
 from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import finite, write_json
@@ -65,7 +65,7 @@ def export(
     *,
     world_names: Sequence[str] = (),
     metrics: Mapping[str, Any] | None = None,
-    area: Area | None = None,
+    source: LandmarkSource | None = None,
     overwrite: bool = False,
 ) -> ExportedBundle:
     """Write a bundle of a trained network; the folder is replaced atomically.
@@ -89,8 +89,8 @@ def export(
         Names of the fingerprints that identify the world of a data set.
     metrics : mapping, optional
         Evaluation of the run, as in metrics.json; None if there is none.
-    area : Area, optional
-        Area whose map gives the landmarks; needed unless `options.map_mb` is 0.
+    source : LandmarkSource, optional
+        Map that gives the landmarks; None for a bundle without them.
     overwrite : bool
         Whether a bundle in the folder may be replaced.
 
@@ -138,14 +138,13 @@ def export(
                 "run": dict(facts),
             }
             landmarks = None
-            if area is not None and options.map_mb:
+            if source is not None and options.map_mb:
                 landmarks = write_landmarks(
                     partial / LANDMARKS,
-                    area,
+                    source,
                     data,
                     graphs[FLOAT32]["sha256"],
                     np.array(view.offset),
-                    progress,
                     max_bytes=round(1e6 * options.map_mb),
                 )
                 document["landmarks"] = {**_entry(partial / LANDMARKS), **asdict(landmarks)}

@@ -1,4 +1,4 @@
-"""Landmark map of a bundle: chosen from the map of an area."""
+"""Landmark map of a bundle: chosen from the map that its data set was made from."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from spn_data.area.area import Area
-from spn_data.area.names import DATABASE, GEO, MODEL, SPLIT
+from spn_data.area.names import GEO
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
-from spn_data.labels.map_hash import map_hash
+from spn_data.inputs.landmark_source import LandmarkSource
 from spn_data.matching.features import FeatureOptions
-from spn_data.work.timing import Progress
 from spn_model.export.landmark_selection import select_landmarks
 from spn_model.landmarks.landmark_map import LandmarkFacts
 
@@ -41,29 +39,27 @@ class LandmarkSummary:
 
 def write_landmarks(
     path: Path,
-    area: Area,
+    source: LandmarkSource,
     data: Dataset,
     network: str,
     offset: np.ndarray,
-    progress: Progress,
     *,
     max_bytes: int,
 ) -> LandmarkSummary:
-    """Choose the landmarks of an area's map for a bundle, and write them.
+    """Choose the landmarks of a map for a bundle, and write them.
 
     Parameters
     ----------
     path : Path
         Target file.
-    area : Area
-        Area with the map that the data set was made from.
+    source : LandmarkSource
+        The map that the data set was made from.
     data : Dataset
         Supplies the names of the training frames.
     network : str
         SHA-256 of the float32 graph.
     offset : ndarray, shape (3,)
         Of the view of the bundle.
-    progress : Progress
     max_bytes : int
 
     Returns
@@ -73,32 +69,20 @@ def write_landmarks(
     Raises
     ------
     InputError
-        If the data set was made from another map than that of the area.
-    StageError, FormatError
-        If the area has no fresh map, or it is damaged.
+        If the data set was made from another map, or a map this small holds no landmark.
     """
-    made_from, now = data.info.fingerprints.get(GEO), area.upstream_of(SPLIT).get(GEO)
-    if made_from is None or made_from != now:
+    if data.info.fingerprints.get(GEO) != source.fingerprint:
         raise InputError(
             "was not made from the map of this area, so landmarks of that map would not fit its network; "
             "give the data set of the area, or --map-mb 0 to export without landmarks",
             path=data.path,
         )
-    geo = area.folder(GEO)
     training = {str(name) for group in data.of_role(Role.TRAIN) for name in group.names}
     facts = LandmarkFacts(
-        features=FEATURES,
-        noise_px=_NOISE_PX,
-        map_hash=map_hash(geo),
-        network=network,
+        features=FEATURES, noise_px=_NOISE_PX, map_hash=source.map_hash, network=network
     )
-    progress("landmarks", 0, 1)
-    chosen, frames = select_landmarks(
-        geo, area.folder(MODEL) / DATABASE, training, offset, facts, max_bytes=max_bytes
-    )
+    chosen, frames = select_landmarks(source, training, offset, facts, max_bytes=max_bytes)
     chosen.save(path)
     return LandmarkSummary(
-        landmarks=len(chosen),
-        descriptors=len(chosen.descriptors),
-        training_frames=frames,
+        landmarks=len(chosen), descriptors=len(chosen.descriptors), training_frames=frames
     )

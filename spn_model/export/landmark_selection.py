@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from spn_data.colmap.map_features import MapFeatures
-from spn_data.colmap.model import read_map_with_keypoints
 from spn_data.errors import InputError
-from spn_data.geometry.pose import to_camera
+from spn_data.inputs.landmark_source import LandmarkSource
 from spn_data.matching.putative import unit_descriptors
 from spn_model.landmarks.landmark_map import LandmarkFacts, LandmarkMap
 
@@ -32,7 +29,6 @@ _OTHER_BYTES = 30_000  # of the file
 class _Seen:
     """Measurements of map points in training frames; arrays of M rows."""
 
-    frame: np.ndarray
     point: np.ndarray
     units: np.ndarray
     directions: np.ndarray  # from the point to the camera
@@ -43,8 +39,7 @@ class _Seen:
 
 
 def select_landmarks(
-    model: Path,
-    database: Path,
+    source: LandmarkSource,
     training: Collection[str],
     offset: np.ndarray,
     facts: LandmarkFacts,
@@ -55,12 +50,9 @@ def select_landmarks(
 
     Parameters
     ----------
-    model : Path
-        Georeferenced model.
-    database : Path
-        COLMAP's database with the descriptors of its features.
+    source : LandmarkSource
     training : collection of str
-        Names of the training frames; nothing of other frames enters the map.
+        Names of the training frames; no measurement in another frame enters the map.
     offset : ndarray, shape (3,)
         Of the world of the network, subtracted from positions.
     facts : LandmarkFacts
@@ -76,49 +68,41 @@ def select_landmarks(
     Raises
     ------
     InputError
-        If the model has no training frame.
-    FormatError
-        If model or database are damaged.
+        If the map has no training frame, or not even one landmark fits.
     """
-    scene, observations, points, point_ids = read_map_with_keypoints(model)
-    frames = [k for k, name in enumerate(scene.names) if name in training]
-    if not frames:
-        raise InputError("none of its frames is a training frame of the data set", path=model)
-    with MapFeatures.open(database) as opened:
-        described = {k: opened.descriptors(scene.names[k]) for k in frames}
-        scales = {k: opened.scales(scene.names[k]) for k in frames}
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in _Seen.__dataclass_fields__}
-    for k in frames:
-        ids = point_ids[scene.names[k]]
-        feature = np.flatnonzero(ids >= 0)
-        point = points.rows_of(ids[feature])
-        camera = scene.cameras[int(scene.camera_ids[k])]
-        towards = scene.poses.centers[k] - points.xyz[point]
-        far = np.linalg.norm(towards, axis=1)
-        depth = to_camera(points.xyz[point], scene.poses.centers[k], scene.poses.rotations[k])[:, 2]
-        pixels = observations.pixels[observations.image_idx == k]
-        cell = np.floor(pixels / [camera.width, camera.height] * _CELLS).astype(np.int64)
-        cell = np.clip(cell, 0, np.array(_CELLS) - 1)
-        parts["frame"].append(np.full(len(point), k))
-        parts["point"].append(point)
-        parts["units"].append(unit_descriptors(described[k][feature]))
-        parts["directions"].append(towards / np.maximum(far, 1e-9)[:, None])
-        parts["distances"].append(far)
-        parts["sizes"].append(scales[k][feature] * depth / camera.focal_px[0])
-        parts["focal_px"].append(np.full(len(point), camera.focal_px[0]))
-        parts["cells"].append((k * _CELLS[1] + cell[:, 1]) * _CELLS[0] + cell[:, 0])
-    seen = _Seen(**{name: np.concatenate(arrays) for name, arrays in parts.items()})
-    count = np.bincount(seen.point, minlength=len(points.xyz))
-    covariance = _covariances(seen, len(points.xyz))
+    is_training = np.array([name in training for name in source.names])
+    if not is_training.any():
+        raise InputError("none of the frames of the map is a training frame of the data set")
+    seen = _seen(source, np.flatnonzero(is_training[source.frame]))
+    count = np.bincount(seen.point, minlength=len(source.xyz))
+    covariance = _covariances(seen, len(source.xyz))
     chosen, rows = _within(seen, _order(seen, count, covariance), max_bytes - _OTHER_BYTES)
     found = LandmarkMap(
         facts=facts,
-        xyz=points.xyz[chosen] - offset,
+        xyz=source.xyz[chosen] - offset,
         covariance=covariance[chosen],
         basis=_basis(rows["descriptors"]),
         **rows,
     )
-    return found, len(frames)
+    return found, int(is_training.sum())
+
+
+def _seen(source: LandmarkSource, rows: np.ndarray) -> _Seen:
+    frame, point = source.frame[rows], source.point[rows]
+    towards = source.poses.centers[frame] - source.xyz[point]
+    far = np.linalg.norm(towards, axis=1)
+    depth = -np.einsum("ni,ni->n", source.poses.rotations[frame][:, 2], towards)
+    cell = np.floor(source.pixels[rows] / source.sizes[frame] * _CELLS).astype(np.int64)
+    cell = np.clip(cell, 0, np.array(_CELLS) - 1)
+    return _Seen(
+        point=point,
+        units=unit_descriptors(source.descriptors[rows]),
+        directions=towards / np.maximum(far, 1e-9)[:, None],
+        distances=far,
+        sizes=source.scales[rows] * depth / source.focal_px[frame],
+        focal_px=source.focal_px[frame],
+        cells=(frame * _CELLS[1] + cell[:, 1]) * _CELLS[0] + cell[:, 0],
+    )
 
 
 def _covariances(seen: _Seen, count: int) -> np.ndarray:

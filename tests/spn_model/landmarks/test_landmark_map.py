@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from spn_data.area.names import DATASET, SPLIT
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import FormatError, InputError
+from spn_data.inputs.landmark_source import read_landmark_source
 from spn_model.export.landmark_export import write_landmarks
 from spn_model.landmarks.landmark_map import LandmarkMap
 from tests.worlds.landmark_world import room
@@ -93,7 +95,7 @@ def split_area(finished_area, tmp_path_factory) -> Area:
 
 def test_landmarks_come_from_training_frames_alone(split_area, tmp_path):
     """Each landmark lies where at least three training frames see it; a small map holds fewer; bytes fit."""
-    sizes = {}
+    sizes, source = {}, read_landmark_source(split_area)
     with Dataset(split_area.folder(SPLIT) / DATASET) as data:
         seen = np.concatenate(
             [
@@ -106,11 +108,10 @@ def test_landmarks_come_from_training_frames_alone(split_area, tmp_path):
             path = tmp_path / f"{megabytes}.npz"
             made = write_landmarks(
                 path,
-                split_area,
+                source,
                 data,
                 "0",
                 np.zeros(3),
-                lambda *_: None,
                 max_bytes=int(1e6 * megabytes),
             )
             assert path.stat().st_size <= 1e6 * megabytes
@@ -125,14 +126,13 @@ def test_landmarks_come_from_training_frames_alone(split_area, tmp_path):
 def test_the_data_set_of_another_map_is_refused(split_area, tmp_path):
     """A data set that was not made from the map of the area gives no landmarks, and the message says why."""
     with Dataset(split_area.folder(SPLIT) / DATASET) as data:
-        data.info.fingerprints["3-geo"] = "another"
+        source = replace(read_landmark_source(split_area), fingerprint="another")
         with pytest.raises(InputError, match="not made from the map of this area"):
             write_landmarks(
                 tmp_path / "l.npz",
-                split_area,
+                source,
                 data,
                 "0",
                 np.zeros(3),
-                lambda *_: None,
                 max_bytes=10**6,
             )
