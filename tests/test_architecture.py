@@ -140,8 +140,24 @@ def test_on_board_needs_errors_and_geometry_only():
     """
     optional = "spn_data.capture.photos.decode_photo"
     values = ("spn_data.errors.", "spn_data.geometry.")
+    # Features on board are detected and compared as those of the map.
+    features = ("spn_data.matching.features.", "spn_data.matching.putative.")
     rooms = {
-        "spn_model/onboard/": (*values, "spn_model.onboard.", optional),
+        "spn_model/landmarks/": (
+            *values,
+            *features,
+            "spn_model.landmarks.",
+            "spn_model.integrity.",
+        ),
+        "spn_model/onboard/": (
+            *(*values, *features, optional),
+            *(
+                "spn_model.onboard.",
+                "spn_model.landmarks.",
+                "spn_model.integrity.",
+                "spn_model.autopilot.",
+            ),
+        ),
         "spn_model/integrity/": (*values, "spn_model.integrity."),
         "spn_model/autopilot/": (*values, "spn_model.autopilot.", "spn_model.integrity."),
     }

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from spn_cli import console, options
-from spn_data.area.names import DATASET, SPLIT
+from spn_data.area.names import DATASET, GEO, SPLIT
+
+_DEFAULT_MB = 10.0  # of landmarks
 
 if TYPE_CHECKING:
     from spn_model.export.exported import ExportedBundle
@@ -35,6 +37,12 @@ if TYPE_CHECKING:
     show_default=True,
     help="Number of training images that calibrate the 8-bit activations.",
 )
+@click.option(
+    "--map-mb",
+    type=click.FloatRange(0, 200),
+    help="Largest size of the landmark map, which fixes of centimetres need; 0 for none.  "
+    "[default: 10, or 0 where the data set is not from a georeferenced map of the area]",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing bundle.")
 def export(
     dataset: Path | None,
@@ -44,6 +52,7 @@ def export(
     target: Path | None,
     int8: bool,
     calibration_images: int,
+    map_mb: float | None,
     overwrite: bool,
 ) -> None:
     """Export a network as a bundle for the drone: ONNX graphs and the parameters of pose decoding.
@@ -55,18 +64,27 @@ def export(
     Example:
         spn-model export --area fields/north --run first
     """
+    from spn_data.inputs.landmark_source import read_landmark_source
     from spn_model.export.bundle_checks import BundleOptions
     from spn_model.runs.run_export import export_run
     from spn_model.runs.run_files import RunFiles
 
     area = options.open_area(area_folder)
     run = RunFiles(area.run_folder(name))
+    if map_mb is None:
+        map_mb = _DEFAULT_MB if dataset is None and area.has(GEO) else 0.0
+        if not map_mb:
+            console.note(
+                "the bundle gets no landmarks, because there is no georeferenced map of the data set in the "
+                "area: spn-onboard gives coarse poses only."
+            )
     with console.progress() as progress:
         exported = export_run(
             run,
             dataset or area.folder(SPLIT) / DATASET,
             progress,
-            BundleOptions(int8=int8, calibration_images=calibration_images),
+            BundleOptions(int8=int8, calibration_images=calibration_images, map_mb=map_mb),
+            source=read_landmark_source(area) if map_mb else None,
             target=target,
             overwrite=overwrite,
         )
@@ -106,6 +124,12 @@ def _show(made: ExportedBundle) -> None:
         )
     header = ("group", "graph", "file", "with a pose", "median", "change", "median", "change")
     console.table("Errors of the exported graphs", rows, header)
+    if made.landmarks is not None:
+        found = made.landmarks
+        console.out.print(
+            f"Landmarks: {found.landmarks} with {found.descriptors} descriptors, from "
+            f"{found.training_frames} training frames."
+        )
     parity = made.parity
     console.out.print(
         f"Difference from PyTorch on {parity.images} images: outputs {parity.output:.1e} of their largest "

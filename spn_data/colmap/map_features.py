@@ -17,6 +17,7 @@ import numpy as np
 from spn_data.errors import FormatError
 
 _DESCRIPTOR_BYTES = 128
+_KEYPOINT_VALUES = 4  # x, y, scale, orientation
 _MAX_ROWS = 1_000_000
 
 
@@ -75,8 +76,30 @@ class MapFeatures:
         FormatError
             If the image has no descriptors, or they are damaged or unreadable.
         """
+        return self._read("descriptors", name, np.uint8, _DESCRIPTOR_BYTES)
+
+    def scales(self, name: str) -> np.ndarray:
+        """Read the scales of the features of an image, in pixels.
+
+        Parameters
+        ----------
+        name : str
+            Image name.
+
+        Returns
+        -------
+        ndarray, shape (K,), float32
+
+        Raises
+        ------
+        FormatError
+            As `descriptors`.
+        """
+        return self._read("keypoints", name, np.float32, _KEYPOINT_VALUES)[:, 2]
+
+    def _read(self, table: str, name: str, kind: type[np.generic], width: int) -> np.ndarray:
         query = (
-            "SELECT d.rows, d.cols, d.data FROM descriptors d JOIN images i USING (image_id) "
+            f"SELECT t.rows, t.cols, t.data FROM {table} t JOIN images i USING (image_id) "
             "WHERE i.name = ?"
         )
         try:
@@ -86,10 +109,7 @@ class MapFeatures:
         if row is None:
             raise FormatError(f"{self._path}: contains no features of {name}")
         rows, columns, data = row
-        if (
-            columns != _DESCRIPTOR_BYTES
-            or not 0 <= rows <= _MAX_ROWS
-            or len(data or b"") != rows * columns
-        ):
-            raise FormatError(f"{self._path}: the descriptors of {name} are damaged")
-        return np.frombuffer(data or b"", np.uint8).reshape(-1, _DESCRIPTOR_BYTES)
+        size = rows * columns * np.dtype(kind).itemsize
+        if columns != width or not 0 <= rows <= _MAX_ROWS or len(data or b"") != size:
+            raise FormatError(f"{self._path}: the {table} of {name} are damaged")
+        return np.frombuffer(data or b"", kind).reshape(-1, width)

@@ -47,6 +47,21 @@ def numbers(value: Any, *shape: int) -> np.ndarray:
     return found
 
 
+def bounded(value: Any, low: float, high: float) -> float:
+    """Return a number between two bounds.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no number, or outside the bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is not a number")
+    if not (math.isfinite(value) and low <= value <= high):
+        raise ValueError(f"{value!r} is outside {low} to {high}")
+    return float(value)
+
+
 def _check(value: Any, depth: int) -> None:
     if depth > 8:
         raise ValueError("numbers are nested too deeply")

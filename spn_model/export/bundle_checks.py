@@ -36,6 +36,8 @@ class BundleOptions:
         Images on which onnxruntime is compared with PyTorch.
     loss_images : int
         Maximum number of images per evaluation sequence on which the errors of both graphs are measured.
+    map_mb : float
+        Largest size of the landmark map in megabytes; 0 for a bundle without one.
     output_tolerance : float
         Largest allowed difference of an output, as a share of its largest value.
     pose_tolerance : float
@@ -46,6 +48,7 @@ class BundleOptions:
     calibration_images: int = 64
     parity_images: int = 16
     loss_images: int = 500
+    map_mb: float = 0.0
     output_tolerance: float = 1e-4
     pose_tolerance: float = 0.01
 

@@ -16,6 +16,7 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError, SpnError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_to_json
+from spn_data.inputs.landmark_source import LandmarkSource
 from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import finite, write_json
@@ -29,6 +30,7 @@ from spn_model.export.bundle_checks import (
 )
 from spn_model.export.exported import ExportedBundle
 from spn_model.export.graphs import Deployment, deployment, write_graph
+from spn_model.export.landmark_export import write_landmarks
 from spn_model.export.model_card import model_card
 from spn_model.export.quantization import quantize
 from spn_model.models.checkpoint import Checkpoint
@@ -40,11 +42,13 @@ from spn_model.onboard.bundle import (
     FORMAT,
     GRAPHS,
     INT8,
+    LANDMARKS,
     OFFSET_CONVENTION,
     OFFSET_VERSION,
     VERSION,
     read_bundle,
     sha256_of,
+    verified_landmarks,
     verified_path,
 )
 
@@ -61,6 +65,7 @@ def export(
     *,
     world_names: Sequence[str] = (),
     metrics: Mapping[str, Any] | None = None,
+    source: LandmarkSource | None = None,
     overwrite: bool = False,
 ) -> ExportedBundle:
     """Write a bundle of a trained network; the folder is replaced atomically.
@@ -84,6 +89,8 @@ def export(
         Names of the fingerprints that identify the world of a data set.
     metrics : mapping, optional
         Evaluation of the run, as in metrics.json; None if there is none.
+    source : LandmarkSource, optional
+        Map that gives the landmarks; None for a bundle without them.
     overwrite : bool
         Whether a bundle in the folder may be replaced.
 
@@ -118,7 +125,8 @@ def export(
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
             _write_graphs(partial, deployed, data, options, progress)
-            document = {
+            graphs = _graph_entries(partial)
+            document: dict[str, Any] = {
                 "format": FORMAT,
                 "version": OFFSET_VERSION if any(view.offset) else VERSION,
                 "conventions": CONVENTIONS + (OFFSET_CONVENTION if any(view.offset) else ""),
@@ -126,18 +134,30 @@ def export(
                 "view": view.to_json(),
                 "input": camera_to_json(camera),
                 "decoding": deployed.decoding.to_json(),
-                "graphs": _graph_entries(partial),
+                "graphs": graphs,
                 "run": dict(facts),
             }
+            landmarks = None
+            if source is not None and options.map_mb:
+                landmarks = write_landmarks(
+                    partial / LANDMARKS,
+                    source,
+                    data,
+                    graphs[FLOAT32]["sha256"],
+                    np.array(view.offset),
+                    max_bytes=round(1e6 * options.map_mb),
+                )
+                document["landmarks"] = {**_entry(partial / LANDMARKS), **asdict(landmarks)}
             write_json(partial / DOCUMENT, document)
             parity = compare_with_pytorch(partial, checkpoint, deployed, data, options, progress)
             errors = measure_errors(partial, deployed, data, options, progress)
             made = ExportedBundle(
                 folder=folder,
                 units=view.units,
-                bytes={name: entry["bytes"] for name, entry in _graph_entries(partial).items()},
+                bytes={name: entry["bytes"] for name, entry in graphs.items()},
                 parity=parity,
                 errors=errors,
+                landmarks=landmarks,
             )
             document["measured"] = {
                 "parity": asdict(parity),
@@ -178,6 +198,8 @@ def is_up_to_date(folder: Path, facts: Mapping[str, Any], options: BundleOptions
         same = all(run[name] == value for name, value in facts.items())
         for graph in bundle.graphs.values():
             verified_path(graph)
+        if bundle.landmarks is not None:
+            verified_landmarks(bundle)
         return bool(same and measured["options"] == asdict(options))
     except (SpnError, KeyError, TypeError) as error:
         _logger.debug("%s: not an up-to-date bundle: %r", folder, error)
@@ -190,7 +212,7 @@ def _check_replaceable(folder: Path, overwrite: bool) -> None:
         return
     if not overwrite:
         raise StageError(f"{folder} already exists; use --overwrite to replace it")
-    ours = {DOCUMENT, CARD, *GRAPHS.values()}
+    ours = {DOCUMENT, CARD, LANDMARKS, *GRAPHS.values()}
     foreign = (
         [] if not folder.is_dir() else [p.name for p in folder.iterdir() if p.name not in ours]
     )
@@ -251,7 +273,8 @@ def _write_graphs(
 
 def _graph_entries(folder: Path) -> dict[str, dict[str, Any]]:
     paths = {p: folder / name for p, name in GRAPHS.items() if (folder / name).is_file()}
-    return {
-        precision: {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
-        for precision, path in paths.items()
-    }
+    return {precision: _entry(path) for precision, path in paths.items()}
+
+
+def _entry(path: Path) -> dict[str, Any]:
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}

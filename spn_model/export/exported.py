@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spn_model.export.bundle_checks import GroupErrors, Parity
+from spn_model.export.landmark_export import LandmarkSummary
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,6 +26,8 @@ class ExportedBundle:
         Differences from PyTorch.
     errors : tuple of GroupErrors
         By group, float32 before int8.
+    landmarks : LandmarkSummary or None
+        None for a bundle without landmarks.
     notes : tuple of str
         One sentence each.
     """
@@ -34,4 +37,5 @@ class ExportedBundle:
     bytes: Mapping[str, int]
     parity: Parity
     errors: tuple[GroupErrors, ...]
+    landmarks: LandmarkSummary | None = None
     notes: tuple[str, ...] = field(default=())

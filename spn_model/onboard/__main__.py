@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 # OpenCV reads this when it is imported. It limits images whose header claims an arbitrary size.
@@ -16,16 +17,21 @@ import cv2
 from spn_data.errors import InputError, SpnError
 from spn_data.geometry.camera_file import read_camera
 from spn_model.onboard import lines
+from spn_model.onboard.fly import fly
 from spn_model.onboard.localizer import Localizer, Located
 from spn_model.onboard.sources import check_sources, frames
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line `python -m spn_model.onboard BUNDLE SOURCE...` and return its exit code.
+    """Run the command line `python -m spn_model.onboard [fly] BUNDLE SOURCE...` and return its exit code.
 
     The code is 1, with a one-line message, if bundle, camera or source cannot be used, and 0 otherwise.
     """
-    parser = argparse.ArgumentParser(prog="spn-onboard", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="spn-onboard",
+        description=__doc__,
+        epilog="For fixes of centimetres with a judgement of each: spn-onboard fly --help",
+    )
     parser.add_argument("bundle", type=Path, help="bundle folder from `spn-model export`")
     parser.add_argument("sources", type=Path, nargs="+", help="images and videos")
     parser.add_argument(
@@ -39,11 +45,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--threads", type=int, default=1, help="threads of the network and of OpenCV (default 1)"
     )
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["fly"]:
+        return _ended(lambda: fly(arguments[1:]))
     given = parser.parse_args(arguments)
     if not 1 <= given.threads <= 256:
         parser.error("--threads must be between 1 and 256")
+    return _ended(lambda: _localize_all(given))
+
+
+def _ended(work: Callable[[], None]) -> int:
+    """Do the work of a command, and return its exit code."""
     try:
-        _localize_all(given)
+        work()
     except SpnError as error:
         sys.stderr.write(f"Error: {error}\n")
         return 1

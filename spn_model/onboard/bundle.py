@@ -6,7 +6,6 @@ docs/export.md specifies the format, also for programs in other languages.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
-from spn_data.geometry.json_values import parse_file
+from spn_data.geometry.json_values import bounded, parse_file
 from spn_model.onboard.decoding import DecodingOptions
 from spn_model.onboard.graph_check import check_self_contained
 from spn_model.onboard.view import View
@@ -27,6 +26,7 @@ VERSION = 1
 OFFSET_VERSION = 2  # of a view with an offset, so that programs that know none refuse it
 DOCUMENT, CARD = "bundle.json", "MODEL_CARD.md"
 FLOAT32, INT8 = "float32", "int8"
+LANDMARKS = "landmarks.npz"
 GRAPHS = {FLOAT32: "model.onnx", INT8: "model-int8.onnx"}
 INPUT = "image"  # of a graph: (1, h, w, 3) uint8 RGB
 CONVENTIONS = (
@@ -81,11 +81,11 @@ class CellDecoding:
         options: dict[str, Any] = {}
         for own in fields(DecodingOptions):
             low, high = _LIMITS.get(own.name, _SIZES)
-            number = _number(given[own.name], low, high)
+            number = bounded(given[own.name], low, high)
             options[own.name] = int(number) if isinstance(own.default, int) else number
         return cls(
-            first_px=_number(value["first_px"], 0, 1000),
-            stride_px=_number(value["stride_px"], 1, 1000),
+            first_px=bounded(value["first_px"], 0, 1000),
+            stride_px=bounded(value["stride_px"], 1, 1000),
             options=DecodingOptions(**options),
         )
 
@@ -117,7 +117,7 @@ class PoseDecoding:
         center = value["center"]
         if not isinstance(center, list) or len(center) != 3:
             raise ValueError(f"its centre is {center!r}")
-        return cls(center=np.array([_number(v, -1e9, 1e9) for v in center]))
+        return cls(center=np.array([bounded(v, -1e9, 1e9) for v in center]))
 
 
 Decoding = CellDecoding | PoseDecoding
@@ -127,8 +127,8 @@ _DECODINGS: dict[str, type[CellDecoding] | type[PoseDecoding]] = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GraphFile:
-    """ONNX file of a bundle."""
+class BundleFile:
+    """File of a bundle: a graph, or the landmarks."""
 
     path: Path
     bytes: int
@@ -149,8 +149,10 @@ class Bundle:
         Pinhole of the graph's input: that of the view, or a smaller one.
     decoding : Decoding
         How outputs are converted to a pose.
-    graphs : mapping of str to GraphFile
+    graphs : mapping of str to BundleFile
         By precision.
+    landmarks : BundleFile or None
+        None in a bundle without landmarks.
     document : mapping
         The whole file, including facts for people.
     """
@@ -159,7 +161,8 @@ class Bundle:
     view: View
     camera: Camera
     decoding: Decoding
-    graphs: Mapping[str, GraphFile]
+    graphs: Mapping[str, BundleFile]
+    landmarks: BundleFile | None
     document: Mapping[str, Any]
 
 
@@ -208,18 +211,19 @@ def read_bundle(folder: Path) -> Bundle:
             camera=camera,
             decoding=_decoding(document["decoding"]),
             graphs={p: _graph(folder, p, entry) for p, entry in dict(document["graphs"]).items()},
+            landmarks=_landmarks(folder, document.get("landmarks")),
             document=document,
         )
     except _DAMAGE as error:
         raise FormatError(f"{path}: is damaged ({error!r})") from error
 
 
-def verified_path(graph: GraphFile) -> Path:
+def verified_path(graph: BundleFile) -> Path:
     """Return the path of a graph after checking it against bundle.json.
 
     Parameters
     ----------
-    graph : GraphFile
+    graph : BundleFile
         Entry of `Bundle.graphs`.
 
     Returns
@@ -231,20 +235,51 @@ def verified_path(graph: GraphFile) -> Path:
     FormatError
         If the file is missing, is a link, has another size or hash, or keeps weights in another file.
     """
-    path = graph.path
-    if path.is_symlink() or not path.is_file():
-        raise FormatError(f"{path}: is not a regular file; copy the whole bundle folder again")
-    size = path.stat().st_size
-    if size != graph.bytes:
-        raise FormatError(
-            f"{path}: has {size} bytes, but {DOCUMENT} says {graph.bytes}; copy it again"
-        )
-    if sha256_of(path) != graph.sha256:
-        raise FormatError(f"{path}: its SHA-256 differs from {DOCUMENT}; copy it again")
+    path = _verified(graph)
     try:
         check_self_contained(path)
     except ValueError as error:
         raise FormatError(f"{path}: cannot be used: {error}; export the run again") from error
+    return path
+
+
+def verified_landmarks(bundle: Bundle) -> Path:
+    """Return the path of the landmarks of a bundle after checking it against bundle.json.
+
+    Parameters
+    ----------
+    bundle : Bundle
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        If the bundle has no landmarks.
+    FormatError
+        If the file is missing, is a link, or has another size or hash.
+    """
+    if bundle.landmarks is None:
+        raise InputError(
+            "has no landmarks, which a fix needs: export the run again with --map-mb 10",
+            path=bundle.folder,
+        )
+    return _verified(bundle.landmarks)
+
+
+def _verified(file: BundleFile) -> Path:
+    path = file.path
+    if path.is_symlink() or not path.is_file():
+        raise FormatError(f"{path}: is not a regular file; copy the whole bundle folder again")
+    size = path.stat().st_size
+    if size != file.bytes:
+        raise FormatError(
+            f"{path}: has {size} bytes, but {DOCUMENT} says {file.bytes}; copy it again"
+        )
+    if sha256_of(path) != file.sha256:
+        raise FormatError(f"{path}: its SHA-256 differs from {DOCUMENT}; copy it again")
     return path
 
 
@@ -260,21 +295,25 @@ def _decoding(value: Mapping[str, Any]) -> Decoding:
     return _DECODINGS[value["kind"]].from_json(value)
 
 
-def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> GraphFile:
+def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> BundleFile:
     # The name in the file is only compared, never used as a path.
     if GRAPHS.get(precision) != entry["file"]:
         raise ValueError(f"its {precision} graph is {entry['file']!r}")
     digest = str(entry["sha256"])
-    return GraphFile(
+    return BundleFile(
         path=folder / GRAPHS[precision],
-        bytes=int(_number(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
+        bytes=int(bounded(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
         sha256=digest,
     )
 
 
-def _number(value: Any, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is not a number")
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{value!r} is outside {low} to {high}")
-    return float(value)
+def _landmarks(folder: Path, entry: Mapping[str, Any] | None) -> BundleFile | None:
+    if entry is None:
+        return None
+    if entry["file"] != LANDMARKS:
+        raise ValueError(f"its landmarks are {entry['file']!r}")
+    return BundleFile(
+        path=folder / LANDMARKS,
+        bytes=int(bounded(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
+        sha256=str(entry["sha256"]),
+    )

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
+from spn_data.geometry.pinhole import residuals_and_jacobian
 from spn_data.geometry.pose import Poses, to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
 
@@ -143,7 +144,7 @@ def decode(
             raise GeometryError(
                 f"only {len(x)} cells are in front of the camera, need {options.min_inliers}"
             )
-        residuals, jacobian = _residuals_and_jacobian(x, at[ahead], matrix, rotation)
+        residuals, jacobian = residuals_and_jacobian(x, at[ahead], matrix, rotation)
         sigma_px = np.hypot(options.floor_px, focal_px * sigma_m[ahead] / x[:, 2])
         normalised_sq = (residuals**2).sum(axis=1) / (sigma_px * width) ** 2
         weights = (1 + normalised_sq) ** -2 / sigma_px**2
@@ -196,22 +197,3 @@ def _first_pose(
         )
     rotation = rotations_from_vectors(turn.reshape(1, 3))[0]
     return middle - rotation.T @ move.ravel(), rotation
-
-
-def _residuals_and_jacobian(
-    x: np.ndarray, at: np.ndarray, matrix: np.ndarray, rotation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return reprojection residuals (N, 2) of points x (N, 3) in the camera, and their Jacobian (N, 2, 6).
-
-    The residual is projected minus observed. A rotation by exp(v) moves a point x by v x x, and a shift d of
-    the centre moves it by -R d.
-    """
-    projected = x @ matrix.T
-    pixels = projected[:, :2] / projected[:, 2:]
-    point_jacobian = (matrix[None, :2] - pixels[:, :, None] * matrix[None, 2:]) / projected[
-        :, 2:, None
-    ]
-    jacobian = np.concatenate(
-        [-point_jacobian @ rotation, np.cross(x[:, None, :], point_jacobian)], axis=2
-    )
-    return pixels - at, jacobian

@@ -8,6 +8,7 @@ from typing import Any
 
 from spn_data.area.names import GEO, MODEL
 from spn_data.errors import FormatError
+from spn_data.inputs.landmark_source import LandmarkSource
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, load_json
 from spn_data.work.timing import Progress
@@ -46,6 +47,7 @@ def export_run(
     progress: Progress,
     options: BundleOptions,
     *,
+    source: LandmarkSource | None = None,
     target: Path | None = None,
     overwrite: bool = False,
 ) -> ExportedRun:
@@ -61,6 +63,8 @@ def export_run(
         Receives the step, items done, and items in total.
     options : BundleOptions
         Content and checks of the bundle.
+    source : LandmarkSource, optional
+        Map that gives the landmarks of the bundle.
     target : Path, optional
         Folder of the bundle; by default in the folder of the run.
     overwrite : bool
@@ -97,6 +101,7 @@ def export_run(
             options,
             world_names=(MODEL, GEO),
             metrics=metrics,
+            source=source,
             overwrite=overwrite,
         )
     return ExportedRun(

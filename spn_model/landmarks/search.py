@@ -1,0 +1,243 @@
+"""Search: the pose of one image in the landmark map, from several hypotheses that one judge compares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spn_model.integrity.judgement import Witness
+from spn_model.landmarks.landmark_map import LandmarkMap
+from spn_model.landmarks.matching import (
+    Expected,
+    ImageFeatures,
+    expected,
+    match,
+    match_all,
+    match_near,
+)
+from spn_model.landmarks.solver import (
+    KnownVertical,
+    Sightings,
+    SolvedPose,
+    first_pose,
+    fit_focal_length,
+    solve,
+    vertical_terms,
+)
+
+FIRST_PX = 4.0  # of RANSAC
+SEARCH_PX = 12.0  # around a projection, once there is a pose
+_MIN_FIRST = 8  # sightings that agree with a first pose
+_ROUNDS = 6  # of matching around the projections
+_SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
+ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
+WEAK = 120  # landmarks that agree below which all features are compared, not only the strongest
+MAP = "retrieval"  # among all landmarks
+_MARGIN = 1.25  # on the field of view of an uncertain hypothesis
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A supposed pose: which landmarks to look for.
+
+    Attributes
+    ----------
+    source : str
+        "network", "retrieval", "prior" or "track", as in `FixSource`.
+    center : ndarray, shape (3,)
+    rotation : ndarray, shape (3, 3)
+    radius_px : float or None
+        How far landmarks may be from their projections; None if anywhere in the image.
+    """
+
+    source: str
+    center: np.ndarray
+    rotation: np.ndarray
+    radius_px: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Candidate:
+    """A pose with everything that speaks for and against it.
+
+    Attributes
+    ----------
+    source : str
+        Where the hypothesis came from.
+    pose : SolvedPose
+    seen : Sightings
+        Landmarks found within `SEARCH_PX` of their projections.
+    candidates : Expected
+        Landmarks that the pose should see.
+    """
+
+    source: str
+    pose: SolvedPose
+    seen: Sightings
+    candidates: Expected
+
+    @property
+    def agreeing(self) -> int:
+        """Number of landmarks that agree with the pose."""
+        return int(self.pose.inliers.sum())
+
+    def is_elsewhere(self, other: Candidate) -> bool:
+        """Return whether the pose is another one than that of `other`."""
+        turn = np.trace(self.pose.rotation @ other.pose.rotation.T)
+        return bool(
+            np.linalg.norm(self.pose.center - other.pose.center) > ELSEWHERE_M
+            or np.rad2deg(np.arccos(np.clip((turn - 1) / 2, -1, 1))) > ELSEWHERE_DEG
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Result of a search: the best pose, and how many landmarks agree with the best pose elsewhere.
+
+    Attributes
+    ----------
+    best : Candidate
+    rival_inliers : int
+        0 if no other pose was found.
+    """
+
+    best: Candidate
+    rival_inliers: int
+
+
+def search(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    hypotheses: Sequence[Hypothesis] = (),
+    vertical: KnownVertical | None = None,
+) -> Found | None:
+    """Find the pose of an image.
+
+    The features are compared with all landmarks of the map, and with those that each hypothesis sees. What
+    does not agree with the best pose is asked for another one.
+
+    Parameters
+    ----------
+    landmarks : LandmarkMap
+    features : ImageFeatures
+    hypotheses : sequence of Hypothesis
+    vertical : KnownVertical, optional
+
+    Returns
+    -------
+    Found or None
+        None if too few landmarks agree on any pose.
+    """
+    found = [
+        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess), vertical)
+        for guess in hypotheses
+    ]
+    compared = match_all(features, landmarks)
+    found.append(_candidate(landmarks, features, MAP, compared, vertical))
+    if max((c.agreeing for c in found if c), default=0) < WEAK:
+        compared = match_all(features, landmarks, len(features))
+        found.append(_candidate(landmarks, features, MAP, compared, vertical))
+    best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
+    if best is not None:
+        used = best.seen.features[best.pose.inliers]
+        rest = compared.select(~np.isin(compared.features, used))
+        found.append(_candidate(landmarks, features, MAP, rest, vertical))
+    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
+    if not poses:
+        return None
+    rivals = [c.agreeing for c in poses[1:] if c.is_elsewhere(poses[0])]
+    return Found(poses[0], max(rivals, default=0))
+
+
+def follow(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    guess: Hypothesis,
+    vertical: KnownVertical | None = None,
+) -> Found | None:
+    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there."""
+    seen = _guided(landmarks, features, guess)
+    found = _candidate(landmarks, features, guess.source, seen, vertical)
+    return None if found is None else Found(found, 0)
+
+
+def _guided(landmarks: LandmarkMap, features: ImageFeatures, guess: Hypothesis) -> Sightings:
+    if guess.radius_px is None:
+        wanted = _seen_from(landmarks, features, guess.center, guess.rotation, _MARGIN)
+        return match(features, landmarks, wanted)
+    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, 1.0)
+    return match_near(features, landmarks, wanted, guess.radius_px)
+
+
+def _candidate(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    source: str,
+    seen: Sightings,
+    vertical: KnownVertical | None,
+) -> Candidate | None:
+    first = first_pose(seen, FIRST_PX, _MIN_FIRST)
+    return None if first is None else _refine(landmarks, features, source, *first, vertical)
+
+
+def _refine(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    source: str,
+    center: np.ndarray,
+    rotation: np.ndarray,
+    vertical: KnownVertical | None,
+) -> Candidate | None:
+    """Match around the projections and solve, until no more landmarks agree."""
+    best, agreeing = None, 0
+    for _ in range(_ROUNDS):
+        wanted = _seen_from(landmarks, features, center, rotation, 1.0)
+        seen = match_near(features, landmarks, wanted, SEARCH_PX)
+        pose = solve(seen, center, rotation, vertical) if len(seen) >= _MIN_FIRST else None
+        if pose is None:
+            break
+        count = int(pose.inliers.sum())
+        if count <= agreeing:
+            break
+        settled = best is not None and count <= _SETTLED * agreeing
+        best = Candidate(source=source, pose=pose, seen=seen, candidates=wanted)
+        center, rotation, agreeing = pose.center, pose.rotation, count
+        if settled:
+            break
+    return best
+
+
+def _seen_from(
+    landmarks: LandmarkMap,
+    features: ImageFeatures,
+    center: np.ndarray,
+    rotation: np.ndarray,
+    margin: float,
+) -> Expected:
+    return expected(
+        landmarks, center, rotation, features.focal_px, features.half_view, margin=margin
+    )
+
+
+def witness_of(
+    found: Found, features: ImageFeatures, vertical: KnownVertical | None = None
+) -> Witness:
+    """Return what is known about the pose of a candidate, for its judgement."""
+    best, tilt = found.best, 0.0
+    if vertical is not None:
+        tilt = float(np.linalg.norm(vertical_terms(vertical, best.pose.rotation)[1]))
+    return Witness(
+        at=best.seen.at / features.focal_px / features.half_view,
+        xyz=best.seen.xyz,
+        residuals=best.pose.residuals,
+        jacobian=best.pose.jacobian,
+        by_focal=best.pose.by_focal,
+        weights=best.pose.weights,
+        inliers=best.pose.inliers,
+        information=best.pose.information,
+        tilt_sigmas=tilt,
+        rival_inliers=found.rival_inliers,
+        focal_change=fit_focal_length(best.seen, best.pose),
+    )

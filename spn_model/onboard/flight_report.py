@@ -1,0 +1,77 @@
+"""Report on a flight: availability of fixes, longest outage, reasons for missing ones, processing time."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from spn_model.integrity.fix import Fix, NoFix
+
+
+class FlightReport:
+    """Counts of what was published during a flight."""
+
+    def __init__(self) -> None:
+        self._usable: list[bool] = []
+        self._times_us: list[int] = []
+        self._processing_s: list[float] = []
+        self._sources: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()
+        self._levels_m: list[tuple[float, float]] = []
+
+    def add(self, item: Fix | NoFix) -> None:
+        """Count an image."""
+        usable = isinstance(item, Fix) and item.usable
+        self._usable.append(usable)
+        self._times_us.append(item.time_us)
+        self._processing_s.append(item.processing_s)
+        if isinstance(item, Fix):
+            self._sources[item.source.value] += usable
+            if usable:
+                self._levels_m.append((item.horizontal_protection_m, item.vertical_protection_m))
+            else:
+                self._reasons[f"{item.state.value}: waits for images that agree"] += 1
+        else:
+            # Numbers differ from image to image; what is counted is the kind of reason.
+            kind = " ".join("#" if any(c.isdigit() for c in w) else w for w in item.reason.split())
+            self._reasons[f"{item.state.value}: {kind}"] += 1
+
+    @property
+    def availability(self) -> float:
+        """Share of images with a usable fix."""
+        return float(np.mean(self._usable)) if self._usable else 0.0
+
+    @property
+    def longest_outage_s(self) -> float:
+        """Longest time between usable fixes, begin and end of the flight included."""
+        if not self._times_us:
+            return 0.0
+        times = np.array(self._times_us)
+        marks = np.concatenate([times[:1], times[np.array(self._usable)], times[-1:]])
+        return float(np.diff(marks).max(initial=0)) * 1e-6
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        if not self._usable:
+            return ["No images."]
+        usable = sum(self._usable)
+        p50, p95 = 1e3 * np.percentile(self._processing_s, [50, 95])
+        found = [
+            f"Usable fixes: {usable} of {len(self._usable)} images ({100 * self.availability:.1f} %); "
+            f"longest outage {self.longest_outage_s:.1f} s.",
+            f"Processing time: {p50:.0f} ms (median), {p95:.0f} ms (95 %).",
+        ]
+        if usable:
+            horizontal, vertical = np.median(self._levels_m, axis=0)
+            sources = ", ".join(
+                f"{name} {count}" for name, count in self._sources.most_common() if count
+            )
+            found.append(
+                f"Protection level (median): {horizontal:.2f} m horizontally, {vertical:.2f} m vertically."
+            )
+            found.append(f"Sources: {sources}.")
+        found += [
+            f"No fix, {count} images: {reason}" for reason, count in self._reasons.most_common(8)
+        ]
+        return found

@@ -1,0 +1,108 @@
+"""`spn-onboard fly`: fixes of a recorded flight with a bundle that has landmarks."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from spn_cli.data import main as data_main
+from spn_cli.model import main as model_main
+
+import spn_data
+from spn_data.geometry.camera_file import camera_to_json
+from spn_data.storage.json_files import write_json
+from spn_model.integrity.fix import NoFix
+from spn_model.onboard.__main__ import main
+from spn_model.onboard.pilot import Pilot, PilotOptions
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def flown_area(finished_area, tmp_path_factory) -> Path:
+    """The area of the short flight, with a network of a few steps and its bundle."""
+    area = tmp_path_factory.mktemp("flown") / "area"
+    shutil.copytree(finished_area, area)
+    before = torch.get_num_threads()
+    for command, words in (
+        (data_main, ["split"]),
+        (
+            model_main,
+            ["train", "--images", "32", "--validations", "1", "--threads", "1", "--device", "cpu"],
+        ),
+        (model_main, ["export", "--run", "default", "--map-mb", "1", "--calibration-images", "2"]),
+    ):
+        result = CliRunner().invoke(command, [*words, "--area", str(area)])
+        assert result.exit_code == 0, result.output
+    torch.set_num_threads(before)
+    return area
+
+
+@pytest.fixture(scope="module")
+def camera_file(flown_area, tmp_path_factory) -> Path:
+    """The camera of the flight."""
+    path = tmp_path_factory.mktemp("camera") / "camera.json"
+    write_json(path, camera_to_json(spn_data.open_area(flown_area).map.cameras["flight1"]))
+    return path
+
+
+def test_a_recorded_flight_gets_fixes(flown_area, camera_file, flight1, tmp_path, capsys):
+    """Most images of the mapping flight get a fix; those of chosen frames are protected from the error."""
+    bundle, out = flown_area / "runs" / "default" / "bundle", tmp_path / "fixes.jsonl"
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    assert main([*words, "--to", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "Usable fixes: " in printed
+    assert "Protection level (median)" in printed
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
+    usable = [k for k, line in enumerate(lines) if line["usable"]]
+    assert len(usable) > 0.7 * len(lines)
+    labels = spn_data.open_area(flown_area).labels()
+    compared = 0
+    for row in np.flatnonzero(labels.registered):
+        line = lines[int(labels.video_frame[row])]
+        if line["usable"]:
+            compared += 1
+            off = np.array(line["center"]) - labels.poses.centers[row]
+            assert np.hypot(*off[:2]) < line["horizontal_protection_m"]
+            assert abs(off[2]) < line["vertical_protection_m"]
+    assert compared > 5
+
+
+def test_images_that_show_nothing_of_the_map_have_no_fix(flown_area, camera_file):
+    """Black images and noise have a NoFix with a reason."""
+    area = spn_data.open_area(flown_area)
+    camera = area.map.cameras["flight1"]
+    pilot = Pilot(
+        flown_area / "runs" / "default" / "bundle",
+        camera,
+        PilotOptions(sequence=False, network=False),
+    )
+    rng = np.random.default_rng(0)
+    shape = (camera.height, camera.width, 3)
+    for image in (np.zeros(shape, np.uint8), rng.integers(0, 255, shape).astype(np.uint8)):
+        found = pilot.fix(image, 1)
+        assert isinstance(found, NoFix)
+        assert found.reason
+
+
+def test_a_bundle_without_landmarks_is_refused(flown_area, camera_file, flight1, tmp_path, capsys):
+    """A bundle without landmarks, and one whose landmarks were changed, give one line and exit code 1."""
+    bundle = tmp_path / "bundle"
+    shutil.copytree(flown_area / "runs" / "default" / "bundle", bundle)
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    with (bundle / "landmarks.npz").open("r+b") as handle:
+        handle.seek(500)
+        handle.write(b"\0" * 64)
+    assert main(words) == 1
+    assert "its SHA-256 differs from bundle.json" in capsys.readouterr().err
+    document = json.loads((bundle / "bundle.json").read_text())
+    del document["landmarks"]
+    (bundle / "bundle.json").write_text(json.dumps(document))
+    assert main(words) == 1
+    assert "has no landmarks, which a fix needs" in capsys.readouterr().err
