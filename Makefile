@@ -17,7 +17,7 @@ $(VENV)/readers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[readers]'
 	touch $@
 
-# Simulated flights with exact truth, from video to a network on board; three minutes of training are far too few
+# Simulated flights with exact truth, from video to fixes on board; three minutes of training are far too few
 # for a network to be flown (half an hour is the default), and enough to see each step.
 demo: $(VENV)/installed
 	rm -rf $(DEMO)
@@ -35,6 +35,9 @@ demo: $(VENV)/installed
 	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
 	$(BIN)/spn-model export --run default --area $(DEMO)/area
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
+	$(BIN)/spn-onboard fly $(DEMO)/area/runs/default/bundle $(DEMO)/flights/evaluation/medium.mp4 \
+		--camera $(DEMO)/area/4-eval/medium/camera.json --to $(DEMO)/fixes.jsonl
+	$(BIN)/python benchmarks/fixes.py $(DEMO)/area $(DEMO)/area/runs/default/bundle
 	$(BIN)/python tools/run_page.py docs/python.md
 
 test: $(VENV)/readers

@@ -105,7 +105,8 @@ def plan(
         Videos, or folders with videos or photos.
     options : FramesOptions
     extended : Area or None
-        Area to extend. Sources whose files are all in it are ignored, and its names are not used again.
+        Area to extend. Sources whose files are all in it are ignored, and its names are not used again; the
+        plan may then be without sources.
     tested : Area or None
         Area whose evaluation sequences must not become part of the map, and keep their names.
 
@@ -116,7 +117,7 @@ def plan(
     Raises
     ------
     InputError
-        If there is no new source, or a file belongs to an evaluation sequence.
+        If a file belongs to an evaluation sequence.
     """
     sources: list[Source] = []
     ignored: list[tuple[Path, str]] = []
@@ -150,11 +151,6 @@ def plan(
                 name, number = f"{source.sequence}-{number}", number + 1
             names.add(name.lower())
             sources.append(replace(source, sequence=name))
-    if not sources:
-        raise InputError(
-            "nothing to add: all files are already in the area",
-            path=", ".join(str(path) for path in inputs),
-        )
     return Plan(
         tuple(sources),
         tuple(ignored),

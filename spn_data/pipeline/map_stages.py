@@ -107,7 +107,7 @@ def add(
     """Extend an area by further sources; it does not change until its next version is complete.
 
     Frames, features and matches are reused and the origin is kept, but the map is reconstructed again.
-    Sources that are already in the area are skipped.
+    Sources that are already in the area are skipped; without others, the area is unchanged.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def add(
     StageError
         If the area has no model, or as in `reconstruct`.
     InputError
-        If there is no new source, or an input cannot be used.
+        If an input cannot be used.
     """
     for stage in (FRAMES, MODEL):
         if not area.has(stage):
@@ -136,6 +136,11 @@ def add(
         geo = replace(geo, fit=replace(geo.fit, origin=origin))
     options = replace(options, geo=geo)
     found = plan(inputs, options.frames, extended=area, tested=area)
+    if not found.sources:  # also where the same command was killed after its last change
+        for stage in STAGES:
+            if area.has(stage):
+                watcher.unchanged(area.record(stage))
+        return
     if overwrite:
         area.discard_next()
     following = area.next_area()

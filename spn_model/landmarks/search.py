@@ -69,14 +69,11 @@ class Candidate:
     pose : SolvedPose
     seen : Sightings
         Landmarks found within `SEARCH_PX` of their projections.
-    candidates : Expected
-        Landmarks that the pose should see.
     """
 
     source: str
     pose: SolvedPose
     seen: Sightings
-    candidates: Expected
 
     @property
     def agreeing(self) -> int:
@@ -202,7 +199,7 @@ def _refine(
         if count <= agreeing:
             break
         settled = best is not None and count <= _SETTLED * agreeing
-        best = Candidate(source=source, pose=pose, seen=seen, candidates=wanted)
+        best = Candidate(source=source, pose=pose, seen=seen)
         center, rotation, agreeing = pose.center, pose.rotation, count
         if settled:
             break
