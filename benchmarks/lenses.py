@@ -5,7 +5,7 @@ about 1 % of the width off, with decentring and a third radial term. Measurement
 their tracks are adjusted as `spn-data reconstruct` does, and compared with the truth after the best-fit
 similarity over the camera centres:
 
-    PYTHONPATH=. python benchmarks/lenses.py --draws 200 --models /tmp/lenses
+    PYTHONPATH=. python benchmarks/lenses.py --draws 200 --models lenses
 
 Adjusted models are kept in the folder given, and used again, so that estimates of the uncertainty can be
 compared on the same draws. What was looked at while they were chosen were seeds from 1000 (`--first 1000`).

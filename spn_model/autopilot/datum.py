@@ -87,9 +87,21 @@ class Datum:
             )
 
     def local_ned(self, enu: np.ndarray, origin: Geodetic, projection: Projection) -> np.ndarray:
-        """Return North, East, Down (3,) about an autopilot's origin of a point (3,) in the world.
+        """Return a point of the world in an autopilot's local frame.
 
-        North and east are in the autopilot's own projection, down is a difference of heights above sea level.
+        Parameters
+        ----------
+        enu : ndarray, shape (3,)
+            Point in the world, metres.
+        origin : Geodetic
+            Origin of the autopilot.
+        projection : Projection
+            Its own, for north and east.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            North, east, and down: a difference of heights above sea level.
         """
         place = self.geodetic(enu)
         north, east = north_east(

@@ -59,7 +59,19 @@ class Mounting:
 
     @classmethod
     def pitched(cls, pitch_deg: float, lever_arm_m: np.ndarray | None = None) -> Mounting:
-        """Return the mounting of a camera that looks forward, pitched up by an angle; -90 looks down."""
+        """Return the mounting of a camera that looks forward, pitched by an angle.
+
+        Parameters
+        ----------
+        pitch_deg : float
+            Positive: up; -90 looks down.
+        lever_arm_m : ndarray, shape (3,), optional
+            Camera from the body's centre: forward, right, down.
+
+        Returns
+        -------
+        Mounting
+        """
         c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
         turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return cls(

@@ -126,7 +126,27 @@ class CsvWriter(_TextWriter):
 def open_writer(
     path: Path, *, datum: Datum | None, mounting: Mounting
 ) -> JsonLinesWriter | CsvWriter | Ros2Writer:
-    """Open a file of fixes by its suffix: `.jsonl`, `.csv`, or none for the folder of a ROS 2 bag."""
+    """Open a file of fixes by its suffix: `.jsonl`, `.csv`, or none for the folder of a ROS 2 bag.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder that does not exist yet.
+    datum : Datum or None
+        Where the world is on the Earth; None if unknown.
+    mounting : Mounting
+        Of the camera in the body; used by a bag.
+
+    Returns
+    -------
+    JsonLinesWriter, CsvWriter or Ros2Writer
+        Call `send` for each image, then `close`.
+
+    Raises
+    ------
+    InputError
+        If the path exists, or has another suffix.
+    """
     if path.suffix == ".jsonl":
         return JsonLinesWriter(path, datum)
     if path.suffix == ".csv":

@@ -225,14 +225,17 @@ def test_a_focal_length_far_from_what_was_given_is_told(flight1: Path, tmp_path:
     record = Area(tmp_path / "area").record(MODEL)
     assert 66 < record.counts["cameras"]["flight1"]["fov_deg"] < 78
     assert any(
-        note.startswith("camera flight1: the focal length was estimated") for note in record.notes
+        note.startswith("camera flight1: focal length 2")
+        and note.endswith("60 deg, as given is outvoted")
+        for note in record.notes
     )
 
 
 def test_no_surprise_is_told_of_a_focal_length_that_was_given_rightly(finished_area: Path) -> None:
-    """A correct initial focal length gives no note."""
-    notes = Area(finished_area).record(MODEL).notes
-    assert not any("focal length" in note for note in notes)
+    """Of a correct initial focal length one note says that all witnesses agree."""
+    notes = [note for note in Area(finished_area).record(MODEL).notes if "focal length" in note]
+    assert len(notes) == 1
+    assert notes[0].endswith("they agree")
 
 
 @pytest.mark.slow

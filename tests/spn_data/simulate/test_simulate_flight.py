@@ -145,7 +145,7 @@ def test_presets_differ_in_image_and_rate_only() -> None:
         np.testing.assert_allclose(
             path.poses.centers, standard[name].poses.centers[::2], atol=1e-12
         )
-    with pytest.raises(InputError, match="unknown preset 'large'; choose from demo, standard"):
+    with pytest.raises(InputError, match="unknown preset 'large'; choose from demo, look-alike, "):
         preset("large")
     with pytest.raises(InputError, match="unknown flight 'flight3'"):
         simulate_paths(replace(preset("demo"), only=("flight3",)))
