@@ -19,9 +19,7 @@ _MAX_LANDMARKS = 2500  # compared with the image; the ones seen most alike
 _MAX_RATIO = 0.88  # distance of the nearest landmark over that of the second nearest
 _MAX_DISTANCE = 0.8
 STRONGEST = 400  # features that are compared with all landmarks
-_SIZE_PX = (
-    12.0  # keypoints of this scale are measured with twice the standard deviation of small ones
-)
+_SIZE_PX = 12.0  # scale of keypoints with twice the standard deviation of small ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +154,9 @@ def match(features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected)
     Sightings
         At most one for each landmark and each feature.
     """
-    row = np.repeat(np.arange(len(features)), len(candidates.rows))
-    column = np.tile(np.arange(len(candidates.rows)), len(features))
     similarity = features.units @ landmarks.units[candidates.rows].T
-    return _best(features, landmarks, candidates, row, column, similarity.ravel())
+    row, column = np.nonzero(similarity > 1 - _MAX_DISTANCE**2 / 2)
+    return _best(features, landmarks, candidates, row, column, similarity[row, column])
 
 
 def match_near(
