@@ -29,6 +29,7 @@ from spn_data.telemetry.track import Telemetry
 
 # A fix is an outlier if its residual exceeds this many sigma of the white noise.
 _OUTLIER_SIGMAS = 5.0
+_MAX_OUTLIERS = 0.5  # of the fixes; with more of them, the model or the telemetry is wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +217,12 @@ def _geo_fit(fitted: Fitted) -> GeoFit:
     distance = np.zeros((len(Kind), len(problem.model)))
     distance[problem.kind, problem.frame] = result.distance
     outlier = np.asarray((distance[:3] > _OUTLIER_SIGMAS).any(axis=0))
+    count = int(fixes.has_fix.sum())
+    if problem.control is None and outlier.sum() > _MAX_OUTLIERS * count:
+        raise GeometryError(
+            f"{outlier.sum()} of {count} fixes contradict the georegistered model: parts of it may be joined "
+            "wrongly, or this may be the telemetry of another flight"
+        )
     covariance = result.covariance[:SHARED, :SHARED] + drift_covariance(problem, result)
     # Gravity constrains the cameras' rotations; telemetry cannot show how positions are tilted against them.
     covariance[[3, 4], [3, 4]] += np.deg2rad(options.model_bend_deg) ** 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -223,6 +224,21 @@ def test_telemetry_of_another_flight_is_refused(standard):
     shuffled = replace(standard.telemetry.select(back), time_s=standard.telemetry.time_s)
     with pytest.raises(GeometryError, match="telemetry of another"):
         replace(standard, telemetry=shuffled).fit()
+
+
+def test_a_model_joined_wrongly_is_refused(standard, monkeypatch):
+    """If 47 % of the model are 200 m beside their place, and 40 % are allowed, the fixes contradict it."""
+    module = sys.modules["spn_data.georegistration.georegister"]
+    monkeypatch.setattr(module, "_MAX_OUTLIERS", 0.4)
+    centers, at = (
+        standard.model.centers.copy(),
+        np.arange(len(standard.time_s)) / len(standard.time_s),
+    )
+    shift = np.array([200.0, 0.0, 0.0]) / standard.world_from_model.scale
+    centers[at >= 0.53] += standard.world_from_model.rotation.T @ shift
+    joined = Poses(centers, standard.model.quats_wxyz)
+    with pytest.raises(GeometryError, match="fixes contradict the georegistered model"):
+        replace(standard, model=joined).fit()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
