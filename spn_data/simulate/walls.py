@@ -83,22 +83,24 @@ def _details(
     paint_target(image, canvas)
 
 
-def paint_plaster_wall(canvas: Canvas) -> np.ndarray:
-    """Paint a plain plastered wall (H, W, 4) with the common window grid."""
-    rng = canvas.rng
-    image, alpha = _plaster(canvas, rng), np.zeros(canvas.shape, np.uint8)
+def _with_windows(image: np.ndarray, canvas: Canvas, rng: np.random.Generator) -> np.ndarray:
+    """Return a wall (H, W, 4) with the common window grid and details; alpha marks what reflects."""
+    alpha = np.zeros(canvas.shape, np.uint8)
     paint_windows(image, alpha, canvas)
     _details(image, alpha, canvas, rng)
     return np.dstack([image, alpha])
+
+
+def paint_plaster_wall(canvas: Canvas) -> np.ndarray:
+    """Paint a plain plastered wall (H, W, 4) with the common window grid."""
+    rng = canvas.rng
+    return _with_windows(_plaster(canvas, rng), canvas, rng)
 
 
 def paint_panel_wall(canvas: Canvas) -> np.ndarray:
     """Paint a wall of identical panels (H, W, 4) with the common window grid."""
     rng = canvas.rng
-    image, alpha = _panels(canvas, rng), np.zeros(canvas.shape, np.uint8)
-    paint_windows(image, alpha, canvas)
-    _details(image, alpha, canvas, rng)
-    return np.dstack([image, alpha])
+    return _with_windows(_panels(canvas, rng), canvas, rng)
 
 
 def paint_curtain_wall(canvas: Canvas) -> np.ndarray:

@@ -34,7 +34,6 @@ class ImageFeatures:
         Of the keypoints, in the same pixels.
     units : ndarray of float32, shape (K, 128)
         Descriptors of length one.
-    descriptors : ndarray of uint8, shape (K, 128)
     focal_px : float
         Of the camera reduced to the width that features are detected at.
     half_view : ndarray, shape (2,)
@@ -44,7 +43,6 @@ class ImageFeatures:
     at: np.ndarray
     scales: np.ndarray
     units: np.ndarray
-    descriptors: np.ndarray
     focal_px: float
     half_view: np.ndarray
 
@@ -62,7 +60,6 @@ class ImageFeatures:
             at=camera.unproject(keypoints[:, :2]) * focal_px,
             scales=keypoints[:, 2] * reduction,
             units=unit_descriptors(features.descriptors),
-            descriptors=features.descriptors,
             focal_px=focal_px,
             half_view=np.abs(camera.unproject(np.array(corners, np.float64))).max(axis=0),
         )

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
+from spn_data.geometry.camera_file import camera_at_size
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.matching.features import extract
@@ -209,14 +209,9 @@ class Pilot:
 
     def _features(self, image: np.ndarray) -> ImageFeatures:
         height, width = image.shape[:2]
-        if abs(width * self.camera.height / (height * self.camera.width) - 1) > 0.01:
-            raise InputError(
-                f"the image is {width}x{height}, but the camera is {self.camera.width}x"
-                f"{self.camera.height}; give the camera of these images"
-            )
+        camera = camera_at_size(self.camera, width, height)
         options = self.landmarks.facts.features
         found = extract(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), None, options)
-        camera = self.camera.scaled(width, height)
         return ImageFeatures.of(found, camera, options.max_image_size_px)
 
     def _from_network(self, image: np.ndarray) -> list[Hypothesis]:
