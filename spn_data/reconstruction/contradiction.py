@@ -138,8 +138,8 @@ class ShapeError:
 
 # Median error of distances between cameras, relative to the median distance: at most 0.05 for right models of
 # drone flights with consumer receivers, at least 0.33 where look-alike places were taken for one.
-_MAX_SHAPE_ERROR = 0.15
-_MIN_SHAPE_ERROR_M = 3.0  # that a consumer receiver does not explain
+_MAX_SHAPE_ERROR = 0.25
+_MIN_SHAPE_ERROR_M = 4.0  # that a consumer receiver does not explain
 _MOST_COMPARED = 500  # cameras, evenly chosen
 
 

@@ -35,6 +35,8 @@ class ReconstructResult:
         Database file of the attempt that was kept.
     registrations : tuple of FrameRegistration
         One per frame.
+    contradicted : bool
+        Whether matches or fixes contradict the model, so that parts of it lie at wrong places.
     submodels : tuple of int
         Number of images in each sub-model of the attempt that was kept.
     attempts : tuple of str
@@ -46,6 +48,7 @@ class ReconstructResult:
     refined: RefinedModel
     database: Path
     registrations: tuple[FrameRegistration, ...]
+    contradicted: bool
     submodels: tuple[int, ...]
     attempts: tuple[str, ...]
     pairs_tried: int
@@ -135,6 +138,7 @@ def reconstruct(
         refined,
         work / best.database,
         registrations,
+        best.contradicted,
         best.submodels,
         tuple(notes),
         tried,

@@ -276,6 +276,9 @@ def test_a_model_that_is_contradicted_is_made_again(
     assert result.exit_code == 0, result.output
     assert answers == []
     notes = Area(tmp_path / "area").record(MODEL).notes
+    assert Area(tmp_path / "area").record(MODEL).counts["contradicted"] == (
+        stays and judge == "contradictions"
+    )
     assert notes.count(words) == (1 + len(retried) if stays else 1)
     made = [note.split(" attempt")[0] for note in notes if " attempt" in note]
     assert made == ["first", *expected]
