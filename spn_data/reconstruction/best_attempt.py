@@ -62,7 +62,7 @@ class ReconstructionRun:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class AttemptResult:
     """Result of one attempt."""
 
     sound: bool  # whether nothing contradicts it
@@ -78,10 +78,10 @@ class Candidate:
         return self.sound, self.registered
 
 
-def best_attempt(run: ReconstructionRun, notes: list[str]) -> Candidate | None:
+def best_attempt(run: ReconstructionRun, notes: list[str]) -> AttemptResult | None:
     """Return the first attempt that is good enough, otherwise the best of all."""
     options = run.options
-    best: Candidate | None = None
+    best: AttemptResult | None = None
     known = all(lens.focal_is_known for lens in run.frames.lenses.values())
     for attempt in attempts(options, focal_is_known=known):
         if attempt.checks and not (best and best.contradicted):
@@ -98,7 +98,7 @@ def best_attempt(run: ReconstructionRun, notes: list[str]) -> Candidate | None:
     return best
 
 
-def _try(run: ReconstructionRun, attempt: Attempt, notes: list[str]) -> Candidate | None:
+def _try(run: ReconstructionRun, attempt: Attempt, notes: list[str]) -> AttemptResult | None:
     """Run an attempt and the second chances of its missing frames; append what happened to the notes."""
     if attempt.checks:
         notes.append(_check_pairs(run, attempt))
@@ -127,7 +127,7 @@ def _try(run: ReconstructionRun, attempt: Attempt, notes: list[str]) -> Candidat
     sound = registered > 2 and not (
         contradicted or drifted
     )  # nothing contradicts a model of no frames
-    return Candidate(sound, contradicted, registered, model, kept, submodels)
+    return AttemptResult(sound, contradicted, registered, model, kept, submodels)
 
 
 def _match_all(run: ReconstructionRun, attempt: Attempt) -> None:

@@ -144,8 +144,8 @@ def _map(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     if counts.get("contradicted"):
         yield VerdictReason(
             Level.STOP,
-            "Matches or fixes contradict the map: parts of it lie at wrong places. Places may look alike; the "
-            "notes on the model name the worst contradiction.",
+            "Matches or fixes contradict the map: parts of it lie at wrong places. Places may look alike; "
+            "the notes on the model name the worst contradiction.",
             "Fly again with more overlap and from farther away, where several places are seen together",
             "spn-data reconstruct VIDEO --add",
         )

@@ -98,7 +98,7 @@ def test_pairs_of_look_alike_places_are_left_out_and_all_others_kept(flight: _Fl
 
 
 def test_two_models_are_not_joined_against_the_fixes(flight: _Flight) -> None:
-    """Where the fixes say that two models lie elsewhere, no pair between them is kept but neighbours in time."""
+    """Of two models that the fixes contradict, only pairs of neighbours in time are kept between them."""
     fixes = flight.centers * 10.0
     fixes[BREAK:] += [0.0, 300.0, 0.0]
     kept = flight.checked(fixes)
