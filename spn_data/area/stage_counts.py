@@ -27,6 +27,7 @@ _KINDS: dict[str, dict[str, Any]] = {
         **dict.fromkeys(("registered", "frames", "points", "observations"), COUNT),
         **dict.fromkeys(("pairs_verified", "pairs_tried"), COUNT),
         **dict.fromkeys(("mean_error_px", "viewing_distance"), KNOWN),
+        "contradicted": FLAG,
         "cameras": {
             "*": {
                 **{"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},

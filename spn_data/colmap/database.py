@@ -6,7 +6,7 @@ Each write is committed at once, so that a killed run loses nothing it has writt
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -303,14 +303,39 @@ class MapDatabase:
         StageError
             If the disk is full.
         """
-        source, cleared = self._native, {self.ids[name] for name in names}
+        cleared = {self.ids[name] for name in names}
+        self._write_copy(target, set(self.ids.values()) - cleared, cleared.isdisjoint)
+
+    def write_with_pairs(self, target: Path, pairs: Collection[tuple[str, str]]) -> None:
+        """Write a copy with all features and only some pairs.
+
+        Parameters
+        ----------
+        target : Path
+            File to write; an existing file is replaced.
+        pairs : collection of (str, str)
+            Pairs of image names to keep, in the order of `verified_pairs`.
+
+        Raises
+        ------
+        StageError
+            If the disk is full.
+        """
+        kept = {(self.ids[first], self.ids[second]) for first, second in pairs}
+        self._write_copy(target, set(self.ids.values()), kept.__contains__)
+
+    def _write_copy(
+        self, target: Path, images: set[int], keeps: Callable[[tuple[int, int]], bool]
+    ) -> None:
+        """Write a copy with the features of some images and the pairs of ids that `keeps` accepts."""
+        source = self._native
         with self._write_images(target, self._path.stat().st_size) as copy:
-            for image_id in set(self.ids.values()) - cleared:
+            for image_id in images:
                 copy.write_keypoints(image_id, source.read_keypoints(image_id))
                 copy.write_descriptors(image_id, source.read_descriptors(image_id))
             for pair_id in source.read_num_matches()[0]:
                 pair = pycolmap.pair_id_to_image_pair(pair_id)
-                if cleared.isdisjoint(pair):
+                if keeps(pair):
                     copy.write_matches(*pair, source.read_matches(*pair))
                     copy.write_two_view_geometry(*pair, source.read_two_view_geometry(*pair))
 

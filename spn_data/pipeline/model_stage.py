@@ -243,6 +243,7 @@ def _counts(
         "shutter": [s.counts() for s in shutters],
         "frames": len(result.registrations),
         "registered": len(registered),
+        "contradicted": result.contradicted,
         "submodels": list(result.submodels),
         "pairs_tried": result.pairs_tried,
         "pairs_verified": result.pairs_verified,

@@ -70,6 +70,11 @@ class Attempt:
         Keep intrinsics fixed until the final bundle adjustment.
     thinned : bool
         Estimate poses from the features with most matches, then triangulate points from all features.
+    hold_focal : bool
+        Keep known focal lengths fixed until the final bundle adjustment.
+    checks : str
+        Name of a database: only those of its pairs are used that agree with models of neighbours in time. If
+        empty, the attempt selects and matches its own pairs.
     """
 
     name: str
@@ -80,6 +85,8 @@ class Attempt:
     missing_features: FeatureOptions
     hold_intrinsics: bool = False
     thinned: bool = False
+    hold_focal: bool = False
+    checks: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,10 +113,11 @@ class Chance:
 
 
 def attempts(options: ReconstructOptions, *, focal_is_known: bool) -> list[Attempt]:
-    """Return the attempts in order: as configured, with fixed intrinsics, with more features and wider pairs.
+    """Return the attempts in order: as configured, with checked pairs, fixed intrinsics, and more features.
 
     Poses from all features take four times as long and have the same accuracy; all features are used only if
-    the first attempt fails. Where a focal length is a guess, it is held only if nothing else gives a model.
+    the first attempt fails. Pairs are checked only if the first attempt is contradicted. Where a focal length
+    is a guess, it is held only if nothing else gives a model.
     """
     features, pairs = options.features, options.pairs
     more = replace(
@@ -121,11 +129,20 @@ def attempts(options: ReconstructOptions, *, focal_is_known: bool) -> list[Attem
     first = Attempt("first", "", "database.db", features, pairs, more, thinned=incremental)
     why = "more features, wider pairs"
     wider = Attempt("more features", why, "database-more-features.db", more, pairs.wider(), more)
+    why = "only pairs that agree with models of neighbours in time"
+    checked = replace(first, name="look-alikes", why=why, database="database-look-alikes.db")
+    checked = replace(checked, checks=first.database)
     if not incremental:
-        return [first, wider]
+        return [first, checked, wider]
     why = "intrinsics held until the end"
     steady = replace(first, name="steady", why=why, hold_intrinsics=True, thinned=False)
-    return [first, steady, wider] if focal_is_known else [first, wider, steady]
+    return [first, checked, *((steady, wider) if focal_is_known else (wider, steady))]
+
+
+def neighbours_attempt(attempt: Attempt) -> Attempt:
+    """Return the mapping of neighbours in time by which the pairs of an attempt are checked."""
+    name = "neighbours"
+    return replace(attempt, name=name, database=f"database-{name}.db", checks="", hold_focal=True)
 
 
 _FEW_MISSING = (
@@ -134,7 +151,12 @@ _FEW_MISSING = (
 
 
 def chances(attempt: Attempt) -> list[Chance]:
-    """Return the second chances of an attempt: wider pairs, then more features if few frames are missing."""
+    """Return the second chances of an attempt: wider pairs, then more features if few frames are missing.
+
+    There are none for checked pairs: more of them would not be checked.
+    """
+    if attempt.checks:
+        return []
     again = Chance(
         "again", "wider pairs for the missing frames", attempt.database, attempt.features, 1.0
     )

@@ -1,10 +1,11 @@
-"""Checks of a model against the matches of its images and the known focal lengths of its cameras."""
+"""Checks of a model against the matches and the fixes of its images, and known focal lengths."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import Scene
@@ -119,3 +120,56 @@ def focal_changes(scene: Scene, frames: FramesToMap, ratio: float) -> list[Focal
         if start.focal_is_known and change.ratio > ratio:
             changes.append(change)
     return sorted(changes, key=lambda one: -one.ratio)
+
+
+@dataclass(frozen=True)
+class ShapeError:
+    """Contradiction between the shape of a model and the fixes of its images.
+
+    Attributes
+    ----------
+    error_m, distance_m : float
+        Medians over all pairs of cameras: of the error of their distance, and of their distance.
+    """
+
+    error_m: float
+    distance_m: float
+
+
+# Median error of distances between cameras, relative to the median distance: at most 0.05 for right models of
+# drone flights with consumer receivers, at least 0.33 where look-alike places were taken for one.
+_MAX_SHAPE_ERROR = 0.25
+_MIN_SHAPE_ERROR_M = 4.0  # that a consumer receiver does not explain
+_MOST_COMPARED = 500  # cameras, evenly chosen
+
+
+def shape_error(centers: np.ndarray, fixes_m: np.ndarray) -> ShapeError | None:
+    """Compare the distances between cameras with those between their fixes.
+
+    No alignment is needed, and what all fixes have in common does not matter.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (N, 3)
+        Camera centres of a model.
+    fixes_m : ndarray, shape (N, 3)
+        Their positions in ENU metres; NaN if unknown.
+
+    Returns
+    -------
+    ShapeError or None
+        None if the fixes do not contradict the model, or are fewer than five.
+    """
+    known = np.flatnonzero(np.isfinite(fixes_m).all(axis=1))
+    known = known[:: max(1, len(known) // _MOST_COMPARED)]
+    if len(known) < 5:
+        return None
+    model, metres = pdist(centers[known]), pdist(fixes_m[known])
+    far = metres >= max(float(np.median(metres)), 1e-6)
+    scale = float(np.median(model[far] / metres[far])) if far.any() else 0.0
+    if scale <= 0:
+        return None
+    error, distance = float(np.median(np.abs(model / scale - metres))), float(np.median(metres))
+    if error <= max(_MIN_SHAPE_ERROR_M, _MAX_SHAPE_ERROR * distance):
+        return None
+    return ShapeError(error, distance)

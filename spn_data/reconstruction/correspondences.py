@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,16 +50,31 @@ class FramesToMap:
     lenses: dict[str, InitialLens]
     masks: dict[str, Path]
 
+    def positions_of(self, names: Sequence[str]) -> np.ndarray:
+        """Return the ENU positions (M, 3) of some of the frames; NaN if unknown."""
+        row = {name: k for k, name in enumerate(self.names)}
+        return self.positions_m[[row[name] for name in names]]
+
     def camera_ids(self, scene: Scene) -> dict[str, int]:
         """Return the ids of the cameras in a model of the frames, by camera key."""
         key_of = dict(zip(self.names, self.cameras.tolist(), strict=True))
         return {key_of[name]: int(i) for name, i in zip(scene.names, scene.camera_ids, strict=True)}
 
 
-def held_cameras(database: Path, frames: FramesToMap) -> dict[int, Hold]:
-    """Return what an adjustment may not change of the cameras, by their ids in a database of the frames."""
-    lenses = _lenses_of(database, frames)
-    return {i: lens.hold for i, lens in lenses.items() if lens.hold is not Hold.NOTHING}
+def held_cameras(
+    database: Path, frames: FramesToMap, known_focals: bool = False
+) -> dict[int, Hold]:
+    """Return what an adjustment may not change of the cameras, by their ids in a database of the frames.
+
+    `known_focals`: hold known focal lengths too.
+    """
+    held: dict[int, Hold] = {}
+    for i, lens in _lenses_of(database, frames).items():
+        if lens.hold is not Hold.NOTHING:
+            held[i] = lens.hold
+        elif known_focals and lens.focal_is_known:
+            held[i] = Hold.FOCAL
+    return held
 
 
 def lens_priors(database: Path, frames: FramesToMap) -> dict[int, LensPrior]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from spn_data.geometry.camera import Camera
 from spn_data.reconstruction.attempts import Attempt
-from spn_data.reconstruction.contradiction import Contradiction, FocalChange
+from spn_data.reconstruction.contradiction import Contradiction, FocalChange, ShapeError
 from spn_data.uncertainty.shared_errors import PrincipalPoint
 
 
@@ -53,6 +53,23 @@ def contradiction_note(wrong: list[Contradiction]) -> str:
     return (
         f"parts of the model are inconsistent: {worst.images[0]} and {worst.images[1]} share "
         f"{worst.matches} matches, but its poses explain only {worst.share:.0%} of them{others}"
+    )
+
+
+def shape_note(error: ShapeError) -> str:
+    """Return how far the shape of a model is from that of its fixes."""
+    return (
+        "fixes contradict the shape of the model: distances between cameras are off by "
+        f"{error.error_m:.1f} m (median; they are {error.distance_m:.1f} m apart), so places that look alike "
+        "may be taken for one, or the fixes belong to another flight"
+    )
+
+
+def checked_note(kept: int, pairs: int) -> str:
+    """Return how many pairs were left out because their images may show different places."""
+    return (
+        f"{pairs - kept} of {pairs} pairs were left out: models of neighbours in time say that their images "
+        "show different places that look alike, or do not say that they show the same place"
     )
 
 

@@ -141,6 +141,14 @@ def _map(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
         )
     else:
         yield VerdictReason(Level.GOOD, text + ".")
+    if counts.get("contradicted"):
+        yield VerdictReason(
+            Level.STOP,
+            "Matches or fixes contradict the map: parts of it lie at wrong places. Places may look alike; "
+            "the notes on the model name the worst contradiction.",
+            "Fly again with more overlap and from farther away, where several places are seen together",
+            "spn-data reconstruct VIDEO --add",
+        )
     error = float(counts["mean_error_px"])
     text = f"The mean reprojection error is {error:.2f} px"
     if error > limits.max_error_px:

@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner, Result
 from spn_cli.data import main
 
-import spn_data.reconstruction.reconstruct
+import spn_data.reconstruction.best_attempt
 from spn_data.area.area import Area
 from spn_data.area.names import FRAMES, GEO, MODEL
 from spn_data.capture.frames import read_frames
@@ -240,18 +240,20 @@ def test_no_surprise_is_told_of_a_focal_length_that_was_given_rightly(finished_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("judge", "wrong", "words"),
+    ("judge", "wrong", "words", "retried"),
     [
         (
             "contradictions",
             Contradiction(("flight1/000001.jpg", "flight1/000002.jpg"), 500, 0.02),
             "parts of the model are inconsistent: flight1/000001.jpg and flight1/000002.jpg share 500 "
             "matches, but its poses explain only 2% of them",
+            ["look-alikes", "steady", "more features"],
         ),
         (
             "focal_changes",
             FocalChange("flight1", 220.0, 767.8),
             "the focal lengths drifted: flight1 from 220 to 768 px",
+            ["steady", "more features"],
         ),
     ],
 )
@@ -263,18 +265,23 @@ def test_a_model_that_is_contradicted_is_made_again(
     judge: str,
     wrong: object,
     words: str,
+    retried: list[str],
     stays: bool,
 ) -> None:
     """A model judged wrong is reconstructed again, until it is accepted or all attempts fail, with notes."""
-    answers = [[wrong]] * 3 if stays else [[wrong], []]
-    monkeypatch.setattr(spn_data.reconstruction.reconstruct, judge, lambda *_: answers.pop(0))
+    expected = retried if stays else retried[:1]
+    answers = [[wrong], *([[wrong]] * len(retried) if stays else [[]])]
+    monkeypatch.setattr(spn_data.reconstruction.best_attempt, judge, lambda *_: answers.pop(0))
     result = run("reconstruct", flight1, "--area", tmp_path / "area", *FAST)
     assert result.exit_code == 0, result.output
     assert answers == []
     notes = Area(tmp_path / "area").record(MODEL).notes
-    assert notes.count(words) == (3 if stays else 1)
-    assert any(note.startswith("steady attempt") for note in notes)
-    assert any(note.startswith("more features attempt") for note in notes) == stays
+    assert Area(tmp_path / "area").record(MODEL).counts["contradicted"] == (
+        stays and judge == "contradictions"
+    )
+    assert notes.count(words) == (1 + len(retried) if stays else 1)
+    made = [note.split(" attempt")[0] for note in notes if " attempt" in note]
+    assert made == ["first", *expected]
 
 
 _MISPLACED = "flight1/000008.jpg"
@@ -284,7 +291,7 @@ _MISPLACED = "flight1/000008.jpg"
 def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Deregister one frame of the first model as misplaced; the list collects the real judgements."""
     judged: list[list[str]] = []
-    drop: Callable[..., list[str]] = spn_data.reconstruction.reconstruct.drop_misplaced
+    drop: Callable[..., list[str]] = spn_data.reconstruction.best_attempt.drop_misplaced
 
     def drop_one(source: Path, target: Path, matches: dict[tuple[str, str], int]) -> list[str]:
         judged.append(drop(source, target, matches))
@@ -296,7 +303,7 @@ def misplaced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         write_native(model, target)
         return [_MISPLACED]
 
-    monkeypatch.setattr(spn_data.reconstruction.reconstruct, "drop_misplaced", drop_one)
+    monkeypatch.setattr(spn_data.reconstruction.best_attempt, "drop_misplaced", drop_one)
     return judged
 
 
@@ -319,7 +326,7 @@ def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_p
     flight1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run stopped when the database has more matches than the first model used ends with the same poses."""
-    match = spn_data.reconstruction.reconstruct.match_missing
+    match = spn_data.reconstruction.best_attempt.match_missing
     matched = []
 
     def match_and_stop(*arguments: Any) -> None:
@@ -330,7 +337,7 @@ def test_a_run_that_is_stopped_before_its_second_chance_maps_comes_to_the_same_p
 
     whole, area = Area(tmp_path / "whole"), Area(tmp_path / "area")
     assert run("reconstruct", flight1, "--area", whole.root, *FAST).exit_code == 0
-    monkeypatch.setattr(spn_data.reconstruction.reconstruct, "match_missing", match_and_stop)
+    monkeypatch.setattr(spn_data.reconstruction.best_attempt, "match_missing", match_and_stop)
     assert run("reconstruct", flight1, "--area", area.root, *FAST).exit_code == 130
     result = run("reconstruct", flight1, "--area", area.root, *FAST)
     assert result.exit_code == 0, result.output

@@ -15,7 +15,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_vectors
-from spn_data.reconstruction.contradiction import contradictions, focal_changes
+from spn_data.reconstruction.contradiction import contradictions, focal_changes, shape_error
 from spn_data.reconstruction.correspondences import FramesToMap
 
 
@@ -110,3 +110,21 @@ def test_a_known_focal_length_that_comes_out_far_off_speaks_against_a_model(
     for change in changes:
         assert change.ratio == pytest.approx(max(factor, 1 / factor))
         assert change.estimated_px / change.known_px == pytest.approx(factor)
+
+
+def test_fixes_contradict_a_model_of_another_shape_and_no_model_of_the_same_one() -> None:
+    """Noise, scale and a common offset of fixes do not contradict a model; a misplaced part does."""
+    rng = np.random.default_rng(0)
+    path = np.column_stack(
+        [np.linspace(0, 60, 80), 5 * np.sin(np.arange(80) / 9), np.full(80, 12.0)]
+    )
+    fixes = path + rng.normal(0, 1.5, path.shape) + [300.0, -20.0, 7.0]
+    assert shape_error(path / 7.3, fixes) is None
+    folded = path.copy()
+    folded[40:, 0] = 60 - folded[40:, 0]  # the second half of a street taken for the first
+    error = shape_error(folded / 7.3, fixes)
+    assert error is not None
+    assert error.error_m > 4
+    assert 15 < error.distance_m < 30
+    fixes[4:] = np.nan
+    assert shape_error(folded, fixes) is None

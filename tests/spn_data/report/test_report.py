@@ -85,6 +85,11 @@ RULES = {
     "no model": (lambda d: replace(d, model_record=None), Level.STOP, "There is no model"),
     "stale": (lambda d: replace(d, stages=STALE), Level.STOP, "3-geo is out of date: 2-model was"),
     "map has holes": (lambda d: with_counts(d, registered=140), Level.CAUTION, "140 of 150"),
+    "map is contradicted": (
+        lambda d: with_counts(d, contradicted=True),
+        Level.STOP,
+        "parts of it lie at wrong places",
+    ),
     "map is a ruin": (lambda d: with_counts(d, registered=118), Level.STOP, "118 of 150"),
     "blur": (
         lambda d: with_counts(d, mean_error_px=1.2),
