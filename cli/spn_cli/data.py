@@ -139,15 +139,17 @@ main.add_command(report)
 @main.command()
 @options.area
 def status(area_folder: Path) -> None:
-    """Show the stages and runs of the area, and which of them are stale.
+    """Show the stages and runs of the area, which of them are stale, and the next step.
 
     \b
     Example:
         spn-data status --area fields/north
     """
-    from spn_cli import show
+    from spn_cli import page, show
 
-    show.status(options.open_area(area_folder))
+    area = options.open_area(area_folder)
+    show.status(area)
+    page.show_judgement(area)
 
 
 @main.command()

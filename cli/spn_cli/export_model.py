@@ -64,6 +64,7 @@ def export(
     Example:
         spn-model export --area fields/north --run first
     """
+    from spn_cli import page
     from spn_data.inputs.landmark_source import read_landmark_source
     from spn_model.export.bundle_checks import BundleOptions
     from spn_model.runs.run_export import export_run
@@ -92,13 +93,14 @@ def export(
         console.note(note)
     if exported.bundle is None:
         console.out.print(f"{exported.folder}: unchanged, made from the same network and options.")
-        return
-    _show(exported.bundle)
-    if not exported.is_evaluated:
-        console.note(
-            f"the run was not evaluated, so its model card contains no errors: run spn-model evaluate "
-            f"--run {name}, then export again with --overwrite."
-        )
+    else:
+        _show(exported.bundle)
+        if not exported.is_evaluated:
+            console.note(
+                f"the run was not evaluated, so its model card contains no errors: run spn-model evaluate "
+                f"--run {name}, then export again with --overwrite."
+            )
+    page.refresh_if_free(area)
 
 
 def _show(made: ExportedBundle) -> None:

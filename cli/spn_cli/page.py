@@ -11,7 +11,7 @@ from spn_data.area.names import FRAMES, REPORT
 from spn_data.errors import InUseError, SpnError
 
 if TYPE_CHECKING:
-    from spn_data.report.verdict import AreaVerdict
+    from spn_data.report.verdict import AreaVerdict, VerdictReason
 
 
 def refresh(area: Area) -> None:
@@ -19,11 +19,12 @@ def refresh(area: Area) -> None:
     from spn_data.pipeline.area_report import write_report
 
     try:
-        path, verdict = write_report(area)
+        path, verdict, step = write_report(area)
     except SpnError as error:
         console.note(f"{REPORT} could not be written: {error}")
         return
-    show_verdict(path, verdict)
+    show_verdict(verdict, path)
+    show_next(step, area)
 
 
 def refresh_if_free(area: Area) -> None:
@@ -39,10 +40,32 @@ def refresh_if_free(area: Area) -> None:
         )
 
 
-def show_verdict(path: Path, verdict: AreaVerdict) -> None:
-    """Print the verdict and the next step."""
-    console.out.print(f"{verdict.headline}: see {path}.")
-    if step := verdict.next_step:
-        console.out.print(
-            f"Next: {step.do}{': ' if step.do and step.command else ''}{step.command}"
-        )
+def show_judgement(area: Area) -> None:
+    """Print the verdict and the next step of an area with frames; say why if they are not known."""
+    from spn_data.pipeline.area_report import judge_area
+
+    if not area.has(FRAMES):
+        return
+    try:
+        verdict, step = judge_area(area)
+    except SpnError as error:
+        console.note(f"there is no verdict: {error}")
+        return
+    show_verdict(verdict)
+    show_next(step, area)
+
+
+def show_verdict(verdict: AreaVerdict, path: Path | None = None) -> None:
+    """Print the verdict, and the page with its reasons if it was written."""
+    console.out.print(f"{verdict.headline}{f': see {path}' if path else ''}.")
+
+
+def show_next(step: VerdictReason, area: Area) -> None:
+    """Print the next step: one line that can be typed in the current folder."""
+    from spn_data.report.next_step import command_for
+
+    root, here = area.root.resolve(), Path.cwd()
+    where = root.relative_to(here) if root.is_relative_to(here) else root
+    command = command_for(step.command, where)
+    words = f"Next: {step.do}{': ' if step.do and command else ''}{command}"
+    console.out.print(words, soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -84,6 +85,8 @@ def train(
     """
     from spn_cli import page
     from spn_cli.show_training import TrainingDisplay, errors_table
+    from spn_data.area.names import FRAMES
+    from spn_data.report.verdict import Level, VerdictReason
     from spn_model.runs.run_files import RunFiles
     from spn_model.runs.run_training import TrainRequest, train_run
     from spn_model.training.recipe import read_recipe
@@ -117,9 +120,12 @@ def train(
     errors_table(trained.facts, trained.unit)
     if trained.is_new:
         console.out.print(
-            f"{run.folder}: {run.checkpoint.name}, {run.log.name}. "
-            f"Next: spn-model evaluate --run {run.name}",
+            f"{run.folder}: {run.checkpoint.name}, {run.log.name}.",
             soft_wrap=True,
         )
+    if not area.has(FRAMES):  # the data set is of another area, or imported
+        words = ["spn-model", "evaluate", *([str(dataset)] if dataset else []), "--run", run.name]
+        do = "Evaluate the network on frames that it was not trained on"
+        page.show_next(VerdictReason(Level.GOOD, "", do, shlex.join(words)), area)
     # Also after a training that was complete: the run that finished it may have been killed before this.
     page.refresh_if_free(area)

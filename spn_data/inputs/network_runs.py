@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from spn_data.area.area import Area
-from spn_data.area.names import CHECKPOINT, COMPARED, DATASET, FIGURES, METRICS, RUNS, SPLIT
+from spn_data.area.names import BUNDLE, CHECKPOINT, COMPARED, DATASET, FIGURES, METRICS, RUNS, SPLIT
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
+from spn_data.report.network_state import NetworkState
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json
 
@@ -58,6 +59,25 @@ def read_runs(area: Area) -> tuple[tuple[RunFacts, ...], tuple[str, ...]]:
     if len(names) > _MAX_RUNS:
         broken.append(f"{len(names) - _MAX_RUNS} more runs are not shown.")
     return tuple(found), tuple(broken)
+
+
+def trained_runs(area: Area, runs: Sequence[RunFacts]) -> tuple[NetworkState, ...]:
+    """Return the state of the trained networks of an area, the newest first; `runs` are evaluated ones."""
+    evaluated = {
+        name for run in runs if run.is_current and not run.is_outdated for name in run.networks
+    }
+    found = []
+    for name in area.sequences(RUNS):
+        folder = area.root / RUNS / name
+        checkpoint, bundle = folder / CHECKPOINT, folder / BUNDLE
+        if not checkpoint.is_file():
+            continue
+        made = checkpoint.stat().st_mtime
+        has_bundle = bundle.is_dir()
+        is_exported = has_bundle and bundle.stat().st_mtime >= made
+        path = f"{RUNS}/{name}/{BUNDLE}"
+        found.append((made, NetworkState(name, path, name in evaluated, has_bundle, is_exported)))
+    return tuple(run for _, run in sorted(found, key=lambda one: (-one[0], one[1].name)))
 
 
 def _read(folder: Path, current: str, budget: int) -> RunFacts:

@@ -32,13 +32,14 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
-from spn_data.inputs.network_runs import read_runs
+from spn_data.inputs.network_runs import read_runs, trained_runs
 from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
-from spn_data.report.verdict import AreaVerdict, verdict
+from spn_data.report.next_step import next_step
+from spn_data.report.verdict import AreaVerdict, VerdictReason, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
@@ -53,7 +54,9 @@ class ReportOptions:
     max_frames: int = 30_000
 
 
-def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, AreaVerdict]:
+def write_report(
+    area: Area, options: ReportOptions | None = None
+) -> tuple[Path, AreaVerdict, VerdictReason]:
     """Write report.html in the area's folder, replacing an earlier one.
 
     Stale stages are named but otherwise left out.
@@ -69,6 +72,8 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
         The page.
     verdict : AreaVerdict
         Whether the area is ready for training.
+    next : VerdictReason
+        The next step.
 
     Raises
     ------
@@ -81,7 +86,17 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
     path, data = area.root / REPORT, report_data(area)
     html = render(data, max_points=options.max_points, max_frames=options.max_frames)
     write_atomically(path, html)
-    return path, verdict(data)
+    return path, *_judged(data)
+
+
+def judge_area(area: Area) -> tuple[AreaVerdict, VerdictReason]:
+    """Return the verdict on an area and the next step; raises the same errors as `write_report`."""
+    return _judged(report_data(area))
+
+
+def _judged(data: ReportData) -> tuple[AreaVerdict, VerdictReason]:
+    judged = verdict(data)
+    return judged, next_step(judged, data.trained)
 
 
 class _FreshStages(Area):
@@ -152,6 +167,7 @@ def report_data(area: Area) -> ReportData:
         },
         runs=runs,
         broken_runs=broken_runs,
+        trained=trained_runs(area, runs),
     )
 
 

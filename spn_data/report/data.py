@@ -15,6 +15,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
+from spn_data.report.network_state import NetworkState
 from spn_data.split import audit
 from spn_data.split.groups import Split
 from spn_data.storage.stage_record import StageRecord
@@ -358,6 +359,8 @@ class ReportData:
         Evaluated networks.
     broken_runs : tuple of str
         Why other runs cannot be shown.
+    trained : tuple of NetworkState
+        Trained networks, the newest first.
     """
 
     title: str
@@ -378,6 +381,7 @@ class ReportData:
     evaluation_records: dict[str, StageRecord] = field(default_factory=dict)
     runs: tuple[RunFacts, ...] = ()
     broken_runs: tuple[str, ...] = ()
+    trained: tuple[NetworkState, ...] = ()
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
 from spn_data.report.scene import pack_scene
 from spn_data.report.thinning import thin_frames
-from spn_data.report.verdict import verdict
 
 _SCRIPTS = ("data", "draw", "view", "timeline", "table", "main")
 
@@ -39,7 +38,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
     sections_by_name = {
         "title": escape(data.title),
         "heading": sections.heading(data),
-        "verdict": sections.verdict_box(verdict(data)),
+        "verdict": sections.verdict_box(data),
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data) + sections.control(data),

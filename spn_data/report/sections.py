@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
 from spn_data.report.figures import format_value
+from spn_data.report.next_step import command_for, next_step
 from spn_data.report.residual_map import residual_map
-from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
+from spn_data.report.verdict import Level, VerdictReason, verdict
 from spn_data.split import audit
 from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import limitations
@@ -38,29 +40,31 @@ def heading(data: ReportData) -> str:
     )
 
 
-def verdict_box(verdict: AreaVerdict) -> str:
+def verdict_box(data: ReportData) -> str:
     """Return the verdict, the next step, and the findings."""
-    mark = _MARKS[verdict.level][0]
-    step = verdict.next_step
-    next_step = f'<p class="next"><b>Next:</b> {_what_to_do(step)}</p>' if step else ""
-    findings = "".join(_finding(f, is_next=f is step) for f in verdict.findings)
+    judged, area = verdict(data), Path(data.path)
+    mark = _MARKS[judged.level][0]
+    step = next_step(judged, data.trained)
+    next_line = f'<p class="next"><b>Next:</b> {_what_to_do(step, area)}</p>'
+    findings = "".join(_finding(f, area, is_next=f is step) for f in judged.findings)
     return (
-        f'<section id="verdict" class="{verdict.level}"><h2><span class="mark">{mark}</span>'
-        f"{escape(verdict.headline)}</h2>{next_step}<ul>{findings}</ul></section>"
+        f'<section id="verdict" class="{judged.level}"><h2><span class="mark">{mark}</span>'
+        f"{escape(judged.headline)}</h2>{next_line}<ul>{findings}</ul></section>"
     )
 
 
-def _finding(finding: VerdictReason, *, is_next: bool) -> str:
+def _finding(finding: VerdictReason, area: Path, *, is_next: bool) -> str:
     mark, word = _MARKS[finding.level]
-    do = "" if is_next else _what_to_do(finding)
+    do = "" if is_next else _what_to_do(finding, area)
     return (
         f'<li class="{finding.level}"><span class="mark" title="{word}">{mark}</span>'
         f"<span>{escape(finding.text)}{f' <em>{do}</em>' if do else ''}</span></li>"
     )
 
 
-def _what_to_do(finding: VerdictReason) -> str:
-    code = f"<code>{escape(finding.command)}</code>" if finding.command else ""
+def _what_to_do(finding: VerdictReason, area: Path) -> str:
+    command = command_for(finding.command, area)
+    code = f"<code>{escape(command)}</code>" if command else ""
     return f"{escape(finding.do)}{': ' if finding.do and code else '.' if finding.do else ''}{code}"
 
 

@@ -48,11 +48,6 @@ class AreaVerdict:
     headline: str
     findings: tuple[VerdictReason, ...]
 
-    @property
-    def next_step(self) -> VerdictReason | None:
-        """First finding that has a remedy."""
-        return next((f for f in self.findings if f.do or f.command), None)
-
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictLimits:

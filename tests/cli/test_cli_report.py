@@ -67,7 +67,16 @@ def test_the_command_tells_the_verdict(area):
     """The verdict of the page and the next step are also printed."""
     ran = run(area)
     assert "Not ready to train: 1 thing to do first: see" in ran.output
-    assert "Next: Split the frames: spn-data split" in ran.output
+    assert ran.output.endswith(f"Next: Split the frames: spn-data split --area {area}\n")
+
+
+def test_the_status_ends_with_the_next_step_for_the_current_folder(area, monkeypatch):
+    """The status ends with a command that can be typed where it was run: in the area, and above it."""
+    for here, option in ((area, ""), (area.parent, f" --area {area.name}")):
+        monkeypatch.chdir(here)
+        ran = CliRunner().invoke(main, ["status", "--area", str(area)])
+        assert ran.exit_code == 0, ran.output
+        assert ran.output.endswith(f"Next: Split the frames: spn-data split{option}\n")
 
 
 def test_a_stale_stage_is_named_and_left_out(area):

@@ -1,0 +1,59 @@
+"""The next step for the state of an area: what stands in the way, then train, evaluate, export and fly."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from spn_data.report.network_state import NetworkState
+from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
+
+_IN_AREA = "AREA/"  # in commands: the folder of the area
+
+
+def next_step(verdict: AreaVerdict, trained: Sequence[NetworkState]) -> VerdictReason:
+    """Return the next step.
+
+    Parameters
+    ----------
+    verdict : AreaVerdict
+    trained : sequence of NetworkState
+        Trained networks, the newest first.
+
+    Returns
+    -------
+    VerdictReason
+        The first finding that has to be dealt with before training, otherwise the step that follows in the
+        life of the newest network. Reservations stop nobody and keep their own remedies.
+    """
+    for finding in verdict.findings:
+        if finding.level is Level.STOP and (finding.do or finding.command):
+            return finding
+    if not trained:
+        return VerdictReason(Level.GOOD, "", "Train a network", "spn-model train")
+    run = trained[0]
+    name = shlex.quote(run.name)
+    if not run.is_evaluated:
+        do = f"Evaluate the network {run.name} on frames that it was not trained on"
+        return VerdictReason(Level.GOOD, "", do, f"spn-model evaluate --run {name}")
+    if not run.is_exported:
+        do = f"Export the network {run.name} with its landmarks"
+        again = " --overwrite" if run.has_bundle else ""
+        return VerdictReason(Level.GOOD, "", do, f"spn-model export --run {name}{again}")
+    bundle = f"{_IN_AREA}{run.bundle}"
+    do = f"Fly a recorded flight with the bundle of {run.name}"
+    command = f"spn-onboard fly {shlex.quote(bundle)} VIDEO --camera CAMERA.json --to fixes.jsonl"
+    return VerdictReason(Level.GOOD, "", do, command)
+
+
+def command_for(command: str, area: Path) -> str:
+    """Return a command that can be typed where the path `area` leads to the area; "." needs no option."""
+    if command.startswith("spn-onboard"):  # has no option for an area
+        words = (
+            str(area / word.removeprefix(_IN_AREA)) if word.startswith(_IN_AREA) else word
+            for word in shlex.split(command)
+        )
+        return shlex.join(words)
+    takes_area = command.startswith("spn-") and area != Path(".")
+    return f"{command} --area {shlex.quote(str(area))}" if takes_area else command
