@@ -9,9 +9,10 @@ import threading
 import cv2  # noqa: F401  (must be loaded first)
 import pycolmap
 
-# Keep COLMAP's log off the terminal; child processes write theirs to a log file.
+# Keep COLMAP's log off the terminal; the standard error of child processes is a log file. Otherwise COLMAP
+# makes log files of its own, in the folder for temporary files or, if it is read-only, in the current one.
 pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-pycolmap.logging.alsologtostderr = False
+pycolmap.logging.logtostderr = True
 
 # Its import replaces the handler of SIGTERM by one that prints a native stack trace.
 if threading.current_thread() is threading.main_thread():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -419,3 +422,20 @@ def test_poses_survive_the_way_through_colmaps_convention() -> None:
     error, error_deg = pose_errors(again, poses)
     assert error.max() < 1e-12
     assert error_deg.max() < 1e-10
+
+
+def test_colmap_logs_to_standard_error_and_makes_no_files(tmp_path: Path) -> None:
+    """A message of COLMAP is written to standard error, and to no file of its own."""
+    program = (
+        "from spn_data.colmap import pycolmap\npycolmap.logging.error('something went wrong')\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "something went wrong" in ran.stderr
+    assert list(tmp_path.iterdir()) == []
