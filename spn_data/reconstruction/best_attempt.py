@@ -65,12 +65,17 @@ class ReconstructionRun:
 class AttemptResult:
     """Result of one attempt."""
 
-    sound: bool  # whether nothing contradicts it
+    objections: tuple[str, ...]  # to the model, in sentences
     contradicted: bool  # by the matches of its images or by their fixes
     registered: int
     model: Path
     database: str
-    submodels: tuple[int, ...]
+    submodels: tuple[int, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        """Whether there is a model and nothing contradicts it."""
+        return self.registered > 2 and not self.objections
 
     @property
     def rank(self) -> tuple[bool, int]:
@@ -110,24 +115,28 @@ def _try(run: ReconstructionRun, attempt: Attempt, notes: list[str]) -> AttemptR
     if not models:
         return None
     model, kept = _settled(run, attempt, models[0], notes), attempt.database
-    if count_registered(model) > 2 and chances(attempt):
+    found = _judged(run, model, kept)
+    is_incomplete = 2 < found.registered < len(run.frames.names)
+    if is_incomplete and not found.contradicted and chances(attempt):
         model, kept = _second_chances(run, attempt, model, notes)
-    registered, scene = count_registered(model), read_scene(model)
-    with MapDatabase.open(run.work / kept) as database:
-        wrong = contradictions(database, scene)
-    drifted = focal_changes(scene, run.frames, _DRIFTED)
+        found = _judged(run, model, kept)
+    notes += found.objections
+    return replace(found, submodels=submodels)
+
+
+def _judged(run: ReconstructionRun, model: Path, database: str) -> AttemptResult:
+    """Check a model against the matches and fixes of its images and the focal lengths of its cameras."""
+    scene = read_scene(model)
+    with MapDatabase.open(run.work / database) as opened:
+        wrong = contradictions(opened, scene)
     shape = shape_error(scene.poses.centers, run.frames.positions_of(scene.names))
-    if wrong:
-        notes.append(contradiction_note(wrong))
-    if shape:
-        notes.append(shape_note(shape))
-    if drifted:
-        notes.append(drift_note(drifted))
-    contradicted = bool(wrong or shape)
-    sound = registered > 2 and not (
-        contradicted or drifted
-    )  # nothing contradicts a model of no frames
-    return AttemptResult(sound, contradicted, registered, model, kept, submodels)
+    drifted = focal_changes(scene, run.frames, _DRIFTED)
+    objections = [
+        *([contradiction_note(wrong)] if wrong else []),
+        *([shape_note(shape)] if shape else []),
+        *([drift_note(drifted)] if drifted else []),
+    ]
+    return AttemptResult(tuple(objections), bool(wrong or shape), len(scene.names), model, database)
 
 
 def _match_all(run: ReconstructionRun, attempt: Attempt) -> None:
@@ -165,8 +174,6 @@ def _second_chances(
 ) -> tuple[Path, str]:
     """Return the model with the frames that the second chances of an attempt connect, and its database."""
     n, registered, kept = len(run.frames.names), count_registered(model), attempt.database
-    if registered == n:
-        return model, kept
     with MapDatabase.open(run.work / attempt.database) as database:
         wider = _pairs(run, database, attempt.pairs.wider())
     for chance in chances(attempt):

@@ -425,10 +425,17 @@ def test_poses_survive_the_way_through_colmaps_convention() -> None:
 
 
 def test_colmap_logs_to_standard_error_and_makes_no_files(tmp_path: Path) -> None:
-    """A message of COLMAP is written to standard error, and to no file of its own."""
-    program = (
-        "from spn_data.colmap import pycolmap\npycolmap.logging.error('something went wrong')\n"
-    )
+    """COLMAP writes its log to standard error and to no file; its adjustments reset other switches."""
+    program = """
+import sys
+from spn_data.colmap import pycolmap
+pycolmap.logging.minloglevel = pycolmap.logging.Level.INFO.value
+options = pycolmap.SyntheticDatasetOptions(
+    num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4, num_points3D=50
+)
+pycolmap.bundle_adjustment(pycolmap.synthesize_dataset(options))
+pycolmap.logging.error("something went wrong")
+"""
     ran = subprocess.run(
         [sys.executable, "-c", program],
         cwd=tmp_path,
@@ -437,5 +444,6 @@ def test_colmap_logs_to_standard_error_and_makes_no_files(tmp_path: Path) -> Non
         text=True,
         check=True,
     )
+    assert "Global bundle adjustment" in ran.stderr
     assert "something went wrong" in ran.stderr
     assert list(tmp_path.iterdir()) == []
