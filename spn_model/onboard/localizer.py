@@ -16,7 +16,8 @@ from spn_data.geometry.camera_file import SHAPE_TOLERANCE
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
-from spn_data.geometry.rotations import canonical_quats
+from spn_data.geometry.rotations import canonical_quats, rotations_from_vectors
+from spn_model.landmarks.solver import KnownVertical, tilt_sigmas, vertical_terms
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -27,7 +28,7 @@ from spn_model.onboard.bundle import (
     read_bundle,
     verified_path,
 )
-from spn_model.onboard.decoding import decode
+from spn_model.onboard.decoding import MAX_TILT_SIGMAS, decode, tilt_reason
 
 # Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
 # Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
@@ -113,7 +114,14 @@ class Localizer:
         self._check_graph(path)
         self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
 
-    def localize(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> Located:
+    def localize(
+        self,
+        image: np.ndarray,
+        camera: Camera,
+        *,
+        rgb: bool = False,
+        vertical: KnownVertical | None = None,
+    ) -> Located:
         """Estimate the pose of an image.
 
         Parameters
@@ -124,6 +132,8 @@ class Localizer:
             Its camera with distortion; scaled if its size differs but its aspect ratio is the same.
         rgb : bool
             Whether the image is RGB.
+        vertical : KnownVertical, optional
+            Up in the camera.
 
         Returns
         -------
@@ -138,7 +148,7 @@ class Localizer:
         """
         seen = self.view(image, camera, rgb=rgb)
         reason = missing_texture(image)
-        return Located.failed(reason) if reason else self.decode(self.run(seen))
+        return Located.failed(reason) if reason else self.decode(self.run(seen), vertical=vertical)
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.
@@ -179,7 +189,12 @@ class Localizer:
         found: list[np.ndarray] = self.session.run(self.bundle.decoding.outputs, {INPUT: images})
         return found
 
-    def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
+    def decode(
+        self,
+        outputs: list[np.ndarray],
+        matrix: np.ndarray | None = None,
+        vertical: KnownVertical | None = None,
+    ) -> Located:
         """Convert outputs of the network to a pose in the world.
 
         Parameters
@@ -188,6 +203,8 @@ class Localizer:
             As `run` returns them.
         matrix : ndarray, shape (3, 3), optional
             Camera matrix K of the image, if it is not that of the bundle's camera.
+        vertical : KnownVertical, optional
+            Up in the camera.
 
         Returns
         -------
@@ -195,7 +212,7 @@ class Localizer:
         """
         by, offset = self.bundle.decoding, self.bundle.view.offset
         if isinstance(by, PoseDecoding):
-            found = _decode_regression(by, *outputs)
+            found = _levelled(_decode_regression(by, *outputs), vertical)
             return Located(found.poses.moved_by(offset), found.covariance, found.reason)
         coordinates, log_scale = outputs
         try:
@@ -206,6 +223,7 @@ class Localizer:
                 first_px=by.first_px,
                 stride_px=by.stride_px,
                 options=by.options,
+                vertical=vertical,
             )
         except GeometryError as error:
             return Located.failed(str(error))
@@ -282,3 +300,18 @@ def _decode_regression(
         return Located.failed("the network's output is not a valid pose")
     covariance = np.diag(np.exp(2 * log_std[0].astype(np.float64)))
     return Located(Poses(x[None] + decoding.center, canonical_quats(q[None])), covariance)
+
+
+def _levelled(found: Located, vertical: KnownVertical | None) -> Located:
+    """Add a known vertical to a regressed pose, weighted by their covariances, to first order."""
+    if vertical is None or found.reason:
+        return found
+    rotation = found.poses.rotations[0]
+    tilt = tilt_sigmas(vertical, rotation, found.covariance)
+    if tilt > MAX_TILT_SIGMAS:
+        return Located.failed(tilt_reason(tilt))
+    by, off = vertical_terms(vertical, rotation)
+    covariance = np.linalg.inv(np.linalg.inv(found.covariance) + by.T @ by)
+    step = -covariance @ by.T @ off
+    rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
+    return Located(Poses.from_rotations(found.poses.centers + step[:3], rotation[None]), covariance)
