@@ -18,6 +18,7 @@ from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.link import FixSink, open_link
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
+from spn_model.onboard.attitude import BODY, CAMERA, GIMBAL, add_options, attitude_of
 from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.sources import check_sources, frames
@@ -55,7 +56,8 @@ def fly(arguments: list[str]) -> None:
         else Datum(origin=view.origin, geoid_height_m=given.geoid_height)
     )
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
-    report = FlightReport()
+    attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
+    report, images, known = FlightReport(), 0, 0
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
@@ -66,11 +68,16 @@ def fly(arguments: list[str]) -> None:
             stack.callback(sink.close)
         for number, time_s, image in frames(given.source):
             seconds = number / given.fps if math.isnan(time_s) else time_s
-            item: Fix | NoFix = pilot.fix(image, _FIRST_US + round(1e6 * seconds))
+            vertical = None if attitude is None else attitude.at(seconds)
+            images, known = images + 1, known + (vertical is not None)
+            item: Fix | NoFix = pilot.fix(image, _FIRST_US + round(1e6 * seconds), vertical)
             report.add(item)
             for sink in sinks:
                 sink.send(item)
-    for line in report.lines():
+    lines = report.lines()
+    if attitude is not None:
+        lines.append(attitude.coverage(known, images))
+    for line in lines:
         sys.stdout.write(line + "\n")
 
 
@@ -95,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("FORWARD", "RIGHT", "DOWN"),
         help="of the camera from the body's centre, m",
     )
+    add_options(parser, (GIMBAL, CAMERA, BODY))
     parser.add_argument("--geoid-height", type=float, help="of the place, m above the ellipsoid")
     parser.add_argument("--fps", type=float, default=10.0, help="where images state no time")
     parser.add_argument("--no-network", action="store_true", help="search by landmarks alone")
