@@ -19,8 +19,8 @@ import click
 def telemetry(file: Path, target: Path) -> None:
     """Write the telemetry of a flight as one CSV table.
 
-    FILE is a log, a subtitle file, or a video that holds telemetry. Times are seconds on the clock of FILE. The
-    table is what spn-onboard reads as --attitude.
+    FILE is a log, a subtitle file, or a video that holds telemetry. Times are seconds on its clock. The table
+    is what spn-onboard reads as --attitude.
 
     \b
     Example:
@@ -39,8 +39,8 @@ def telemetry(file: Path, target: Path) -> None:
     write_track(target, track)
     angles = int(np.isfinite(track.gimbal_deg[:, 1:]).all(axis=1).sum())
     console.out.print(
-        f"{target}: {len(track)} records ({track.kind}), {int(track.has_fix.sum())} with a position, {angles} "
-        "with pitch and roll of the camera."
+        f"{target}: {len(track)} records ({track.kind}), {int(track.has_fix.sum())} with a position, "
+        f"{angles} with pitch and roll of the camera."
     )
     for note in track.notes:
         console.note(note)

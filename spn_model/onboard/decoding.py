@@ -16,7 +16,7 @@ from spn_model.landmarks.solver import KnownVertical, pose_by_ransac, tilt_sigma
 # few pixels still converges.
 _ROBUST_SCALES = (4.0, 2.0, *[1.0] * 10)
 _CONVERGED_PX = 1e-3
-MAX_TILT_SIGMAS = 5.0  # between a known vertical and the network
+_MAX_TILT_SIGMAS = 5.0  # between a known vertical and the network
 _MIN_SLOPE = 0.2  # bounds the growth of the covariance (1 / slope^2) if cells contradict each other
 
 
@@ -146,9 +146,7 @@ def decode(
     found = _refined(xyz, sigma_m, at, matrix, *first, options)
     if vertical is None:
         return found
-    tilt = tilt_sigmas(vertical, found.poses.rotations[0], found.covariance)
-    if tilt > MAX_TILT_SIGMAS:
-        raise GeometryError(tilt_reason(tilt))
+    _check_tilt(found.poses, found.covariance, vertical)
     return _refined(xyz, sigma_m, at, matrix, *first, options, vertical)
 
 
@@ -208,9 +206,43 @@ def _refined(
     )
 
 
-def tilt_reason(sigmas: float) -> str:
-    """Return why a pose of the network is none that contradicts a known vertical."""
-    return f"the network contradicts the known vertical by {sigmas:.1f} standard deviations"
+def with_vertical(
+    poses: Poses, covariance: np.ndarray, vertical: KnownVertical
+) -> tuple[Poses, np.ndarray]:
+    """Add a known vertical to a pose that a network regressed, to first order.
+
+    Parameters
+    ----------
+    poses : Poses
+        One pose.
+    covariance : ndarray, shape (6, 6)
+        As that of a `PoseEstimate`.
+    vertical : KnownVertical
+
+    Returns
+    -------
+    poses : Poses
+    covariance : ndarray, shape (6, 6)
+
+    Raises
+    ------
+    GeometryError
+        If the pose contradicts the vertical.
+    """
+    _check_tilt(poses, covariance, vertical)
+    by, off = vertical_terms(vertical, poses.rotations[0])
+    covariance = np.linalg.inv(np.linalg.inv(covariance) + by.T @ by)
+    step = -covariance @ by.T @ off
+    rotation = rotations_from_vectors(step[None, 3:])[0] @ poses.rotations[0]
+    return Poses.from_rotations(poses.centers + step[:3], rotation[None]), covariance
+
+
+def _check_tilt(poses: Poses, covariance: np.ndarray, vertical: KnownVertical) -> None:
+    tilt = tilt_sigmas(vertical, poses.rotations[0], covariance)
+    if tilt > _MAX_TILT_SIGMAS:
+        raise GeometryError(
+            f"the network contradicts the stated attitude by {tilt:.1f} standard deviations"
+        )
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from spn_data.geometry.camera_file import SHAPE_TOLERANCE
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
-from spn_data.geometry.rotations import canonical_quats, rotations_from_vectors
-from spn_model.landmarks.solver import KnownVertical, tilt_sigmas, vertical_terms
+from spn_data.geometry.rotations import canonical_quats
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -28,7 +28,7 @@ from spn_model.onboard.bundle import (
     read_bundle,
     verified_path,
 )
-from spn_model.onboard.decoding import MAX_TILT_SIGMAS, decode, tilt_reason
+from spn_model.onboard.decoding import decode, with_vertical
 
 # Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
 # Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
@@ -211,11 +211,13 @@ class Localizer:
         Located
         """
         by, offset = self.bundle.decoding, self.bundle.view.offset
-        if isinstance(by, PoseDecoding):
-            found = _levelled(_decode_regression(by, *outputs), vertical)
-            return Located(found.poses.moved_by(offset), found.covariance, found.reason)
-        coordinates, log_scale = outputs
         try:
+            if isinstance(by, PoseDecoding):
+                found = _decode_regression(by, *outputs)
+                if vertical is not None and not found.reason:
+                    found = Located(*with_vertical(found.poses, found.covariance, vertical))
+                return replace(found, poses=found.poses.moved_by(offset))
+            coordinates, log_scale = outputs
             estimate = decode(
                 coordinates[0],
                 log_scale[0, 0],
@@ -300,18 +302,3 @@ def _decode_regression(
         return Located.failed("the network's output is not a valid pose")
     covariance = np.diag(np.exp(2 * log_std[0].astype(np.float64)))
     return Located(Poses(x[None] + decoding.center, canonical_quats(q[None])), covariance)
-
-
-def _levelled(found: Located, vertical: KnownVertical | None) -> Located:
-    """Add a known vertical to a regressed pose, weighted by their covariances, to first order."""
-    if vertical is None or found.reason:
-        return found
-    rotation = found.poses.rotations[0]
-    tilt = tilt_sigmas(vertical, rotation, found.covariance)
-    if tilt > MAX_TILT_SIGMAS:
-        return Located.failed(tilt_reason(tilt))
-    by, off = vertical_terms(vertical, rotation)
-    covariance = np.linalg.inv(np.linalg.inv(found.covariance) + by.T @ by)
-    step = -covariance @ by.T @ off
-    rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
-    return Located(Poses.from_rotations(found.poses.centers + step[:3], rotation[None]), covariance)
