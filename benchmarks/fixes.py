@@ -4,7 +4,8 @@
         [--attitude-sigma 1]
 
 With --attitude-sigma, each frame is localized a second time, with a known vertical: that of its label, with
-simulated normal noise of this standard deviation along each of two axes.
+simulated (sim.) normal noise of this standard deviation along each of two axes. Medians of the network's own
+poses are over all frames; one without a pose counts as infinite.
 
 Truth are the labels of the evaluation sequences of the area. Each frame is searched for alone. A fix is
 misleading if it is off by more than 0.5 m or 2 degrees, or by more than its protection level; a fix of a
@@ -84,6 +85,26 @@ def noisy_vertical(
     return KnownVertical(up=(x, y, z), sigma_deg=sigma_deg)
 
 
+def coarse(
+    pilot: Pilot, area: Area, name: str, labels: Labels, rows: np.ndarray, sigma_deg: float | None
+) -> str:
+    """Return how many frames the network alone locates, and its median errors over all frames."""
+    found, rng = np.full((len(rows), 2), np.inf), np.random.default_rng(0)
+    for k, row in enumerate(rows.tolist()):
+        image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
+        truth = labels.poses[row : row + 1]
+        vertical = None if sigma_deg is None else noisy_vertical(truth.rotations[0], sigma_deg, rng)
+        located = pilot.localizer.localize(image, pilot.camera, vertical=vertical)
+        if not located.reason:
+            found[k] = [float(v[0]) for v in pose_errors(located.poses, truth)]
+    near = 100 * np.mean((found[:, 0] < 5) & (found[:, 1] < 10))
+    median_m, median_deg = np.median(found, axis=0)
+    return (
+        f"{np.isfinite(found[:, 0]).sum():5} {len(rows):5} {median_m:8.4f} {median_deg:6.3f}   "
+        f"{near:.0f} % within 5 m and 10 deg"
+    )
+
+
 def measured(
     pilot: Pilot, area: Area, name: str, labels: Labels, rows: np.ndarray, sigma_deg: float | None
 ) -> tuple[int, np.ndarray, list[float]]:
@@ -133,7 +154,10 @@ def main() -> None:
         rows = np.flatnonzero(labels.registered & ~labels.tracked)
         pilot = Pilot(given.bundle, camera, options)
         for sigma_deg in (None, given.attitude_sigma) if given.attitude_sigma else (None,):
-            label = name if sigma_deg is None else f"{name}, attitude {sigma_deg:g} deg (simulated)"
+            label = name if sigma_deg is None else f"{name}, attitude {sigma_deg:g} deg, sim."
+            if options.network:
+                found = coarse(pilot, area, name, labels, rows, sigma_deg)
+                print(f"{f'network: {label}':34} {found}", flush=True)
             show(label, *measured(pilot, area, name, labels, rows, sigma_deg))
         kinds: dict[str, list[int]] = {}
         for row in rows[:: max(1, len(rows) // max(given.spoilt, 1))][: given.spoilt].tolist():
