@@ -74,6 +74,31 @@ def test_a_recorded_flight_gets_fixes(flown_area, camera_file, flight1, tmp_path
     assert compared > 5
 
 
+def test_an_attitude_is_compared_with_each_fix(flown_area, camera_file, flight1, tmp_path, capsys):
+    """The flight's own gimbal angles change no fix; angles that are 10 degrees off leave none, with a reason."""
+    bundle = flown_area / "runs" / "default" / "bundle"
+    assert json.loads((bundle / "bundle.json").read_text())["gimbal"]["flights"] == 1
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    table = flown_area / "1-frames" / "telemetry" / "flight1.csv"
+    wrong = tmp_path / "wrong.csv"
+    first, header, *rows = table.read_text().splitlines()
+    column = header.split(",").index("pitch_deg")
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[column] = str(float(row[column]) + 10)
+    wrong.write_text("\n".join([first, header, *(",".join(row) for row in cells)]))
+    usable = {}
+    for path in (None, table, wrong):
+        given = [] if path is None else ["--attitude", str(path)]
+        assert main([*words, "--no-network", *given]) == 0
+        printed = capsys.readouterr().out
+        usable[path] = int(printed.split("Usable fixes: ")[1].split()[0])
+        assert (" images, to 1 deg, corrected by the mounting" in printed) == (path is not None)
+    assert usable[None] == usable[table] > 0
+    assert usable[wrong] == 0
+    assert "the images contradict the stated attitude by # standard deviations" in printed
+
+
 def test_images_that_show_nothing_of_the_map_have_no_fix(flown_area, camera_file):
     """Black images and noise have a NoFix with a reason."""
     area = spn_data.open_area(flown_area)
