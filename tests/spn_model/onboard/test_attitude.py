@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from spn_cli.data import main
 
 from spn_data.errors import InputError
 from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
@@ -55,6 +57,23 @@ def test_telemetry_of_a_gimbal_is_read_with_the_mounting_of_the_bundle(tmp_path)
     assert as_it_is.up[0] == pytest.approx(up_of(-30, 1))
     assert as_it_is.sigma_deg[0] == 2.0
     assert GimbalMounting.from_json(MOUNTED.to_json()) == MOUNTED
+
+
+def test_spn_data_writes_the_file_from_telemetry(tmp_path):
+    """`spn-data telemetry` writes what is read on board, from subtitles of a drone, and never over a file."""
+    record = "00:00:00,{0}00 --> 00:00:00,{1}00\n[latitude: 49.0] [longitude: 8.4] [rel_alt: 5.0 "
+    angles = "abs_alt: 120.0] [gb_yaw: 10.0 gb_pitch: -30.5 gb_roll: 1.5]"
+    srt, table = tmp_path / "flight.SRT", tmp_path / "a.csv"
+    srt.write_text("".join(f"{k + 1}\n{record.format(k, k + 1)}{angles}\n\n" for k in range(5)))
+    words = ["telemetry", str(srt), "--to", str(table)]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.output
+    assert "5 with pitch and roll" in " ".join(done.output.split())
+    body = Mounting.pitched(0.0).body_from_camera
+    found = read_attitude(table, of="gimbal", mounting=MOUNTED, body_from_camera=body)
+    assert found.time_s == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert found.up[3] @ up_of(-30.5, 1.5) == pytest.approx(np.cos(np.deg2rad(1.58)), abs=1e-4)
+    assert CliRunner().invoke(main, words).exit_code == 1
 
 
 def test_between_records_and_beyond_them(tmp_path):
