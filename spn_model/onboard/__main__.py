@@ -78,17 +78,16 @@ def _localize_all(given: argparse.Namespace) -> None:
     cv2.setNumThreads(given.threads)
     camera = read_camera(given.camera)
     localizer = Localizer(given.bundle, int8=given.int8, threads=given.threads)
+    attitude = attitude_of(given, localizer.bundle.gimbal, localizer.bundle.view)
+    if attitude is not None and len(given.sources) > 1:
+        raise InputError("--attitude belongs to one video, and several sources are given")
     origin = localizer.bundle.view.origin
     line = lines.csv_line if given.format == "csv" else lines.json_line
     if given.format == "csv":
         sys.stdout.write(lines.csv_header() + "\n")
     check_sources(given.sources)
-    attitude = attitude_of(given, localizer.bundle.gimbal, localizer.bundle.view)
-    if attitude is not None and len(given.sources) > 1:
-        raise InputError("--attitude belongs to one video, and several sources are given")
-    known = 0
     noted = False
-    used, problems = 0, []
+    used, known, problems = 0, 0, []
     for source in given.sources:
         number = 0
         try:
