@@ -231,10 +231,11 @@ def with_vertical(
     """
     _check_tilt(poses, covariance, vertical)
     by, off = vertical_terms(vertical, poses.rotations[0])
-    covariance = np.linalg.inv(np.linalg.inv(covariance) + by.T @ by)
-    step = -covariance @ by.T @ off
+    gain = np.linalg.solve(np.eye(3) + by @ covariance @ by.T, by @ covariance).T
+    step = -gain @ off
     rotation = rotations_from_vectors(step[None, 3:])[0] @ poses.rotations[0]
-    return Poses.from_rotations(poses.centers + step[:3], rotation[None]), covariance
+    levelled = Poses.from_rotations(poses.centers + step[:3], rotation[None])
+    return levelled, covariance - gain @ by @ covariance
 
 
 def _check_tilt(poses: Poses, covariance: np.ndarray, vertical: KnownVertical) -> None:

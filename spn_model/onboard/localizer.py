@@ -214,7 +214,7 @@ class Localizer:
         try:
             if isinstance(by, PoseDecoding):
                 found = _decode_regression(by, *outputs)
-                if vertical is not None and not found.reason:
+                if vertical is not None and np.isfinite(found.covariance).all():
                     found = Located(*with_vertical(found.poses, found.covariance, vertical))
                 return replace(found, poses=found.poses.moved_by(offset))
             coordinates, log_scale = outputs
