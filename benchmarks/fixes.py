@@ -1,6 +1,11 @@
 """Measure the fixes of a bundle on frames of known pose, on foreign frames, and on spoilt frames.
 
     PYTHONPATH=. python benchmarks/fixes.py AREA BUNDLE [--foreign FOLDER ...] [--spoilt 100]
+        [--attitude-sigma 1]
+
+With --attitude-sigma, each frame is localized a second time, with a known vertical: that of its label, with
+simulated (sim.) normal noise of this standard deviation along each of two axes. Medians of the network's own
+poses are over all frames; one without a pose counts as infinite.
 
 Truth are the labels of the evaluation sequences of the area. Each frame is searched for alone. A fix is
 misleading if it is off by more than 0.5 m or 2 degrees, or by more than its protection level; a fix of a
@@ -22,10 +27,11 @@ import spn_data
 from spn_data.area.area import Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.geometry.rotations import rotation_vectors
+from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels
 from spn_model.integrity.fix import Fix
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
 MISLEADING_M, MISLEADING_DEG = 0.5, 2.0
@@ -70,6 +76,63 @@ def errors(fix: Fix, labels: Labels, row: int) -> tuple[float, float, float, boo
     return away, turn, float(both @ np.linalg.solve(fix.covariance, both) / 6), wrong
 
 
+def noisy_vertical(
+    rotation: np.ndarray, sigma_deg: float, rng: np.random.Generator
+) -> KnownVertical:
+    """Return up in a camera of known rotation, with normal noise along each of two axes."""
+    noise = np.deg2rad(sigma_deg) * np.append(rng.normal(size=2), 0.0)
+    x, y, z = (rotation @ rotations_from_vectors(noise[None])[0][:, 2]).tolist()
+    return KnownVertical(up=(x, y, z), sigma_deg=sigma_deg)
+
+
+def coarse(
+    pilot: Pilot, area: Area, name: str, labels: Labels, rows: np.ndarray, sigma_deg: float | None
+) -> str:
+    """Return how many frames the network alone locates, and its median errors over all frames."""
+    found, rng = np.full((len(rows), 2), np.inf), np.random.default_rng(0)
+    for k, row in enumerate(rows.tolist()):
+        image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
+        truth = labels.poses[row : row + 1]
+        vertical = None if sigma_deg is None else noisy_vertical(truth.rotations[0], sigma_deg, rng)
+        located = pilot.localizer.localize(image, pilot.camera, vertical=vertical)
+        if not located.reason:
+            found[k] = [float(v[0]) for v in pose_errors(located.poses, truth)]
+    near = 100 * np.mean((found[:, 0] < 5) & (found[:, 1] < 10))
+    median_m, median_deg = np.median(found, axis=0)
+    return (
+        f"{np.isfinite(found[:, 0]).sum():5} {len(rows):5} {median_m:8.4f} {median_deg:6.3f}   "
+        f"{near:.0f} % within 5 m and 10 deg"
+    )
+
+
+def measured(
+    pilot: Pilot, area: Area, name: str, labels: Labels, rows: np.ndarray, sigma_deg: float | None
+) -> tuple[int, np.ndarray, list[float]]:
+    """Return the number of frames, the errors of their fixes, and the processing times."""
+    results, times, rng = [], [], np.random.default_rng(0)
+    for row in rows.tolist():
+        image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
+        vertical = None
+        if sigma_deg is not None:
+            vertical = noisy_vertical(labels.poses.rotations[row], sigma_deg, rng)
+        fix = pilot.fix(image, 1, vertical)
+        times.append(fix.processing_s)
+        if isinstance(fix, Fix):
+            results.append(errors(fix, labels, row))
+    return len(rows), np.array(results, dtype=float).reshape(-1, 4), times
+
+
+def show(name: str, of: int, found: np.ndarray, times: list[float]) -> None:
+    """Print the row of a set of frames."""
+    bad = int(found[:, 3].sum())
+    print(
+        f"{name:34} {len(found):5} {of:5} {np.median(found[:, 0]):8.4f} "
+        f"{np.median(found[:, 1]):6.3f} {found[:, 0].max(initial=0):7.3f} {found[:, 2].mean():7.2f} "
+        f"{100 * (1 - bad / max(len(found), 1)):7.1f} % {bad:8}  {1e3 * np.median(times):8.0f}",
+        flush=True,
+    )
+
+
 def main() -> None:
     """Print a row for each set of frames."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -78,6 +141,9 @@ def main() -> None:
     parser.add_argument("--foreign", type=Path, nargs="*", default=[], help="folders of images")
     parser.add_argument("--spoilt", type=int, default=0, help="frames to spoil, of each sequence")
     parser.add_argument("--no-network", action="store_true")
+    parser.add_argument(
+        "--attitude-sigma", type=float, help="of a simulated known vertical, degrees"
+    )
     given = parser.parse_args()
     cv2.setNumThreads(1)
     area, reader = Area(given.area), spn_data.open_area(given.area)
@@ -87,21 +153,12 @@ def main() -> None:
         labels, camera = reader.labels(name), reader.map.cameras[name]
         rows = np.flatnonzero(labels.registered & ~labels.tracked)
         pilot = Pilot(given.bundle, camera, options)
-        results, times, bad = [], [], 0
-        for row in rows.tolist():
-            image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
-            fix = pilot.fix(image, 1)
-            times.append(fix.processing_s)
-            if isinstance(fix, Fix):
-                results.append(errors(fix, labels, row))
-                bad += results[-1][3]
-        found = np.array(results, dtype=float).reshape(-1, 4)
-        print(
-            f"{name:34} {len(found):5} {len(rows):5} {np.median(found[:, 0]):8.4f} "
-            f"{np.median(found[:, 1]):6.3f} {found[:, 0].max(initial=0):7.3f} {found[:, 2].mean():7.2f} "
-            f"{100 * (1 - bad / max(len(found), 1)):7.1f} % {bad:8}  {1e3 * np.median(times):8.0f}",
-            flush=True,
-        )
+        for sigma_deg in (None, given.attitude_sigma) if given.attitude_sigma else (None,):
+            label = name if sigma_deg is None else f"{name}, attitude {sigma_deg:g} deg, sim."
+            if options.network:
+                found = coarse(pilot, area, name, labels, rows, sigma_deg)
+                print(f"{f'network: {label}':34} {found}", flush=True)
+            show(label, *measured(pilot, area, name, labels, rows, sigma_deg))
         kinds: dict[str, list[int]] = {}
         for row in rows[:: max(1, len(rows) // max(given.spoilt, 1))][: given.spoilt].tolist():
             image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))

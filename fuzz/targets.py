@@ -52,6 +52,7 @@ from spn_data.telemetry.subtitles import read_subtitles
 from spn_data.telemetry.table import read_track
 from spn_model.evaluation.results import read_run
 from spn_model.models.checkpoint import load
+from spn_model.onboard.attitude import Attitude, read_attitude
 from spn_model.onboard.bundle import GRAPHS, read_bundle, sha256_of
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import frames as onboard_frames
@@ -107,6 +108,13 @@ def _video(path: Path) -> None:
     probe(path)
     for _, _frame in zip(range(_FRAMES), decode_gray(path, threads=1), strict=False):
         pass
+
+
+def _attitude(path: Path) -> Attitude:
+    """Read a telemetry file as the attitude of a camera."""
+    return read_attitude(
+        path, of="camera", mounting=None, body_from_camera=np.eye(3), sigma_deg=1.0
+    )
 
 
 def _payload(path: Path) -> None:
@@ -259,6 +267,7 @@ TARGETS = (
     Target("observations.npz", "area/4-eval/*/observations.npz", read_label_observations),
     Target("frames.csv", "area/1-frames/frames.csv area/4-eval/*/frames.csv", read_frames),
     Target("telemetry.csv", "area/1-frames/telemetry/*.csv", read_track),
+    Target("attitude", "area/1-frames/telemetry/*.csv", _attitude),
     Target("coverage.csv", "area/coverage/*.csv", read_strata),
     Target("registration.csv", "area/2-model/registration.csv", _reasons, 1),
     Target("COLMAP model", "area/3-geo/*.bin", _model, 1),

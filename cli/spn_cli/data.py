@@ -17,6 +17,7 @@ from spn_cli.import_ import import_
 from spn_cli.register import register
 from spn_cli.report import report
 from spn_cli.split import split
+from spn_cli.telemetry import telemetry
 
 
 @click.group(cls=Group)
@@ -134,6 +135,7 @@ main.add_command(export)
 
 
 main.add_command(report)
+main.add_command(telemetry)
 
 
 @main.command()

@@ -132,6 +132,7 @@ def _show(made: ExportedBundle) -> None:
             f"Landmarks: {found.landmarks} with {found.descriptors} descriptors, from "
             f"{found.training_frames} training frames."
         )
+        console.out.print(f"Attitude: {made.gimbal}.")
     parity = made.parity
     console.out.print(
         f"Difference from PyTorch on {parity.images} images: outputs {parity.output:.1e} of their largest "

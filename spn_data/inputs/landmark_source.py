@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.area.area import Area
-from spn_data.area.names import DATABASE, GEO, MODEL, SPLIT
+from spn_data.area.names import DATABASE, FRAMES, FRAMES_TABLE, GEO, MODEL, SPLIT
+from spn_data.capture.frames import read_frames
 from spn_data.colmap.map_features import MapFeatures
 from spn_data.colmap.model import read_map_with_keypoints
 from spn_data.geometry.pose import Poses
@@ -30,6 +31,10 @@ class LandmarkSource:
         Of the frames.
     poses : Poses
         Of the frames.
+    flights : tuple of str
+        Sequences of the frames.
+    gimbal_deg : ndarray, shape (F, 3)
+        Heading, pitch and roll that the telemetry states for each frame; NaN if it states none.
     focal_px : ndarray, shape (F,)
         Horizontal focal lengths.
     sizes : ndarray, shape (F, 2)
@@ -49,6 +54,8 @@ class LandmarkSource:
     xyz: np.ndarray
     names: tuple[str, ...]
     poses: Poses
+    flights: tuple[str, ...]
+    gimbal_deg: np.ndarray
     focal_px: np.ndarray
     sizes: np.ndarray
     frame: np.ndarray
@@ -84,6 +91,9 @@ def read_landmark_source(area: Area) -> LandmarkSource:
             is_point = point_ids[name] >= 0
             descriptors.append(opened.descriptors(name)[is_point])
             scales.append(opened.scales(name)[is_point])
+    table = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
+    rows = {str(name): row for row, name in enumerate(table.names)}
+    listed = np.array([rows[str(name)] for name in scene.names])
     cameras = [scene.cameras[int(number)] for number in scene.camera_ids]
     return LandmarkSource(
         fingerprint=fingerprint,
@@ -91,6 +101,8 @@ def read_landmark_source(area: Area) -> LandmarkSource:
         xyz=points.xyz,
         names=tuple(str(name) for name in scene.names),
         poses=scene.poses,
+        flights=tuple(str(name) for name in table.sequences[listed]),
+        gimbal_deg=table.gimbal_deg[listed],
         focal_px=np.array([camera.focal_px[0] for camera in cameras]),
         sizes=np.array([(camera.width, camera.height) for camera in cameras]),
         frame=seen.image_idx,

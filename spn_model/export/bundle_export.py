@@ -29,8 +29,9 @@ from spn_model.export.bundle_checks import (
     measure_errors,
 )
 from spn_model.export.exported import ExportedBundle
+from spn_model.export.gimbal_mounting import measure_mounting
 from spn_model.export.graphs import Deployment, deployment, write_graph
-from spn_model.export.landmark_export import write_landmarks
+from spn_model.export.landmark_export import training_names, write_landmarks
 from spn_model.export.model_card import model_card
 from spn_model.export.quantization import quantize
 from spn_model.models.checkpoint import Checkpoint
@@ -137,7 +138,7 @@ def export(
                 "graphs": graphs,
                 "run": dict(facts),
             }
-            landmarks = None
+            landmarks, mounted = None, ""
             if source is not None and options.map_mb:
                 landmarks = write_landmarks(
                     partial / LANDMARKS,
@@ -148,6 +149,8 @@ def export(
                     max_bytes=round(1e6 * options.map_mb),
                 )
                 document["landmarks"] = {**_entry(partial / LANDMARKS), **asdict(landmarks)}
+                gimbal, mounted = measure_mounting(source, training_names(data))
+                document["gimbal"] = None if gimbal is None else gimbal.to_json()
             write_json(partial / DOCUMENT, document)
             parity = compare_with_pytorch(partial, checkpoint, deployed, data, options, progress)
             errors = measure_errors(partial, deployed, data, options, progress)
@@ -158,6 +161,7 @@ def export(
                 parity=parity,
                 errors=errors,
                 landmarks=landmarks,
+                gimbal=mounted,
             )
             document["measured"] = {
                 "parity": asdict(parity),

@@ -28,6 +28,9 @@ class ExportedBundle:
         By group, float32 before int8.
     landmarks : LandmarkSummary or None
         None for a bundle without landmarks.
+    gimbal : str
+        What was measured of the mounting of the camera in its gimbal, or why nothing was; empty for a bundle
+        without landmarks.
     notes : tuple of str
         One sentence each.
     """
@@ -38,4 +41,5 @@ class ExportedBundle:
     parity: Parity
     errors: tuple[GroupErrors, ...]
     landmarks: LandmarkSummary | None = None
+    gimbal: str = ""
     notes: tuple[str, ...] = field(default=())

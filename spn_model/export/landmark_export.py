@@ -77,12 +77,18 @@ def write_landmarks(
             "give the data set of the area, or --map-mb 0 to export without landmarks",
             path=data.path,
         )
-    training = {str(name) for group in data.of_role(Role.TRAIN) for name in group.names}
     facts = LandmarkFacts(
         features=FEATURES, noise_px=_NOISE_PX, map_hash=source.map_hash, network=network
     )
-    chosen, frames = select_landmarks(source, training, offset, facts, max_bytes=max_bytes)
+    chosen, frames = select_landmarks(
+        source, training_names(data), offset, facts, max_bytes=max_bytes
+    )
     chosen.save(path)
     return LandmarkSummary(
         landmarks=len(chosen), descriptors=len(chosen.descriptors), training_frames=frames
     )
+
+
+def training_names(data: Dataset) -> set[str]:
+    """Return the names of the training frames, the only ones that a bundle is made from."""
+    return {str(name) for group in data.of_role(Role.TRAIN) for name in group.names}

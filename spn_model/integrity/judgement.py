@@ -169,7 +169,10 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
             f"the orientation is known to {sigma_deg:.2f} deg, {limits.max_sigma_deg:g} is needed"
         )
     elif witness.tilt_sigmas > limits.max_tilt_sigmas:
-        reason = f"contradicts the known vertical by {witness.tilt_sigmas:.1f} standard deviations"
+        reason = (
+            f"the images contradict the stated attitude by {witness.tilt_sigmas:.1f} standard deviations; "
+            "check its time, its mounting and its standard deviation"
+        )
     elif abs(focal) > limits.max_focal_sigmas * np.hypot(focal_sigma, limits.focal_sigma):
         reason = (
             f"the landmarks fit a focal length that is {100 * focal:+.1f} % from the stated one; "

@@ -24,7 +24,7 @@ from spn_model.landmarks.solver import (
     first_pose,
     fit_focal_length,
     solve,
-    vertical_terms,
+    tilt_sigmas,
 )
 
 FIRST_PX = 4.0  # of RANSAC
@@ -108,7 +108,6 @@ def search(
     landmarks: LandmarkMap,
     features: ImageFeatures,
     hypotheses: Sequence[Hypothesis] = (),
-    vertical: KnownVertical | None = None,
 ) -> Found | None:
     """Find the pose of an image.
 
@@ -120,7 +119,6 @@ def search(
     landmarks : LandmarkMap
     features : ImageFeatures
     hypotheses : sequence of Hypothesis
-    vertical : KnownVertical, optional
 
     Returns
     -------
@@ -128,19 +126,19 @@ def search(
         None if too few landmarks agree on any pose.
     """
     found = [
-        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess), vertical)
+        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess))
         for guess in hypotheses
     ]
     compared = match_all(features, landmarks)
-    found.append(_candidate(landmarks, features, MAP, compared, vertical))
+    found.append(_candidate(landmarks, features, MAP, compared))
     if max((c.agreeing for c in found if c), default=0) < WEAK:
         compared = match_all(features, landmarks, len(features))
-        found.append(_candidate(landmarks, features, MAP, compared, vertical))
+        found.append(_candidate(landmarks, features, MAP, compared))
     best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
     if best is not None:
         used = best.seen.features[best.pose.inliers]
         rest = compared.select(~np.isin(compared.features, used))
-        found.append(_candidate(landmarks, features, MAP, rest, vertical))
+        found.append(_candidate(landmarks, features, MAP, rest))
     poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
     if not poses:
         return None
@@ -152,11 +150,10 @@ def follow(
     landmarks: LandmarkMap,
     features: ImageFeatures,
     guess: Hypothesis,
-    vertical: KnownVertical | None = None,
 ) -> Found | None:
     """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there."""
     seen = _guided(landmarks, features, guess)
-    found = _candidate(landmarks, features, guess.source, seen, vertical)
+    found = _candidate(landmarks, features, guess.source, seen)
     return None if found is None else Found(found, 0)
 
 
@@ -173,10 +170,9 @@ def _candidate(
     features: ImageFeatures,
     source: str,
     seen: Sightings,
-    vertical: KnownVertical | None,
 ) -> Candidate | None:
     first = first_pose(seen, FIRST_PX, _MIN_FIRST)
-    return None if first is None else _refine(landmarks, features, source, *first, vertical)
+    return None if first is None else _refine(landmarks, features, source, *first)
 
 
 def _refine(
@@ -185,14 +181,13 @@ def _refine(
     source: str,
     center: np.ndarray,
     rotation: np.ndarray,
-    vertical: KnownVertical | None,
 ) -> Candidate | None:
     """Match around the projections and solve, until no more landmarks agree."""
     best, agreeing = None, 0
     for _ in range(_ROUNDS):
         wanted = _seen_from(landmarks, features, center, rotation, 1.0)
         seen = match_near(features, landmarks, wanted, SEARCH_PX)
-        pose = solve(seen, center, rotation, vertical) if len(seen) >= _MIN_FIRST else None
+        pose = solve(seen, center, rotation) if len(seen) >= _MIN_FIRST else None
         if pose is None:
             break
         count = int(pose.inliers.sum())
@@ -224,7 +219,7 @@ def witness_of(
     """Return what is known about the pose of a candidate, for its judgement."""
     best, tilt = found.best, 0.0
     if vertical is not None:
-        tilt = float(np.linalg.norm(vertical_terms(vertical, best.pose.rotation)[1]))
+        tilt = tilt_sigmas(vertical, best.pose.rotation, best.pose.covariance)
     return Witness(
         at=best.seen.at / features.focal_px / features.half_view,
         xyz=best.seen.xyz,

@@ -12,6 +12,7 @@ from spn_data.geometry.pose import to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
 
 _RANSAC_ITERATIONS = 1000
+_FEWEST = 4  # P3P needs three points and a fourth to disambiguate
 _STEPS = 12
 _CONVERGED = (
     1e-3  # mean change of the whitened projections; a step larger than the next is no solution
@@ -131,39 +132,64 @@ class SolvedPose:
 def first_pose(
     seen: Sightings, threshold_px: float, min_inliers: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return centre and rotation of the pose that most sightings agree with, or None (AP3P in RANSAC)."""
-    if len(seen) < max(4, min_inliers):
+    """Return centre and rotation of the pose that most sightings agree with, or None."""
+    if len(seen) < min_inliers:
         return None
-    middle, rays = np.median(seen.xyz, axis=0), seen.at / seen.focal_px
+    threshold, rays = threshold_px / seen.focal_px, seen.at / seen.focal_px
+    found = pose_by_ransac(seen.xyz, rays, np.eye(3), threshold, _RANSAC_ITERATIONS)
+    return None if found is None or found[2] < min_inliers else found[:2]
+
+
+def pose_by_ransac(
+    xyz: np.ndarray, at: np.ndarray, matrix: np.ndarray, threshold: float, iterations: int
+) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Find the pose that most points agree with: AP3P in RANSAC, then SQPnP of the points that agree.
+
+    Parameters
+    ----------
+    xyz : ndarray, shape (K, 3)
+        Points in the world.
+    at : ndarray, shape (K, 2)
+        Their pixels.
+    matrix : ndarray, shape (3, 3)
+        Camera matrix, with the same origin of pixels.
+    threshold : float
+        Distance in the image up to which a point agrees, in pixels.
+    iterations : int
+        Most iterations of RANSAC.
+
+    Returns
+    -------
+    tuple or None
+        Centre (3,), rotation (3, 3) and number of points that agree; None if there is no pose.
+    """
+    if len(xyz) < _FEWEST:
+        return None
+    middle = np.median(xyz, axis=0)
     found, turn, move, inliers = cv2.solvePnPRansac(
-        seen.xyz - middle,
-        rays,
-        np.eye(3),
+        xyz - middle,
+        at,
+        matrix,
         None,
-        iterationsCount=_RANSAC_ITERATIONS,
-        reprojectionError=threshold_px / seen.focal_px,
+        iterationsCount=iterations,
+        reprojectionError=threshold,
         confidence=0.9999,
         flags=cv2.SOLVEPNP_AP3P,
     )
-    if not found or inliers is None or len(inliers) < min_inliers:
+    if not found or inliers is None or len(inliers) < _FEWEST:
         return None
     # OpenCV solves for all inliers by EPnP, which is metres off where points are nearly on a plane.
     kept = inliers.ravel()
     found, turn, move = cv2.solvePnP(
-        (seen.xyz - middle)[kept], rays[kept], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+        (xyz - middle)[kept], at[kept], matrix, None, flags=cv2.SOLVEPNP_SQPNP
     )
     if not found or not np.isfinite(turn).all() or not np.isfinite(move).all():
         return None
     rotation = rotations_from_vectors(turn.reshape(1, 3))[0]
-    return middle - rotation.T @ move.ravel(), rotation
+    return middle - rotation.T @ move.ravel(), rotation, len(kept)
 
 
-def solve(
-    seen: Sightings,
-    center: np.ndarray,
-    rotation: np.ndarray,
-    vertical: KnownVertical | None = None,
-) -> SolvedPose | None:
+def solve(seen: Sightings, center: np.ndarray, rotation: np.ndarray) -> SolvedPose | None:
     """Refine a pose by robust least squares over all sightings (Cauchy loss).
 
     Parameters
@@ -173,8 +199,6 @@ def solve(
     center : ndarray, shape (3,)
     rotation : ndarray, shape (3, 3)
         The pose to start from; a few pixels off.
-    vertical : KnownVertical, optional
-        Observation of up, with the weight of its sigma.
 
     Returns
     -------
@@ -191,10 +215,6 @@ def solve(
         weights[x[:, 2] <= 0] = 0
         information = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
         gradient = np.einsum("n,nij,ni->j", weights, jacobian, residuals)
-        if vertical is not None:
-            by, off = vertical_terms(vertical, rotation)
-            information += by.T @ by
-            gradient += by.T @ off
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:
@@ -254,6 +274,27 @@ def vertical_terms(vertical: KnownVertical, rotation: np.ndarray) -> tuple[np.nd
     by = np.zeros((3, 6))
     by[:, 3:] = np.cross(np.eye(3), ours).T * weight
     return by, (ours - np.array(vertical.up)) * weight
+
+
+def tilt_sigmas(vertical: KnownVertical, rotation: np.ndarray, covariance: np.ndarray) -> float:
+    """Return how far a pose from images alone is from a known vertical.
+
+    Parameters
+    ----------
+    vertical : KnownVertical
+    rotation : ndarray, shape (3, 3)
+        World to camera.
+    covariance : ndarray, shape (6, 6)
+        Of the pose, over the centre and a rotation vector in the camera frame.
+
+    Returns
+    -------
+    float
+        The difference in its standard deviations: root of a value that is distributed as chi-squared with
+        two degrees of freedom.
+    """
+    by, off = vertical_terms(vertical, rotation)
+    return float(np.sqrt(off @ np.linalg.solve(np.eye(3) + by @ covariance @ by.T, off)))
 
 
 def _whitened(

@@ -17,6 +17,7 @@ import cv2
 from spn_data.errors import InputError, SpnError
 from spn_data.geometry.camera_file import read_camera
 from spn_model.onboard import lines
+from spn_model.onboard.attitude import CAMERA, GIMBAL, add_options, attitude_of
 from spn_model.onboard.fly import fly
 from spn_model.onboard.localizer import Localizer, Located
 from spn_model.onboard.sources import check_sources, frames
@@ -45,6 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--threads", type=int, default=1, help="threads of the network and of OpenCV (default 1)"
     )
+    add_options(parser, (GIMBAL, CAMERA))
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fly"]:
         return _ended(lambda: fly(arguments[1:]))
@@ -76,21 +78,26 @@ def _localize_all(given: argparse.Namespace) -> None:
     cv2.setNumThreads(given.threads)
     camera = read_camera(given.camera)
     localizer = Localizer(given.bundle, int8=given.int8, threads=given.threads)
+    attitude = attitude_of(given, localizer.bundle.gimbal, localizer.bundle.view)
+    if attitude is not None and len(given.sources) > 1:
+        raise InputError("--attitude belongs to one video, and several sources are given")
     origin = localizer.bundle.view.origin
     line = lines.csv_line if given.format == "csv" else lines.json_line
     if given.format == "csv":
         sys.stdout.write(lines.csv_header() + "\n")
     check_sources(given.sources)
     noted = False
-    used, problems = 0, []
+    used, known, problems = 0, 0, []
     for source in given.sources:
         number = 0
         try:
             for number, time_s, image in frames(source):
+                vertical = None if attitude is None else attitude.at(time_s)
+                known += vertical is not None
                 try:
                     height, width = image.shape[:2]
                     covered = localizer.renderer(camera, width, height).valid.mean()
-                    located = localizer.localize(image, camera)
+                    located = localizer.localize(image, camera, vertical=vertical)
                 except InputError as error:
                     if not number:
                         raise
@@ -110,6 +117,8 @@ def _localize_all(given: argparse.Namespace) -> None:
             failed = Located.failed(reason)
             sys.stdout.write(line(str(source), number, math.nan, failed, origin) + "\n")
             sys.stdout.flush()
+    if attitude is not None:
+        sys.stderr.write(attitude.coverage(known, used) + "\n")
     if problems and not used:
         raise problems[0]
     for problem in problems:

@@ -17,6 +17,7 @@ from spn_data.errors import FormatError, InputError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json
 from spn_data.geometry.json_values import bounded, parse_file
+from spn_model.onboard.attitude import GimbalMounting
 from spn_model.onboard.decoding import DecodingOptions
 from spn_model.onboard.graph_check import check_self_contained
 from spn_model.onboard.view import View
@@ -153,6 +154,8 @@ class Bundle:
         By precision.
     landmarks : BundleFile or None
         None in a bundle without landmarks.
+    gimbal : GimbalMounting or None
+        None if the mapping flights recorded no angles.
     document : mapping
         The whole file, including facts for people.
     """
@@ -163,6 +166,7 @@ class Bundle:
     decoding: Decoding
     graphs: Mapping[str, BundleFile]
     landmarks: BundleFile | None
+    gimbal: GimbalMounting | None
     document: Mapping[str, Any]
 
 
@@ -212,6 +216,7 @@ def read_bundle(folder: Path) -> Bundle:
             decoding=_decoding(document["decoding"]),
             graphs={p: _graph(folder, p, entry) for p, entry in dict(document["graphs"]).items()},
             landmarks=_landmarks(folder, document.get("landmarks")),
+            gimbal=_gimbal(document.get("gimbal")),
             document=document,
         )
     except _DAMAGE as error:
@@ -305,6 +310,10 @@ def _graph(folder: Path, precision: str, entry: Mapping[str, Any]) -> BundleFile
         bytes=int(bounded(entry["bytes"], 1, _MAX_GRAPH_BYTES)),
         sha256=digest,
     )
+
+
+def _gimbal(entry: Mapping[str, Any] | None) -> GimbalMounting | None:
+    return None if entry is None else GimbalMounting.from_json(entry)
 
 
 def _landmarks(folder: Path, entry: Mapping[str, Any] | None) -> BundleFile | None:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from spn_data.errors import GeometryError
 from spn_data.geometry.pinhole import residuals_and_jacobian
 from spn_data.geometry.pose import Poses, to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
+from spn_model.landmarks.solver import KnownVertical, pose_by_ransac, tilt_sigmas, vertical_terms
 
 # Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
 # few pixels still converges.
 _ROBUST_SCALES = (4.0, 2.0, *[1.0] * 10)
 _CONVERGED_PX = 1e-3
+_MAX_TILT_SIGMAS = 5.0  # between a known vertical and the network
 _MIN_SLOPE = 0.2  # bounds the growth of the covariance (1 / slope^2) if cells contradict each other
 
 
@@ -84,6 +85,7 @@ def decode(
     first_px: float,
     stride_px: float,
     options: DecodingOptions | None = None,
+    vertical: KnownVertical | None = None,
 ) -> PoseEstimate:
     """Estimate a camera pose from scene coordinates.
 
@@ -104,6 +106,8 @@ def decode(
         Distance between cells in pixels.
     options : DecodingOptions, optional
         Options of the estimation.
+    vertical : KnownVertical, optional
+        Up in the camera, one more observation in the least squares.
 
     Returns
     -------
@@ -112,10 +116,14 @@ def decode(
     Raises
     ------
     GeometryError
-        If too few cells agree on any pose.
+        If too few cells agree on any pose, or they contradict the known vertical.
 
-    Notes ----- The covariance is the sandwich estimator of the last step (Huber 1967): it uses the scatter of
-    the residuals rather than the scales of the cells, times `cells_per_observation`.
+    Notes
+    -----
+    The covariance is the sandwich estimator of the last step (Huber 1967): it uses the scatter of the
+    residuals rather than the scales of the cells, times `cells_per_observation`. A known vertical has the
+    weight of that many cells' observations, and its stated variance in the covariance. First, the pose of the
+    cells alone is compared with it: cells that disagree would lose their weights and be silent.
 
     References
     ----------
@@ -134,7 +142,26 @@ def decode(
     xyz, sigma_m, at = xyz[finite], sigma_m[finite], at[finite]
     if len(xyz) < options.min_inliers:
         raise GeometryError(f"only {len(xyz)} cells are confident, need {options.min_inliers}")
-    center, rotation = _first_pose(xyz, at, matrix, options)
+    first = _first_pose(xyz, at, matrix, options)
+    found = _refined(xyz, sigma_m, at, matrix, *first, options)
+    if vertical is None:
+        return found
+    _check_tilt(found.poses, found.covariance, vertical)
+    return _refined(xyz, sigma_m, at, matrix, *first, options, vertical)
+
+
+def _refined(
+    xyz: np.ndarray,
+    sigma_m: np.ndarray,
+    at: np.ndarray,
+    matrix: np.ndarray,
+    center: np.ndarray,
+    rotation: np.ndarray,
+    options: DecodingOptions,
+    vertical: KnownVertical | None = None,
+) -> PoseEstimate:
+    """Refine a pose by iteratively reweighted least squares over cells and, if known, the vertical."""
+    turn, count = np.zeros((6, 6)), options.cells_per_observation
     focal_px = np.sqrt(matrix[0, 0] * matrix[1, 1])
     for width in options.robust * np.array(_ROBUST_SCALES):
         in_camera = to_camera(xyz, center, rotation)
@@ -149,11 +176,13 @@ def decode(
         normalised_sq = (residuals**2).sum(axis=1) / (sigma_px * width) ** 2
         weights = (1 + normalised_sq) ** -2 / sigma_px**2
         gradients = np.einsum("nij,ni->nj", jacobian, residuals) * weights[:, None]
-        try:
-            inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, jacobian, jacobian))
-        except np.linalg.LinAlgError as error:
-            raise GeometryError("the scene coordinates do not determine a pose") from error
-        step = -inverse @ gradients.sum(axis=0)
+        information = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
+        gradient = gradients.sum(axis=0)
+        if vertical is not None:
+            by, off = vertical_terms(vertical, rotation)
+            turn = count * by.T @ by
+            gradient += count * by.T @ off
+        step = -_inverse(information + turn) @ gradient
         center = center + step[:3]
         rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
         if width == options.robust and np.abs(jacobian @ step).mean() < _CONVERGED_PX:
@@ -167,33 +196,72 @@ def decode(
     # slope of the influence function is smaller than the weight, because the weight decreases with the
     # residual.
     slope = ((1 + normalised_sq) ** -3 * (1 - normalised_sq) / sigma_px**2).sum() / weights.sum()
-    covariance = inverse @ (gradients.T @ gradients) @ inverse / max(slope, _MIN_SLOPE) ** 2
-    covariance = (covariance + covariance.T) / 2 * options.cells_per_observation
+    inverse = _inverse(max(slope, _MIN_SLOPE) * information + turn)
+    covariance = inverse @ (gradients.T @ gradients + turn) @ inverse * count
     return PoseEstimate(
-        Poses.from_rotations(center[None], rotation[None]), covariance, inliers, len(xyz)
+        Poses.from_rotations(center[None], rotation[None]),
+        (covariance + covariance.T) / 2,
+        inliers,
+        len(xyz),
     )
+
+
+def with_vertical(
+    poses: Poses, covariance: np.ndarray, vertical: KnownVertical
+) -> tuple[Poses, np.ndarray]:
+    """Add a known vertical to a pose that a network regressed, to first order.
+
+    Parameters
+    ----------
+    poses : Poses
+        One pose.
+    covariance : ndarray, shape (6, 6)
+        As that of a `PoseEstimate`.
+    vertical : KnownVertical
+
+    Returns
+    -------
+    poses : Poses
+    covariance : ndarray, shape (6, 6)
+
+    Raises
+    ------
+    GeometryError
+        If the pose contradicts the vertical.
+    """
+    _check_tilt(poses, covariance, vertical)
+    by, off = vertical_terms(vertical, poses.rotations[0])
+    gain = np.linalg.solve(np.eye(3) + by @ covariance @ by.T, by @ covariance).T
+    step = -gain @ off
+    rotation = rotations_from_vectors(step[None, 3:])[0] @ poses.rotations[0]
+    levelled = Poses.from_rotations(poses.centers + step[:3], rotation[None])
+    return levelled, covariance - gain @ by @ covariance
+
+
+def _check_tilt(poses: Poses, covariance: np.ndarray, vertical: KnownVertical) -> None:
+    tilt = tilt_sigmas(vertical, poses.rotations[0], covariance)
+    if tilt > _MAX_TILT_SIGMAS:
+        raise GeometryError(
+            f"the network contradicts the stated attitude by {tilt:.1f} standard deviations"
+        )
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.inv(information)
+    except np.linalg.LinAlgError as error:
+        raise GeometryError("the scene coordinates do not determine a pose") from error
 
 
 def _first_pose(
     xyz: np.ndarray, at: np.ndarray, matrix: np.ndarray, options: DecodingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and rotation of the pose with most inliers (P3P, RANSAC)."""
-    middle = np.median(xyz, axis=0)
+    """Return centre and rotation of the pose with most inliers."""
     # K and pixels share the origin of pixels, so OpenCV needs no half-pixel shift.
-    found, turn, move, inliers = cv2.solvePnPRansac(
-        xyz - middle,
-        at,
-        matrix,
-        None,
-        iterationsCount=options.ransac_iterations,
-        reprojectionError=options.ransac_px,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
-    if not found or inliers is None or len(inliers) < options.min_inliers:
-        count = 0 if inliers is None else len(inliers)
+    found = pose_by_ransac(xyz, at, matrix, options.ransac_px, options.ransac_iterations)
+    if found is None or found[2] < options.min_inliers:
         raise GeometryError(
-            f"{count} of {len(xyz)} cells agree on a pose, need {options.min_inliers}"
+            f"{0 if found is None else found[2]} of {len(xyz)} cells agree on a pose, need "
+            f"{options.min_inliers}"
         )
-    rotation = rotations_from_vectors(turn.reshape(1, 3))[0]
-    return middle - rotation.T @ move.ravel(), rotation
+    return found[:2]

@@ -9,6 +9,11 @@ import numpy as np
 from spn_model.integrity.fix import Fix, NoFix
 
 
+def kind_of_reason(reason: str) -> str:
+    """Return a reason without its numbers, which differ from image to image."""
+    return " ".join("#" if any(c.isdigit() for c in word) else word for word in reason.split())
+
+
 class FlightReport:
     """Counts of what was published during a flight."""
 
@@ -33,9 +38,7 @@ class FlightReport:
             else:
                 self._reasons[f"{item.state.value}: waits for images that agree"] += 1
         else:
-            # Numbers differ from image to image; what is counted is the kind of reason.
-            kind = " ".join("#" if any(c.isdigit() for c in w) else w for w in item.reason.split())
-            self._reasons[f"{item.state.value}: {kind}"] += 1
+            self._reasons[f"{item.state.value}: {kind_of_reason(item.reason)}"] += 1
 
     @property
     def availability(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -18,8 +19,18 @@ from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.link import FixSink, open_link
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
+from spn_model.landmarks.solver import KnownVertical
+from spn_model.onboard.attitude import (
+    BODY,
+    CAMERA,
+    GIMBAL,
+    Attitude,
+    add_options,
+    attitude_of,
+)
 from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.pilot import Pilot, PilotOptions
+from spn_model.onboard.pre_arm import StatedPosition, pre_arm
 from spn_model.onboard.sources import check_sources, frames
 
 _FIRST_US = 1_000_000  # time of the first image of a recording whose clock starts at zero
@@ -36,6 +47,9 @@ def fly(arguments: list[str]) -> None:
     given = _parser().parse_args(arguments)
     cv2.setNumThreads(given.threads)
     check_sources([given.source])
+    stated = None
+    if given.at is not None:
+        stated = StatedPosition(lat_deg=given.at[0], lon_deg=given.at[1], sigma_m=given.at_sigma)
     pilot = Pilot(
         given.bundle,
         read_camera(given.camera),
@@ -55,7 +69,14 @@ def fly(arguments: list[str]) -> None:
         else Datum(origin=view.origin, geoid_height_m=given.geoid_height)
     )
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
-    report = FlightReport()
+    attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
+    images = _images(given, attitude)
+    if given.pre_arm:
+        for line in pre_arm(pilot, images, stated):
+            sys.stdout.write(line + "\n")
+        sys.stdout.write("Ready.\n")
+        return
+    report, count, known = FlightReport(), 0, 0
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
@@ -64,14 +85,27 @@ def fly(arguments: list[str]) -> None:
             sinks.append(open_link(given.profile, given.mavlink, mounting=mounting, datum=datum))
         for sink in sinks:
             stack.callback(sink.close)
-        for number, time_s, image in frames(given.source):
-            seconds = number / given.fps if math.isnan(time_s) else time_s
-            item: Fix | NoFix = pilot.fix(image, _FIRST_US + round(1e6 * seconds))
+        for time_us, image, vertical in images:
+            count, known = count + 1, known + (vertical is not None)
+            item: Fix | NoFix = pilot.fix(image, time_us, vertical)
             report.add(item)
             for sink in sinks:
                 sink.send(item)
-    for line in report.lines():
+    lines = report.lines()
+    if attitude is not None:
+        lines.append(attitude.coverage(known, count))
+    for line in lines:
         sys.stdout.write(line + "\n")
+
+
+def _images(
+    given: argparse.Namespace, attitude: Attitude | None
+) -> Iterator[tuple[int, np.ndarray, KnownVertical | None]]:
+    """Yield time in microseconds, image, and up in the camera if it is known."""
+    for number, time_s, image in frames(given.source):
+        seconds = number / given.fps if math.isnan(time_s) else time_s
+        vertical = None if attitude is None else attitude.at(seconds)
+        yield _FIRST_US + round(1e6 * seconds), image, vertical
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -94,6 +128,22 @@ def _parser() -> argparse.ArgumentParser:
         default=(0.0, 0.0, 0.0),
         metavar=("FORWARD", "RIGHT", "DOWN"),
         help="of the camera from the body's centre, m",
+    )
+    add_options(parser, (GIMBAL, CAMERA, BODY))
+    parser.add_argument(
+        "--pre-arm",
+        action="store_true",
+        help="test the bundle on the first images, and stop; exit code 1 if it is not ready",
+    )
+    parser.add_argument(
+        "--at",
+        type=float,
+        nargs=2,
+        metavar=("LAT", "LON"),
+        help="where the drone stands, for --pre-arm",
+    )
+    parser.add_argument(
+        "--at-sigma", type=float, default=3.0, metavar="M", help="of that position (default 3)"
     )
     parser.add_argument("--geoid-height", type=float, help="of the place, m above the ellipsoid")
     parser.add_argument("--fps", type=float, default=10.0, help="where images state no time")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
 from spn_data.geometry.rotations import canonical_quats
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -27,7 +28,7 @@ from spn_model.onboard.bundle import (
     read_bundle,
     verified_path,
 )
-from spn_model.onboard.decoding import decode
+from spn_model.onboard.decoding import decode, with_vertical
 
 # Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
 # Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
@@ -113,7 +114,14 @@ class Localizer:
         self._check_graph(path)
         self._renderers: dict[tuple[object, ...], PinholeRenderer] = {}
 
-    def localize(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> Located:
+    def localize(
+        self,
+        image: np.ndarray,
+        camera: Camera,
+        *,
+        rgb: bool = False,
+        vertical: KnownVertical | None = None,
+    ) -> Located:
         """Estimate the pose of an image.
 
         Parameters
@@ -124,6 +132,8 @@ class Localizer:
             Its camera with distortion; scaled if its size differs but its aspect ratio is the same.
         rgb : bool
             Whether the image is RGB.
+        vertical : KnownVertical, optional
+            Up in the camera.
 
         Returns
         -------
@@ -138,7 +148,7 @@ class Localizer:
         """
         seen = self.view(image, camera, rgb=rgb)
         reason = missing_texture(image)
-        return Located.failed(reason) if reason else self.decode(self.run(seen))
+        return Located.failed(reason) if reason else self.decode(self.run(seen), vertical=vertical)
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.
@@ -179,7 +189,12 @@ class Localizer:
         found: list[np.ndarray] = self.session.run(self.bundle.decoding.outputs, {INPUT: images})
         return found
 
-    def decode(self, outputs: list[np.ndarray], matrix: np.ndarray | None = None) -> Located:
+    def decode(
+        self,
+        outputs: list[np.ndarray],
+        matrix: np.ndarray | None = None,
+        vertical: KnownVertical | None = None,
+    ) -> Located:
         """Convert outputs of the network to a pose in the world.
 
         Parameters
@@ -188,17 +203,21 @@ class Localizer:
             As `run` returns them.
         matrix : ndarray, shape (3, 3), optional
             Camera matrix K of the image, if it is not that of the bundle's camera.
+        vertical : KnownVertical, optional
+            Up in the camera.
 
         Returns
         -------
         Located
         """
         by, offset = self.bundle.decoding, self.bundle.view.offset
-        if isinstance(by, PoseDecoding):
-            found = _decode_regression(by, *outputs)
-            return Located(found.poses.moved_by(offset), found.covariance, found.reason)
-        coordinates, log_scale = outputs
         try:
+            if isinstance(by, PoseDecoding):
+                found = _decode_regression(by, *outputs)
+                if vertical is not None and np.isfinite(found.covariance).all():
+                    found = Located(*with_vertical(found.poses, found.covariance, vertical))
+                return replace(found, poses=found.poses.moved_by(offset))
+            coordinates, log_scale = outputs
             estimate = decode(
                 coordinates[0],
                 log_scale[0, 0],
@@ -206,6 +225,7 @@ class Localizer:
                 first_px=by.first_px,
                 stride_px=by.stride_px,
                 options=by.options,
+                vertical=vertical,
             )
         except GeometryError as error:
             return Located.failed(str(error))

@@ -172,13 +172,13 @@ class Pilot:
         features = self._features(image)
         guess = self._prediction(time_us)
         if guess is not None and time_us - self._searched_us < self.options.search_s * 1e6:
-            found = follow(self.landmarks, features, guess, vertical)
+            found = follow(self.landmarks, features, guess)
             verdict = self._judged(found, features, vertical)
             if found is not None and verdict is not None and not verdict.reason:
                 return found.best, verdict, ""
         self._searched_us = time_us
         guesses = [guess] if guess is not None else []
-        found = search(self.landmarks, features, [*guesses, *self._from_network(image)], vertical)
+        found = search(self.landmarks, features, [*guesses, *self._from_network(image, vertical)])
         if found is None:
             return None, None, "too few landmarks agree on any pose"
         return found.best, self._judged(found, features, vertical), ""
@@ -214,10 +214,10 @@ class Pilot:
         found = extract(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), None, options)
         return ImageFeatures.of(found, camera, options.max_image_size_px)
 
-    def _from_network(self, image: np.ndarray) -> list[Hypothesis]:
+    def _from_network(self, image: np.ndarray, vertical: KnownVertical | None) -> list[Hypothesis]:
         if not self.options.network:
             return []
-        located = self.localizer.localize(image, self.camera)
+        located = self.localizer.localize(image, self.camera, vertical=vertical)
         if located.reason:
             return []
         center = located.poses.centers[0] - self._offset

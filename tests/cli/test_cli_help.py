@@ -73,6 +73,7 @@ def test_the_commands_are_those_of_this_version():
         "simulate",
         "split",
         "status",
+        "telemetry",
     ]
 
 
@@ -91,6 +92,7 @@ def test_help_lists_the_commands_in_the_order_of_work():
         "import",
         "export",
         "report",
+        "telemetry",
         "status",
         "simulate",
     ]

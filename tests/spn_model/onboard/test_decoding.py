@@ -13,7 +13,8 @@ import pytest
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
-from spn_model.onboard.decoding import DecodingOptions, decode
+from spn_model.landmarks.solver import KnownVertical
+from spn_model.onboard.decoding import DecodingOptions, decode, with_vertical
 
 MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])
 GRID = (59, 33)  # cells of a 480 x 270 image, the first at (7.5, 7.5), 8 px apart
@@ -21,8 +22,26 @@ TRUE = Poses.from_rotations([[310.0, -4.0, 12.0]], rotations_from_vectors([[1.9,
 STILL = DecodingOptions(cells_per_observation=1.0)
 
 
-def decoded(xyz: np.ndarray, log_scale: np.ndarray, options: DecodingOptions | None = None):
-    return decode(xyz, log_scale, MATRIX, first_px=7.5, stride_px=8.0, options=options)
+def decoded(
+    xyz: np.ndarray,
+    log_scale: np.ndarray,
+    options: DecodingOptions | None = None,
+    vertical: KnownVertical | None = None,
+):
+    return decode(
+        *(xyz, log_scale, MATRIX),
+        first_px=7.5,
+        stride_px=8.0,
+        options=options,
+        vertical=vertical,
+    )
+
+
+def vertical_off_by(tilt_deg: float, sigma_deg: float) -> KnownVertical:
+    """Return up of the true pose, turned about the camera's x axis, with a stated standard deviation."""
+    turn = rotations_from_vectors(np.deg2rad([[tilt_deg, 0.0, 0.0]]))[0]
+    x, y, z = (turn @ TRUE.rotations[0][:, 2]).tolist()
+    return KnownVertical(up=(x, y, z), sigma_deg=sigma_deg)
 
 
 def scene(seed: int) -> np.ndarray:
@@ -158,6 +177,57 @@ def test_neighbours_that_err_alike_count_less():
     one = decoded(xyz, log_scale, STILL).covariance
     many = decoded(xyz, log_scale, replace(STILL, cells_per_observation=9.0)).covariance
     assert many == pytest.approx(9 * one)
+
+
+def test_a_known_vertical_halves_the_tilt_with_a_true_covariance():
+    """With a vertical of 0.1 degrees, the tilt is less than half as wrong, and the mean NEES is near 6."""
+    rng = np.random.default_rng(20)
+    options, scale = replace(STILL, cells=100), np.full(GRID[::-1], 0.1)
+    tilts: dict[bool, list[float]] = {True: [], False: []}
+    squares = []
+    for seed in range(20):
+        xyz = scene(seed) + laplace(rng, scale)
+        up = vertical_off_by(0.1 * rng.normal(), 0.1)
+        for known in (True, False):
+            found = decoded(xyz, np.log(scale), options, up if known else None)
+            turn = rotation_vectors(TRUE.rotations @ found.poses.rotations.transpose(0, 2, 1))[0]
+            tilt = np.linalg.norm(np.cross(TRUE.rotations[0][:, 2], turn))
+            tilts[known].append(float(np.rad2deg(tilt)))
+            if known:
+                error = np.concatenate([TRUE.centers[0] - found.poses.centers[0], turn])
+                squares.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(tilts[True]) < 0.5 * np.mean(tilts[False])
+    assert 4 < np.mean(squares) < 8
+
+
+def test_a_vertical_that_contradicts_the_cells_is_refused():
+    """A vertical that is off by 10 of its standard deviations gives no pose; one that is off by one does."""
+    xyz, log_scale = scene(21), np.full(GRID[::-1], -3.0)
+    assert decoded(xyz, log_scale, STILL, vertical_off_by(1.0, 1.0)).inliers > 600
+    with pytest.raises(GeometryError, match="contradicts the stated attitude by 10"):
+        decoded(xyz, log_scale, STILL, vertical_off_by(10.0, 1.0))
+    # A vertical that outweighs the cells would draw the pose away from them, and silence them.
+    xyz += laplace(np.random.default_rng(21), np.exp(log_scale))
+    weak = replace(STILL, cells_per_observation=100.0)
+    with pytest.raises(GeometryError, match="contradicts the stated attitude"):
+        decoded(xyz, log_scale, weak, vertical_off_by(4.0, 0.1))
+
+
+def test_a_known_vertical_levels_a_regressed_pose():
+    """A pose that is tilted by 4 degrees, known to 3, becomes level to a fifth; heading and place stay."""
+    turn = rotations_from_vectors(np.deg2rad([[4.0, 0.0, 0.0]]))
+    tilted = Poses.from_rotations(TRUE.centers, turn @ TRUE.rotations)
+    covariance = np.diag([0.5**2] * 3 + [np.deg2rad(3.0) ** 2] * 3)
+    found, after = with_vertical(tilted, covariance, vertical_off_by(0.0, 0.5))
+    up, before = found.rotations[0][:, 2], tilted.rotations[0][:, 2]
+    off_deg, before_deg = (np.rad2deg(np.arccos(u @ TRUE.rotations[0][:, 2])) for u in (up, before))
+    assert off_deg < 0.05 * before_deg
+    assert found.centers == pytest.approx(TRUE.centers)
+    about_up = TRUE.rotations[0][:, 2]
+    assert about_up @ after[3:, 3:] @ about_up == pytest.approx(np.deg2rad(3.0) ** 2, rel=0.05)
+    assert np.trace(after[3:, 3:]) < 0.4 * np.trace(covariance[3:, 3:])
+    with pytest.raises(GeometryError, match="contradicts the stated attitude"):
+        with_vertical(tilted, covariance, vertical_off_by(-20.0, 0.5))
 
 
 def test_nonsense_gives_no_pose():

@@ -18,6 +18,7 @@ from spn_data.geometry.camera_file import camera_to_json
 from spn_data.storage.json_files import write_json
 from spn_model.integrity.fix import NoFix
 from spn_model.onboard.__main__ import main
+from spn_model.onboard.bundle import read_bundle
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
 pytestmark = pytest.mark.slow
@@ -72,6 +73,50 @@ def test_a_recorded_flight_gets_fixes(flown_area, camera_file, flight1, tmp_path
             assert np.hypot(*off[:2]) < line["horizontal_protection_m"]
             assert abs(off[2]) < line["vertical_protection_m"]
     assert compared > 5
+
+
+def test_an_attitude_is_compared_with_each_fix(flown_area, camera_file, flight1, tmp_path, capsys):
+    """The flight's own gimbal angles change no fix; angles that are 10 degrees off leave none."""
+    bundle = flown_area / "runs" / "default" / "bundle"
+    # The flight has too few frames for the bundle to know its gimbal.
+    assert json.loads((bundle / "bundle.json").read_text())["gimbal"] is None
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    table = flown_area / "1-frames" / "telemetry" / "flight1.csv"
+    wrong = tmp_path / "wrong.csv"
+    first, header, *rows = table.read_text().splitlines()
+    column = header.split(",").index("pitch_deg")
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[column] = str(float(row[column]) + 10)
+    wrong.write_text("\n".join([first, header, *(",".join(row) for row in cells)]))
+    usable = {}
+    for path in (None, table, wrong):
+        given = [] if path is None else ["--attitude", str(path), "--attitude-sigma", "1"]
+        assert main([*words, "--no-network", *given]) == 0
+        printed = capsys.readouterr().out
+        usable[path] = int(printed.split("Usable fixes: ")[1].split()[0])
+        assert (" images, to 1 deg." in printed) == (path is not None)
+    assert usable[None] == usable[table] > 0
+    assert usable[wrong] == 0
+    assert "the images contradict the stated attitude by # standard deviations" in printed
+
+
+def test_the_self_test_compares_the_first_fix(flown_area, camera_file, flight1, capsys):
+    """At the labelled place of the first images the drone is ready; 50 m away it is not, nor at no place."""
+    labels = spn_data.open_area(flown_area).labels()
+    first = labels.poses.centers[np.flatnonzero(labels.registered)[0]]
+    bundle = flown_area / "runs" / "default" / "bundle"
+    origin = read_bundle(bundle).view.origin
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    for north_m, code in ((0.0, 0), (50.0, 1)):
+        lat, lon, _ = origin.wgs84_from_enu(first[None] + [0.0, north_m, 0.0])[0].tolist()
+        at = ["--at", repr(lat), repr(lon)]
+        assert main([*words, "--no-network", "--pre-arm", *at]) == code
+        printed = capsys.readouterr()
+        assert printed.out.endswith("Ready.\n") == (code == 0)
+        assert ("m from the stated position, 9.0 m is allowed" in printed.err) == (code == 1)
+    assert main([*words, "--pre-arm", "--at", "91", "8"]) == 1
+    assert "the stated position 91, 8 with 3 m is none" in capsys.readouterr().err
 
 
 def test_images_that_show_nothing_of_the_map_have_no_fix(flown_area, camera_file):
