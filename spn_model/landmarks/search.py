@@ -189,8 +189,8 @@ def _refine(
 ) -> Candidate | None:
     """Match around the projections and solve, until no more landmarks agree."""
     best, agreeing = None, 0
+    wanted = _seen_from(landmarks, features, center, rotation, 1.0)
     for _ in range(_ROUNDS):
-        wanted = _seen_from(landmarks, features, center, rotation, 1.0)
         seen = match_near(features, landmarks, wanted, SEARCH_PX)
         pose = solve(seen, center, rotation, vertical) if len(seen) >= _MIN_FIRST else None
         if pose is None:
@@ -203,6 +203,7 @@ def _refine(
         center, rotation, agreeing = pose.center, pose.rotation, count
         if settled:
             break
+        wanted = wanted.seen_from(landmarks, center, rotation, features.focal_px)
     return best
 
 
