@@ -20,7 +20,7 @@ _MAX_LANDMARKS = 2500  # compared with the image; the ones seen most alike
 _MAX_RATIO = 0.88  # distance of the nearest landmark over that of the second nearest
 _MIN_SIMILARITY = 1 - 0.8**2 / 2  # of unit descriptors; a distance of at most 0.8
 STRONGEST = 400  # features that are compared with all landmarks
-_BLOCK = 2048  # landmarks compared at once, so that their similarities fit into the CPU cache
+_BLOCK = 1024  # landmarks compared at once, so that their similarities fit into the CPU cache
 _SIZE_PX = 12.0  # scale of keypoints with twice the standard deviation of small ones
 
 
@@ -93,7 +93,7 @@ class Expected:
     ) -> Expected:
         """Return the same landmarks as a pose close to the first one sees them."""
         return replace(
-            self, at=_projected(landmarks.xyz[self.landmarks], center, rotation, focal_px)
+            self, at=projected(landmarks.xyz[self.landmarks], center, rotation, focal_px)
         )
 
 
@@ -147,10 +147,10 @@ def expected(
     return Expected(rows, own, inverse.ravel(), x[own, :2] / z[own, None] * focal_px)
 
 
-def _projected(
+def projected(
     xyz: np.ndarray, center: np.ndarray, rotation: np.ndarray, focal_px: float
 ) -> np.ndarray:
-    """Return the projections (N, 2) of points; infinity behind the camera."""
+    """Return the projections (N, 2) of points relative to the principal point; infinity behind the camera."""
     x = to_camera(xyz, center, rotation)
     z = np.where(x[:, 2:] > _MIN_DEPTH_M, x[:, 2:], np.nan)
     return np.nan_to_num(x[:, :2] / z * focal_px, nan=np.inf)

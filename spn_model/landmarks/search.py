@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from spn_model.landmarks.matching import (
     match,
     match_all,
     match_near,
+    projected,
 )
 from spn_model.landmarks.solver import (
     KnownVertical,
@@ -33,7 +34,7 @@ _MIN_FIRST = 8  # sightings that agree with a first pose
 _ROUNDS = 6  # of matching around the projections
 _SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
 ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
-WEAK = 120  # landmarks that agree below which all features are compared, not only the strongest
+WEAK = 120  # landmarks that agree below which more is tried
 MAP = "retrieval"  # among all landmarks
 _MARGIN = 1.25  # on the field of view of an uncertain hypothesis
 
@@ -107,19 +108,21 @@ class Found:
 def search(
     landmarks: LandmarkMap,
     features: ImageFeatures,
-    hypotheses: Sequence[Hypothesis] = (),
+    hypotheses: Iterable[Hypothesis] = (),
     vertical: KnownVertical | None = None,
 ) -> Found | None:
     """Find the pose of an image.
 
-    The features are compared with all landmarks of the map, and with those that each hypothesis sees. What
-    does not agree with the best pose is asked for another one.
+    The strongest features are compared with all landmarks of the map. If few landmarks agree with the pose
+    that follows, the hypotheses are tried, and at last all features are compared. What does not agree with
+    the best pose is asked for another one.
 
     Parameters
     ----------
     landmarks : LandmarkMap
     features : ImageFeatures
-    hypotheses : sequence of Hypothesis
+    hypotheses : iterable of Hypothesis
+        The most promising first; one that need not be tried is not drawn, so they may be costly.
     vertical : KnownVertical, optional
 
     Returns
@@ -127,25 +130,30 @@ def search(
     Found or None
         None if too few landmarks agree on any pose.
     """
-    found = [
-        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess), vertical)
-        for guess in hypotheses
-    ]
     compared = match_all(features, landmarks)
-    found.append(_candidate(landmarks, features, MAP, compared, vertical))
-    if max((c.agreeing for c in found if c), default=0) < WEAK:
+    found = [_candidate(landmarks, features, MAP, compared, vertical)]
+    remaining = iter(hypotheses)
+    while _is_weak(found) and (guess := next(remaining, None)) is not None:
+        seen = _guided(landmarks, features, guess)
+        found.append(_candidate(landmarks, features, guess.source, seen, vertical))
+    if _is_weak(found):
         compared = match_all(features, landmarks, len(features))
         found.append(_candidate(landmarks, features, MAP, compared, vertical))
     best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
-    if best is not None:
-        used = best.seen.features[best.pose.inliers]
-        rest = compared.select(~np.isin(compared.features, used))
-        found.append(_candidate(landmarks, features, MAP, rest, vertical))
-    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
-    if not poses:
+    if best is None:
         return None
+    # Sightings that nearly agree with the best pose would only lead to it again.
+    off_px = np.abs(compared.at - projected(compared.xyz, best.pose.center, best.pose.rotation, features.focal_px)).max(axis=1)
+    rest = compared.select(off_px > SEARCH_PX)
+    found.append(_candidate(landmarks, features, MAP, rest, vertical))
+    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
     rivals = [c.agreeing for c in poses[1:] if c.is_elsewhere(poses[0])]
     return Found(poses[0], max(rivals, default=0))
+
+
+def _is_weak(found: list[Candidate | None]) -> bool:
+    """Return whether few landmarks agree with the best pose so far."""
+    return max((c.agreeing for c in found if c), default=0) < WEAK
 
 
 def follow(
