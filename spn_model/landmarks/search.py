@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from spn_model.landmarks.solver import (
 
 FIRST_PX = 4.0  # of RANSAC
 SEARCH_PX = 12.0  # around a projection, once there is a pose
+FOLLOW_PX = 24.0  # around a predicted one
 _MIN_FIRST = 8  # sightings that agree with a first pose
 _ROUNDS = 6  # of matching around the projections
 _SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
@@ -162,9 +164,17 @@ def follow(
     guess: Hypothesis,
     vertical: KnownVertical | None = None,
 ) -> Found | None:
-    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there."""
-    seen = _guided(landmarks, features, guess)
-    found = _candidate(landmarks, features, guess.source, seen, vertical)
+    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there.
+
+    Landmarks are looked for close to their projections first, which is quick and mostly enough.
+    """
+    found = _refine(
+        landmarks, features, guess.source, guess.center, guess.rotation, vertical, FOLLOW_PX
+    )
+    if found is None or found.agreeing < WEAK:
+        seen = _guided(landmarks, features, guess)
+        wide = _candidate(landmarks, features, guess.source, seen, vertical)
+        found = max((c for c in (found, wide) if c), key=lambda c: c.agreeing, default=None)
     return None if found is None else Found(found, 0)
 
 
@@ -194,23 +204,27 @@ def _refine(
     center: np.ndarray,
     rotation: np.ndarray,
     vertical: KnownVertical | None,
+    first_px: float = SEARCH_PX,
 ) -> Candidate | None:
-    """Match around the projections and solve, until no more landmarks agree."""
+    """Match around the projections and solve, until no more landmarks agree; at first within `first_px`."""
     best, agreeing = None, 0
     wanted = _seen_from(landmarks, features, center, rotation, 1.0)
+    radius_px = first_px
     for _ in range(_ROUNDS):
-        seen = match_near(features, landmarks, wanted, SEARCH_PX)
+        seen = match_near(features, landmarks, wanted, radius_px)
         pose = solve(seen, center, rotation, vertical) if len(seen) >= _MIN_FIRST else None
         if pose is None:
             break
         count = int(pose.inliers.sum())
         if count <= agreeing:
             break
-        settled = best is not None and count <= _SETTLED * agreeing
+        settled = count <= _SETTLED * agreeing
         best = Candidate(source=source, pose=pose, seen=seen)
-        center, rotation, agreeing = pose.center, pose.rotation, count
+        center, rotation = pose.center, pose.rotation
         if settled:
             break
+        agreeing = count if radius_px == SEARCH_PX else 0  # a wide round is only a start
+        radius_px = SEARCH_PX
         wanted = wanted.seen_from(landmarks, center, rotation, features.focal_px)
     return best
 
@@ -227,15 +241,23 @@ def _seen_from(
     )
 
 
+class HasView(Protocol):
+    """What the landmarks of a candidate were found in: features, or an anchor."""
+
+    @property
+    def half_view(self) -> np.ndarray:
+        """Tangents (2,) of half the field of view, with distortion."""
+
+
 def witness_of(
-    found: Found, features: ImageFeatures, vertical: KnownVertical | None = None
+    found: Found, features: HasView, vertical: KnownVertical | None = None
 ) -> Witness:
     """Return what is known about the pose of a candidate, for its judgement."""
     best, tilt = found.best, 0.0
     if vertical is not None:
         tilt = float(np.linalg.norm(vertical_terms(vertical, best.pose.rotation)[1]))
     return Witness(
-        at=best.seen.at / features.focal_px / features.half_view,
+        at=best.seen.at / best.seen.focal_px / features.half_view,
         xyz=best.seen.xyz,
         residuals=best.pose.residuals,
         jacobian=best.pose.jacobian,
