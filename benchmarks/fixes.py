@@ -26,6 +26,7 @@ from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels
 from spn_model.integrity.fix import Fix
+from spn_model.onboard.flight_report import StepTimes
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
 MISLEADING_M, MISLEADING_DEG = 0.5, 2.0
@@ -83,15 +84,17 @@ def main() -> None:
     area, reader = Area(given.area), spn_data.open_area(given.area)
     options = PilotOptions(sequence=False, network=not given.no_network)
     print(f"{'frames':34} usable of      median   deg   max m  NEES/6  PL>=err  misleading   ms")
+    tables: list[tuple[str, StepTimes]] = []
     for name in [n for n in reader.sequences if "mapping" not in n]:
         labels, camera = reader.labels(name), reader.map.cameras[name]
         rows = np.flatnonzero(labels.registered & ~labels.tracked)
         pilot = Pilot(given.bundle, camera, options)
-        results, times, bad = [], [], 0
+        results, times, steps, bad = [], [], StepTimes(), 0
         for row in rows.tolist():
             image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
             fix = pilot.fix(image, 1)
             times.append(fix.processing_s)
+            steps.add(pilot.steps_s, fix.processing_s)
             if isinstance(fix, Fix):
                 results.append(errors(fix, labels, row))
                 bad += results[-1][3]
@@ -102,6 +105,7 @@ def main() -> None:
             f"{100 * (1 - bad / max(len(found), 1)):7.1f} % {bad:8}  {1e3 * np.median(times):8.0f}",
             flush=True,
         )
+        tables.append((name, steps))
         kinds: dict[str, list[int]] = {}
         for row in rows[:: max(1, len(rows) // max(given.spoilt, 1))][: given.spoilt].tolist():
             image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
@@ -127,6 +131,8 @@ def main() -> None:
             of += 1
             usable += isinstance(pilot.fix(cv2.imread(str(path)), 1), Fix)
         print(f"{'foreign: ' + folder.name:34} {usable:5} {of:5} {'':41} {usable:8}", flush=True)
+    for name, steps in tables:
+        print("\n".join(["", f"{name}, each image alone:", *steps.lines()]))
 
 
 if __name__ == "__main__":

@@ -94,7 +94,9 @@ class Anchor:
             sigma_px=np.hypot(kept.sigma_px, _NOISE_PX),
         )
         pose = solve(seen, guess.center, guess.rotation, vertical)
-        return None if pose is None else Found(Candidate(source=guess.source, pose=pose, seen=seen), 0)
+        return (
+            None if pose is None else Found(Candidate(source=guess.source, pose=pose, seen=seen), 0)
+        )
 
 
 def reduced(gray: np.ndarray, width_px: int) -> np.ndarray:

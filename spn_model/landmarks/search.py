@@ -145,7 +145,10 @@ def search(
     if best is None:
         return None
     # Sightings that nearly agree with the best pose would only lead to it again.
-    off_px = np.abs(compared.at - projected(compared.xyz, best.pose.center, best.pose.rotation, features.focal_px)).max(axis=1)
+    off_px = np.abs(
+        compared.at
+        - projected(compared.xyz, best.pose.center, best.pose.rotation, features.focal_px)
+    ).max(axis=1)
     rest = compared.select(off_px > SEARCH_PX)
     found.append(_candidate(landmarks, features, MAP, rest, vertical))
     poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
@@ -249,9 +252,7 @@ class HasView(Protocol):
         """Tangents (2,) of half the field of view, with distortion."""
 
 
-def witness_of(
-    found: Found, features: HasView, vertical: KnownVertical | None = None
-) -> Witness:
+def witness_of(found: Found, features: HasView, vertical: KnownVertical | None = None) -> Witness:
     """Return what is known about the pose of a candidate, for its judgement."""
     best, tilt = found.best, 0.0
     if vertical is not None:

@@ -115,7 +115,9 @@ class Pilot:
         self._agreement = Agreement(self.options.motion)
         self._offset = np.array(self.localizer.bundle.view.offset)
         self.steps_s: dict[str, float] = {}
-        self._passed: list[tuple[float, Poses]] = []  # the last two poses that passed, with their times
+        self._passed: list[
+            tuple[float, Poses]
+        ] = []  # the last two poses that passed, with their times
         self._anchor: tuple[int, Anchor] | None = None  # with its time
         self._searched_us = 0
         self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
@@ -170,9 +172,7 @@ class Pilot:
                     reason="the pose contradicts the motion since the last fix",
                     processing_s=time.perf_counter() - begin,
                 )
-            self._remember(
-                time_us, Poses.from_rotations(pose.center[None], pose.rotation[None])
-            )
+            self._remember(time_us, Poses.from_rotations(pose.center[None], pose.rotation[None]))
         shown = Poses.from_rotations((pose.center + self._offset)[None], pose.rotation[None])
         return Fix(
             time_us=time_us,
@@ -325,5 +325,7 @@ class Pilot:
 
     def _remember(self, time_us: int, pose: Poses) -> None:
         """Keep two poses for the prediction, unless too much time passed between them."""
-        recent = [p for p in self._passed if 0 < time_us * 1e-6 - p[0] < self.options.motion.coast_s]
+        recent = [
+            p for p in self._passed if 0 < time_us * 1e-6 - p[0] < self.options.motion.coast_s
+        ]
         self._passed = [*recent[-1:], (time_us * 1e-6, pose)]
