@@ -15,7 +15,7 @@ from spn_model.autopilot.datum import Datum, Geodetic
 from spn_model.autopilot.frames import NED_FROM_ENU, BodyPose, Mounting, body_pose
 from spn_model.autopilot.profiles import LOCAL_MESSAGES, MAX_LOCAL_M, STALE_S, Message, Profile
 from spn_model.autopilot.timesync import Timesync
-from spn_model.integrity.coasting import Motion
+from spn_model.integrity.coasting import RecentFixes
 from spn_model.integrity.fix import Fix, FixState, NoFix
 
 _STALE_US = round(STALE_S * 1e6)
@@ -156,7 +156,7 @@ class Sender:
     _waiting: Fix | None = None
     _last_us: int = 0  # stamp of the last pose sent
     _measured_us: int = 0  # exposure of the last fix sent
-    _motion: Motion = field(default_factory=Motion)
+    _recent: RecentFixes = field(default_factory=RecentFixes)
     _fresh_until_us: int = 0
     _failed_us: int = 0  # exposure of the last image without a usable fix
     _lost: bool = False
@@ -172,14 +172,14 @@ class Sender:
             if isinstance(item, Fix) and item.usable:
                 self.report.replaced += self._waiting is not None
                 self._waiting = item
-                self._motion.add(item)
+                self._recent.add(item)
                 return
             if isinstance(item, Fix):
                 self.report.refused += 1
             if (
                 item.state != FixState.COAST
             ):  # after a single image without a pose, predictions go on
-                self._motion.clear()
+                self._recent.clear()
             if item.state == FixState.LOST:
                 self._lost, self._waiting = True, None
             self._failed_us = item.time_us
@@ -259,7 +259,7 @@ class Sender:
         if fix.time_us <= self._last_us:
             # After a prediction for a later time, receivers take no older pose: the fix is moved on.
             newer = fix.time_us > self._measured_us
-            pose = self._motion.predicted(self._last_us + _STEP_US) if newer else None
+            pose = self._recent.predicted(self._last_us + _STEP_US) if newer else None
         if pose is None:
             self.report.repeated += 1
             return []
@@ -287,8 +287,8 @@ class Sender:
         if self._measured_us == 0 or time_us <= self._last_us:
             return None
         slots = math.ceil(self.options.coast_s * self.profile.rate_hz)
-        found = self._motion.predicted(time_us, shared_by=max(1, slots))
-        too_old = found is None or time_us - self._motion.last_us > self.options.coast_s * 1e6
+        found = self._recent.predicted(time_us, shared_by=max(1, slots))
+        too_old = found is None or time_us - self._recent.last_us > self.options.coast_s * 1e6
         return None if too_old else found
 
     def _built(self, fix: Fix, now_us: int) -> list[Any]:

@@ -64,7 +64,7 @@ def coasted(first: Fix, last: Fix, time_us: int, *, shared_by: int = 1) -> Fix:
     )
 
 
-class Motion:
+class RecentFixes:
     """Usable fixes of the last half second, from which poses are predicted."""
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Motion:
             self._fixes = [*(f for f in self._fixes if f.time_us >= since), fix]
 
     def clear(self) -> None:
-        """Forget the motion."""
+        """Forget the recent."""
         self._fixes.clear()
 
     def predicted(self, time_us: int, *, shared_by: int = 1) -> Fix | None:

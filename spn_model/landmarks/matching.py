@@ -156,14 +156,21 @@ def projected(
     return np.nan_to_num(x[:, :2] / z * focal_px, nan=np.inf)
 
 
-def match(features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected) -> Sightings:
-    """Match features with expected landmarks anywhere in the image: mutual nearest, and no other as near.
+def match(
+    features: ImageFeatures,
+    landmarks: LandmarkMap,
+    candidates: Expected,
+    radius_px: float | None = None,
+) -> Sightings:
+    """Match features with expected landmarks in much of the image: mutual nearest, and no other as near.
 
     Parameters
     ----------
     features : ImageFeatures
     landmarks : LandmarkMap
     candidates : Expected
+    radius_px : float, optional
+        Largest distance of a feature from the projection of its landmark along each axis.
 
     Returns
     -------
@@ -172,13 +179,17 @@ def match(features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected)
     """
     similarity = features.units @ landmarks.units[candidates.rows].T
     row, column = np.nonzero(similarity > _MIN_SIMILARITY)
+    if radius_px is not None:
+        off_px = np.abs(features.at[row] - candidates.at[candidates.owner[column]])
+        near = (off_px < radius_px).all(axis=1)
+        row, column = row[near], column[near]
     return _best(features, landmarks, candidates, row, column, similarity[row, column])
 
 
 def match_near(
     features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected, radius_px: float
 ) -> Sightings:
-    """Match features with expected landmarks close to their projections.
+    """Match features with expected landmarks close to their projections: as `match`, fast for small radii.
 
     Parameters
     ----------

@@ -182,11 +182,9 @@ def follow(
 
 
 def _guided(landmarks: LandmarkMap, features: ImageFeatures, guess: Hypothesis) -> Sightings:
-    if guess.radius_px is None:
-        wanted = _seen_from(landmarks, features, guess.center, guess.rotation, _MARGIN)
-        return match(features, landmarks, wanted)
-    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, 1.0)
-    return match_near(features, landmarks, wanted, guess.radius_px)
+    margin = _MARGIN if guess.radius_px is None else 1.0
+    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, margin)
+    return match(features, landmarks, wanted, guess.radius_px)
 
 
 def _candidate(

@@ -12,6 +12,7 @@ from spn_data.capture.frames import FrameStatus
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.pose_fit import fit_pose
 from spn_data.geometry.rotations import rotations_from_angles
+from spn_data.matching.patches import track_points
 from spn_data.tracking.label_video import drop_jumps, track_frames
 from spn_data.tracking.point_tracking import spread_points, track_segment
 from spn_data.tracking.segments import read_segments

@@ -6,7 +6,7 @@ import numpy as np
 
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_angles
-from spn_model.integrity.coasting import Motion, coasted
+from spn_model.integrity.coasting import RecentFixes, coasted
 from spn_model.integrity.fix import FixState
 from tests.worlds.autopilots import NOW_US, make_fix
 
@@ -56,14 +56,14 @@ def test_the_covariance_of_a_prediction_holds_and_grows():
 
 def test_a_motion_needs_two_fixes_of_the_last_half_second():
     """One fix, fixes a second apart and a time before the last fix give no prediction."""
-    rng, motion = np.random.default_rng(0), Motion()
-    assert motion.predicted(NOW_US) is None
-    motion.add(fixed(0.0, rng))
-    assert motion.predicted(NOW_US + 100_000) is None
-    motion.add(fixed(1.0, rng))
-    assert motion.predicted(NOW_US + 1_100_000) is None
-    motion.add(fixed(1.2, rng))
-    assert motion.predicted(NOW_US + 1_100_000) is None
-    assert motion.predicted(NOW_US + 1_300_000) is not None
-    motion.clear()
-    assert motion.predicted(NOW_US + 1_300_000) is None
+    rng, recent = np.random.default_rng(0), RecentFixes()
+    assert recent.predicted(NOW_US) is None
+    recent.add(fixed(0.0, rng))
+    assert recent.predicted(NOW_US + 100_000) is None
+    recent.add(fixed(1.0, rng))
+    assert recent.predicted(NOW_US + 1_100_000) is None
+    recent.add(fixed(1.2, rng))
+    assert recent.predicted(NOW_US + 1_100_000) is None
+    assert recent.predicted(NOW_US + 1_300_000) is not None
+    recent.clear()
+    assert recent.predicted(NOW_US + 1_300_000) is None
