@@ -82,7 +82,7 @@ class RecentFixes:
             self._fixes = [*(f for f in self._fixes if f.time_us >= since), fix]
 
     def clear(self) -> None:
-        """Forget the recent."""
+        """Forget the fixes, since the motion may have changed."""
         self._fixes.clear()
 
     def predicted(self, time_us: int, *, shared_by: int = 1) -> Fix | None:
