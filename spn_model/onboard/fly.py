@@ -41,6 +41,8 @@ def fly(arguments: list[str]) -> None:
         raise InputError(
             "--mavlink goes to an autopilot: give --profile px4 or ardupilot; --to writes a ROS 2 bag"
         )
+    if given.parameters is not None:
+        _write_parameters(given.parameters, given.profile, messages, use_height=given.use_height)
     cv2.setNumThreads(given.threads)
     check_sources([given.source])
     pilot = Pilot(
@@ -56,8 +58,6 @@ def fly(arguments: list[str]) -> None:
             "its world has no metres, so a fix in it means nothing outside; georegister the area",
             path=given.bundle,
         )
-    if given.parameters is not None:
-        _write_parameters(given.parameters, given.profile, messages, use_height=given.use_height)
     datum = (
         None
         if view.origin is None
