@@ -48,7 +48,7 @@ class SenderOptions:
         that fix instead of testing it, so this is off by default.
     coast_s : float
         Age of the last fix up to which poses predicted from it go out between images, 0 to 1 s; 0: none.
-        They have the state `coast` and a quality of at most 49.
+        They have the state `coast` and the quality 49, below that of every fix.
     flag_unhealthy : bool
         Send GLOBAL_POSITION_SENSOR with the flag for an unhealthy sensor while there is no fix, instead of
         none. Off by default: it could not be verified that PX4 heeds the flag, but it does stop after 5 s
@@ -87,9 +87,9 @@ class SenderReport:
     Attributes
     ----------
     sent : int
-        Fixes sent.
+        Fixes sent, those moved on after a prediction included.
     coasted : int
-        Predictions sent, those in place of a fix included.
+        Predictions sent.
     failed : int
         Slots in which it was said that there is no fix.
     stale : int

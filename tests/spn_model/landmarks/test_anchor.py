@@ -51,7 +51,7 @@ def guess(row: int) -> Hypothesis:
 
 @pytest.mark.parametrize("covered", [False, True])
 def test_images_after_an_anchor_have_their_pose_with_a_true_covariance(covered):
-    """Images from a start 0.1 s off: centimetres, and NEES holds, also with a third covered by another picture."""
+    """Images from a start 0.1 s off: centimetres, and NEES holds, also if another picture covers a third."""
     nees = []
     for row in (FIRST + 1, FIRST + 3, FIRST + 6):
         image = render(POSES[row : row + 1])

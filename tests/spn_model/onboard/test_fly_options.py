@@ -24,7 +24,7 @@ WORDS = ["fly", "bundle", "flight.mp4", "--camera", "camera.json"]
     ],
 )
 def test_the_parameter_file_belongs_to_the_options(options, expected, tmp_path, capsys):
-    """It is that of the profile and the messages, and is not written over; the flight itself has no bundle."""
+    """It is that of the profile and the messages, and is not written over; the flight has no bundle."""
     path = tmp_path / "receiver.params"
     assert main([*WORDS, *options, "--parameters", str(path)]) == 1
     assert "flight.mp4" in capsys.readouterr().err
