@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from spn_data.geometry.camera import Camera
@@ -97,13 +96,3 @@ class Anchor:
         return (
             None if pose is None else Found(Candidate(source=guess.source, pose=pose, seen=seen), 0)
         )
-
-
-def reduced(gray: np.ndarray, width_px: int) -> np.ndarray:
-    """Return a grey image whose longer side is at most `width_px`, as features are detected in it."""
-    height, width = gray.shape
-    scale = min(1.0, width_px / max(height, width))
-    if scale == 1:
-        return gray
-    size = (round(width * scale), round(height * scale))
-    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)

@@ -15,11 +15,11 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses, interpolate_pose
-from spn_data.matching.features import extract
+from spn_data.matching.features import extract, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
-from spn_model.landmarks.anchor import Anchor, reduced
+from spn_model.landmarks.anchor import Anchor
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import (
