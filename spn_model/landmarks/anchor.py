@@ -24,7 +24,7 @@ _MIN_POINTS = 60  # below which features are detected instead
 
 
 @dataclass(frozen=True, eq=False)
-class Anchor:
+class LandmarkAnchor:
     """Landmarks that agreed with the pose of an image, and the image.
 
     Attributes
@@ -50,7 +50,7 @@ class Anchor:
     @classmethod
     def of(
         cls, gray: np.ndarray, camera: Camera, candidate: Candidate, half_view: np.ndarray
-    ) -> Anchor:
+    ) -> LandmarkAnchor:
         """Return the anchor of an image with its pose; the landmarks that agree best are kept."""
         off = (candidate.pose.residuals**2).sum(axis=1)
         rows = np.argsort(off, kind="stable")[: min(candidate.agreeing, _MAX_POINTS)]

@@ -19,7 +19,7 @@ from spn_data.matching.features import extract, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
-from spn_model.landmarks.anchor import Anchor
+from spn_model.landmarks.anchor import LandmarkAnchor
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import (
@@ -118,7 +118,7 @@ class Pilot:
         self._passed: list[
             tuple[float, Poses]
         ] = []  # the last two poses that passed, with their times
-        self._anchor: tuple[int, Anchor] | None = None  # with its time
+        self._anchor: tuple[int, LandmarkAnchor] | None = None  # with its time
         self._searched_us = 0
         self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
 
@@ -246,7 +246,10 @@ class Pilot:
         if self.options.sequence:
             small = reduced(gray, self.landmarks.facts.features.max_image_size_px)
             camera = self.camera.scaled(small.shape[1], small.shape[0])
-            self._anchor = (time_us, Anchor.of(small, camera, candidate, features.half_view))
+            self._anchor = (
+                time_us,
+                LandmarkAnchor.of(small, camera, candidate, features.half_view),
+            )
 
     def _judged(
         self, found: Found | None, view: HasView, vertical: KnownVertical | None
@@ -258,7 +261,9 @@ class Pilot:
             verdict = judge(witness, self.options.limits)
         if not self.options.sequence:
             return verdict
-        if not isinstance(view, Anchor):  # what follows one has its errors, and tells nothing new
+        if not isinstance(
+            view, LandmarkAnchor
+        ):  # what follows one has its errors, and tells nothing new
             self._weigh_lens(witness)
         return replace(verdict, reason=verdict.reason or self._lens_over_time())
 

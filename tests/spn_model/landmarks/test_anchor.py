@@ -8,7 +8,7 @@ import pytest
 from spn_data.geometry.pose import to_camera
 from spn_data.geometry.rotations import rotation_vectors
 from spn_model.integrity.judgement import IntegrityLimits, judge
-from spn_model.landmarks.anchor import Anchor
+from spn_model.landmarks.anchor import LandmarkAnchor
 from spn_model.landmarks.search import Candidate, Hypothesis, witness_of
 from spn_model.landmarks.solver import Sightings, solve
 from tests.worlds.tracking_world import CAMERA, path, rays_of, render, surfaces
@@ -19,7 +19,7 @@ NOISE_PX = 0.2
 WRONG = 10  # measurements that are of something else
 
 
-def anchor(seed: int = 0) -> Anchor:
+def anchor(seed: int = 0) -> LandmarkAnchor:
     """Return the anchor of an image of the flight, with landmarks at a grid of its pixels."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(12, 480, 24.0), np.arange(12, 270, 24.0))
@@ -41,7 +41,7 @@ def anchor(seed: int = 0) -> Anchor:
     assert solved is not None
     half_view = np.abs(CAMERA.unproject(np.array([[0, 0], [480, 270.0]]))).max(axis=0)
     candidate = Candidate(source="track", pose=solved, seen=seen)
-    return Anchor.of(render(pose), CAMERA, candidate, half_view)
+    return LandmarkAnchor.of(render(pose), CAMERA, candidate, half_view)
 
 
 def guess(row: int) -> Hypothesis:
