@@ -32,6 +32,7 @@ from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels
 from spn_model.integrity.fix import Fix
 from spn_model.landmarks.solver import KnownVertical
+from spn_model.onboard.flight_report import StepTimes
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
 MISLEADING_M, MISLEADING_DEG = 0.5, 2.0
@@ -107,28 +108,28 @@ def coarse(
 
 def measured(
     pilot: Pilot, area: Area, name: str, labels: Labels, rows: np.ndarray, sigma_deg: float | None
-) -> tuple[int, np.ndarray, list[float]]:
-    """Return the number of frames, the errors of their fixes, and the processing times."""
-    results, times, rng = [], [], np.random.default_rng(0)
+) -> tuple[np.ndarray, StepTimes]:
+    """Return the errors of the fixes of some frames, and the times of the steps."""
+    results, steps, rng = [], StepTimes(), np.random.default_rng(0)
     for row in rows.tolist():
         image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
         vertical = None
         if sigma_deg is not None:
             vertical = noisy_vertical(labels.poses.rotations[row], sigma_deg, rng)
         fix = pilot.fix(image, 1, vertical)
-        times.append(fix.processing_s)
+        steps.add(pilot.steps_s, fix.processing_s)
         if isinstance(fix, Fix):
             results.append(errors(fix, labels, row))
-    return len(rows), np.array(results, dtype=float).reshape(-1, 4), times
+    return np.array(results, dtype=float).reshape(-1, 4), steps
 
 
-def show(name: str, of: int, found: np.ndarray, times: list[float]) -> None:
+def show(name: str, of: int, found: np.ndarray, steps: StepTimes) -> None:
     """Print the row of a set of frames."""
     bad = int(found[:, 3].sum())
     print(
         f"{name:34} {len(found):5} {of:5} {np.median(found[:, 0]):8.4f} "
         f"{np.median(found[:, 1]):6.3f} {found[:, 0].max(initial=0):7.3f} {found[:, 2].mean():7.2f} "
-        f"{100 * (1 - bad / max(len(found), 1)):7.1f} % {bad:8}  {1e3 * np.median(times):8.0f}",
+        f"{100 * (1 - bad / max(len(found), 1)):7.1f} % {bad:8}  {1e3 * steps.median_s():8.0f}",
         flush=True,
     )
 
@@ -149,6 +150,7 @@ def main() -> None:
     area, reader = Area(given.area), spn_data.open_area(given.area)
     options = PilotOptions(sequence=False, network=not given.no_network)
     print(f"{'frames':34} usable of      median   deg   max m  NEES/6  PL>=err  misleading   ms")
+    tables: list[tuple[str, StepTimes]] = []
     for name in [n for n in reader.sequences if "mapping" not in n]:
         labels, camera = reader.labels(name), reader.map.cameras[name]
         rows = np.flatnonzero(labels.registered & ~labels.tracked)
@@ -158,7 +160,9 @@ def main() -> None:
             if options.network:
                 found = coarse(pilot, area, name, labels, rows, sigma_deg)
                 print(f"{f'network: {label}':34} {found}", flush=True)
-            show(label, *measured(pilot, area, name, labels, rows, sigma_deg))
+            found, steps = measured(pilot, area, name, labels, rows, sigma_deg)
+            show(label, len(rows), found, steps)
+            tables.append((label, steps))
         kinds: dict[str, list[int]] = {}
         for row in rows[:: max(1, len(rows) // max(given.spoilt, 1))][: given.spoilt].tolist():
             image = cv2.imread(str(image_path(area, str(labels.names[row]), name)))
@@ -184,6 +188,8 @@ def main() -> None:
             of += 1
             usable += isinstance(pilot.fix(cv2.imread(str(path)), 1), Fix)
         print(f"{'foreign: ' + folder.name:34} {usable:5} {of:5} {'':41} {usable:8}", flush=True)
+    for name, steps in tables:
+        print("\n".join(["", f"{name}, each image alone:", *steps.lines()]))
 
 
 if __name__ == "__main__":

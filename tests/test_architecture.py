@@ -140,8 +140,8 @@ def test_on_board_needs_errors_and_geometry_only():
     """
     optional = "spn_data.capture.photos.decode_photo"
     values = ("spn_data.errors.", "spn_data.geometry.")
-    # Features on board are detected and compared as those of the map.
-    features = ("spn_data.matching.features.", "spn_data.matching.putative.")
+    # Features on board are detected, compared and followed as those of the map.
+    features = tuple(f"spn_data.matching.{name}." for name in ("features", "patches", "putative"))
     rooms = {
         "spn_model/landmarks/": (
             *values,

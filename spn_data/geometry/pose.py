@@ -18,7 +18,9 @@ from spn_data.geometry.rotations import (
     canonical_quats,
     quats_from_rotations,
     rotation_errors_deg,
+    rotation_vectors,
     rotations_from_quats,
+    rotations_from_vectors,
     scalar_last,
 )
 
@@ -316,3 +318,16 @@ def pose_errors(estimated: Poses, true: Poses) -> tuple[np.ndarray, np.ndarray]:
     """
     error_m = np.linalg.norm(estimated.centers - true.centers, axis=-1)
     return error_m, rotation_errors_deg(estimated.quats_wxyz, true.quats_wxyz)
+
+
+def interpolate_pose(
+    first: tuple[float, Poses], second: tuple[float, Poses], time_s: float
+) -> Poses:
+    """Return the pose (1,) at a time on the constant motion through two others, also before or after them."""
+    (time_a, a), (time_b, b) = first, second
+    share = (time_s - time_a) / (time_b - time_a)
+    turn = rotation_vectors(b.rotations @ a.rotations.transpose(0, 2, 1))
+    return Poses.from_rotations(
+        a.centers + share * (b.centers - a.centers),
+        rotations_from_vectors(share * turn) @ a.rotations,
+    )

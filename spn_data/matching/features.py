@@ -124,10 +124,7 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
         At most `options.max_features`.
     """
     height, width = gray.shape
-    scale = min(1.0, options.max_image_size_px / max(height, width))
-    if scale < 1:
-        size = (round(width * scale), round(height * scale))
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    gray = reduced(gray, options.max_image_size_px)
     small_height, small_width = gray.shape
     mask_image = None
     if mask is not None:
@@ -152,6 +149,16 @@ def extract(gray: np.ndarray, mask: np.ndarray | None, options: FeatureOptions) 
     size_angle[:, 0] *= factors.mean()
     keypoints = np.concatenate([xy, size_angle], axis=1).astype(np.float32)
     return Features(keypoints, root_sift(raw[order]))
+
+
+def reduced(gray: np.ndarray, max_image_size_px: int) -> np.ndarray:
+    """Reduce a grey image (H, W) so that its longer side is at most this, as before detection."""
+    height, width = gray.shape
+    scale = min(1.0, max_image_size_px / max(height, width))
+    if scale == 1:
+        return gray
+    size = (round(width * scale), round(height * scale))
+    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
 
 
 def root_sift(descriptors: np.ndarray) -> np.ndarray:

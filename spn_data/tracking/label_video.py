@@ -10,10 +10,10 @@ import numpy as np
 
 from spn_data.capture.frames import Frames
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.pose import Poses, interpolate_pose, pose_errors
 from spn_data.labels.labels import LabelObservations, Labels
 from spn_data.labels.map_points import MapPoints
-from spn_data.tracking.point_tracking import interpolate_pose, track_segment
+from spn_data.tracking.point_tracking import track_segment
 from spn_data.tracking.segments import SequenceToLabel, read_segments
 from spn_data.tracking.tracked_frames import TrackedFrame, TrackingOptions, failed_frame
 from spn_data.work.parallel import run_batches

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from spn_data.geometry.camera import Camera, colmap_pixels, opencv_pixels
+from spn_data.geometry.camera import Camera
 from spn_data.geometry.grouping import rank_within_group
-from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.pose import Poses, interpolate_pose, pose_errors
 from spn_data.geometry.pose_fit import PoseFit, fit_pose
-from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
 from spn_data.labels.map_points import covered_share
+from spn_data.matching.patches import track_points
 from spn_data.tracking.tracked_frames import (
     Anchor,
     Segment,
@@ -75,19 +75,6 @@ def _guesses(known: dict[float, Poses], time_s: float) -> list[Poses]:
     return [*guesses, *(known[side[0]] for side in sides)]
 
 
-def interpolate_pose(
-    first: tuple[float, Poses], second: tuple[float, Poses], time_s: float
-) -> Poses:
-    """Return the pose (1,) at a time on the constant motion through two others, each with its time."""
-    (time_a, a), (time_b, b) = first, second
-    share = (time_s - time_a) / (time_b - time_a)
-    turn = rotation_vectors(b.rotations @ a.rotations.transpose(0, 2, 1))
-    return Poses.from_rotations(
-        a.centers + share * (b.centers - a.centers),
-        rotations_from_vectors(share * turn) @ a.rotations,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _PreparedAnchor:
     """Anchor reduced to the points that are tracked; pixels refer to its image."""
@@ -132,44 +119,6 @@ def spread_points(pixels: np.ndarray, width: int, height: int, count: int) -> np
     cells = y * columns + x
     rank_in_cell = rank_within_group(cells, int(cells.max()) + 1)
     return np.sort(np.argsort(rank_in_cell, kind="stable")[:count])
-
-
-def track_points(
-    from_gray: np.ndarray,
-    to_gray: np.ndarray,
-    pixels: np.ndarray,
-    expected: np.ndarray,
-    levels: int,
-    options: TrackingOptions,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Track patches into another image; return their pixels (K, 2) and which (K,) were found.
-
-    The search starts at the expected pixels. Lucas-Kanade forwards and backwards (Bouguet 2001): points that
-    return to their starting point are found.
-    """
-    height, width = to_gray.shape
-    found = np.all((expected > 0) & (expected < [width, height]), axis=1)  # false for NaN
-    result = np.full((len(pixels), 2), np.nan)
-    rows = np.flatnonzero(found)
-    if len(rows) == 0:
-        return result, found
-    start = opencv_pixels(pixels[rows].astype(np.float32))
-    there = opencv_pixels(expected[rows].astype(np.float32))
-    search = (
-        (options.window_px, options.window_px),
-        levels,
-        (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
-        cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(from_gray, to_gray, start, there, None, None, *search)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-        to_gray, from_gray, there, start.copy(), None, None, *search
-    )
-    closed = np.linalg.norm(back - start, axis=1) <= options.round_trip_px
-    inside = np.all((there >= 0) & (there <= [width - 1, height - 1]), axis=1)
-    result[rows] = colmap_pixels(there.astype(np.float64))
-    found[rows] = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed & inside
-    return result, found
 
 
 def _track_frame(
@@ -221,7 +170,13 @@ def _rough_pose(
     for guess in guesses:
         expected = _project(lens, guess, xyz)
         there, found = track_points(
-            anchor.small, small, pixels, expected, options.start_levels, options
+            anchor.small,
+            small,
+            pixels,
+            expected,
+            levels=options.start_levels,
+            window_px=options.window_px,
+            round_trip_px=options.round_trip_px,
         )
         enough = max(12.0, options.min_inlier_ratio * np.count_nonzero(found))
         if np.count_nonzero(found) < enough:
@@ -253,7 +208,15 @@ def _track_anchor(
     options: TrackingOptions,
 ) -> _TrackedPoints:
     expected = _project(camera, rough, anchor.xyz)
-    there, found = track_points(anchor.gray, gray, anchor.pixels, expected, options.levels, options)
+    there, found = track_points(
+        anchor.gray,
+        gray,
+        anchor.pixels,
+        expected,
+        levels=options.levels,
+        window_px=options.window_px,
+        round_trip_px=options.round_trip_px,
+    )
     return _TrackedPoints(anchor.point_ids[found], anchor.xyz[found], there[found])
 
 

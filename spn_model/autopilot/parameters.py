@@ -11,7 +11,10 @@ from spn_model.autopilot.profiles import ROS2, Message, profile_of
 
 _INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE in QGroundControl's files
 _MAX_DELAY_MS = 250.0
-_QUALITY = "Least quality: ODOMETRY has 1 to 100, or -1 without a fix; VISION_POSITION_ESTIMATE has none, 0."
+_QUALITY = (
+    "Least quality: in ODOMETRY, a fix has 50 to 100, a prediction between images 49, and no pose -1 "
+    "(50 takes fixes alone); VISION_POSITION_ESTIMATE has none, 0."
+)
 _ROBOT_LOCALIZATION = """\
 # Parameters of robot_localization for fixes of squeezeposenet-toolkit: check each before a flight.
 ekf_filter_node:

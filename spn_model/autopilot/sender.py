@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,11 +15,13 @@ from spn_model.autopilot.datum import Datum, Geodetic
 from spn_model.autopilot.frames import NED_FROM_ENU, BodyPose, Mounting, body_pose
 from spn_model.autopilot.profiles import LOCAL_MESSAGES, MAX_LOCAL_M, STALE_S, Message, Profile
 from spn_model.autopilot.timesync import Timesync
+from spn_model.integrity.coasting import RecentFixes
 from spn_model.integrity.fix import Fix, FixState, NoFix
 
 _STALE_US = round(STALE_S * 1e6)
 _FUTURE_US = 50_000  # a stamp ahead of the clock by more comes from another clock
 _SECOND_US = 1_000_000
+_STEP_US = 1000  # a fix that comes after a prediction is moved on to this much later
 _ASKED_FIRST = 3  # times that an autopilot is asked for its origin before it is given one
 
 
@@ -43,6 +46,9 @@ class SenderOptions:
     reset_on_reacquisition : bool
         Increment the reset counter at the first fix after the state `lost`. PX4 and ArduPilot then *jump* to
         that fix instead of testing it, so this is off by default.
+    coast_s : float
+        Age of the last fix up to which poses predicted from it go out between images, 0 to 1 s; 0: none.
+        They have the state `coast` and the quality 49, below that of every fix.
     flag_unhealthy : bool
         Send GLOBAL_POSITION_SENSOR with the flag for an unhealthy sensor while there is no fix, instead of
         none. Off by default: it could not be verified that PX4 heeds the flag, but it does stop after 5 s
@@ -56,6 +62,7 @@ class SenderOptions:
     sensor: int = 1
     system: int = 1
     reset_on_reacquisition: bool = False
+    coast_s: float = 0.5
     flag_unhealthy: bool = False
 
     def __post_init__(self) -> None:
@@ -67,6 +74,8 @@ class SenderOptions:
         for name, value in (("sensor", self.sensor), ("system", self.system)):
             if not 1 <= value <= 255:
                 raise InputError(f"the {name} is {value}, not a number of 1 to 255")
+        if not 0 <= self.coast_s <= 1:
+            raise InputError(f"predictions go out for {self.coast_s!r} s, not 0 to 1")
         if LOCAL_MESSAGES & set(self.messages):
             self.datum.require_amsl()
 
@@ -78,7 +87,9 @@ class SenderReport:
     Attributes
     ----------
     sent : int
-        Fixes sent.
+        Fixes sent, those moved on after a prediction included.
+    coasted : int
+        Predictions sent.
     failed : int
         Slots in which it was said that there is no fix.
     stale : int
@@ -106,6 +117,7 @@ class SenderReport:
     """
 
     sent: int = 0
+    coasted: int = 0
     failed: int = 0
     stale: int = 0
     repeated: int = 0
@@ -142,7 +154,9 @@ class Sender:
     link: Any
     report: SenderReport = field(default_factory=SenderReport)
     _waiting: Fix | None = None
-    _last_us: int = 0  # exposure of the last fix sent
+    _last_us: int = 0  # stamp of the last pose sent
+    _measured_us: int = 0  # exposure of the last fix sent
+    _recent: RecentFixes = field(default_factory=RecentFixes)
     _fresh_until_us: int = 0
     _failed_us: int = 0  # exposure of the last image without a usable fix
     _lost: bool = False
@@ -158,9 +172,14 @@ class Sender:
             if isinstance(item, Fix) and item.usable:
                 self.report.replaced += self._waiting is not None
                 self._waiting = item
+                self._recent.add(item)
                 return
             if isinstance(item, Fix):
                 self.report.refused += 1
+            if (
+                item.state != FixState.COAST
+            ):  # after a single image without a pose, predictions go on
+                self._recent.clear()
             if item.state == FixState.LOST:
                 self._lost, self._waiting = True, None
             self._failed_us = item.time_us
@@ -179,6 +198,9 @@ class Sender:
             messages = self._each_second(now_us)
             fix, self._waiting = self._waiting, None
             sent = [] if fix is None else self._messages(fix, now_us)
+            if not sent and (predicted := self._prediction(now_us)) is not None:
+                sent = self._built(predicted, now_us)
+                self.report.coasted += bool(sent)
             if not sent and self._last_us and now_us >= self._fresh_until_us:
                 self.report.failed += 1
                 sent = self._failed(now_us)
@@ -233,15 +255,48 @@ class Sender:
         if age < -_FUTURE_US:
             self.report.refused += 1
             return self._drop(f"the fix is {-age / 1e3:.0f} ms ahead of the clock")
+        pose: Fix | None = fix
         if fix.time_us <= self._last_us:
+            # After a prediction for a later time, receivers take no older pose: the fix is moved on.
+            newer = fix.time_us > self._measured_us
+            pose = self._recent.predicted(self._last_us + _STEP_US) if newer else None
+        if pose is None:
             self.report.repeated += 1
             return []
-        if self.report.autopilot not in (None, self.profile.autopilot):
+        self.report.reason = ""
+        built = self._built(pose, now_us)
+        if not built:
             self.report.refused += 1
+            return []
+        self._measured_us = fix.time_us
+        if fix.time_us > self._failed_us:  # else a later image has failed
+            self._fresh_until_us = fix.time_us + _STALE_US
+        self._lost = False
+        self.report.sent += 1
+        age = max(0, age)
+        least = self.report.least_age_us
+        self.report.least_age_us = age if least is None else min(least, age)
+        return built
+
+    def _prediction(self, now_us: int) -> Fix | None:
+        """Return the pose for a slot without a fix, if the motion is known and the last fix is young enough.
+
+        Its stamp is as old as that of a fix at best, for the reason given in `_failed`.
+        """
+        time_us = now_us - (self.report.least_age_us or 0)
+        if self._measured_us == 0 or time_us <= self._last_us:
+            return None
+        slots = math.ceil(self.options.coast_s * self.profile.rate_hz)
+        found = self._recent.predicted(time_us, shared_by=max(1, slots))
+        too_old = found is None or time_us - self._recent.last_us > self.options.coast_s * 1e6
+        return None if too_old else found
+
+    def _built(self, fix: Fix, now_us: int) -> list[Any]:
+        """Return the messages with a pose; none, and the reason in the report, if it must not be sent."""
+        if self.report.autopilot not in (None, self.profile.autopilot):
             return self._drop(
                 f"the autopilot is of type {self.report.autopilot}, not of profile {self.profile.name}"
             )
-        self.report.reason = ""
         pose = body_pose(fix, self.options.mounting)
         built = [
             message
@@ -252,17 +307,8 @@ class Sender:
                 else [self._global(fix, pose, now_us)]
             )
         ]
-        if not built:
-            self.report.refused += 1
-            return []
-        self._last_us = fix.time_us
-        if fix.time_us > self._failed_us:  # else a later image has failed
-            self._fresh_until_us = fix.time_us + _STALE_US
-        self._lost = False
-        self.report.sent += 1
-        age = max(0, age)
-        least = self.report.least_age_us
-        self.report.least_age_us = age if least is None else min(least, age)
+        if built:
+            self._last_us = fix.time_us
         return built
 
     def _local(self, kind: Message, fix: Fix, pose: BodyPose) -> list[Any]:

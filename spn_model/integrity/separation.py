@@ -101,17 +101,20 @@ def separate(
     -------
     Separation
     """
-    each = np.einsum("n,nij,nik->njk", weights, jacobian, jacobian)
-    gradients = np.einsum("n,nij,ni->nj", weights, jacobian, residuals)
+    weighted = weights[:, None, None] * jacobian
+    each = weighted.transpose(0, 2, 1) @ jacobian
+    gradients = (weighted * residuals[:, :, None]).sum(axis=1)
+    members = groups.astype(np.float64)
+    normals = (members @ each.reshape(len(each), -1)).reshape(-1, *information.shape)
     covariance = np.linalg.inv(information) * factor
     horizontal, vertical = (sigmas * sigma for sigma in _sigmas(covariance))
     contradiction = 0.0
-    for group in groups:
-        rest = information - each[group].sum(axis=0)
+    for normal, gradient in zip(normals, members @ gradients, strict=True):
+        rest = information - normal
         if np.linalg.eigvalsh(rest)[0] <= _TINY * np.trace(rest):
             return Separation(np.inf, np.inf, contradiction)
         inverse = np.linalg.inv(rest)
-        change = (inverse @ gradients[group].sum(axis=0))[:3]
+        change = (inverse @ gradient)[:3]
         without = inverse * factor
         sigma_h, sigma_v = _sigmas(without)
         horizontal = max(horizontal, float(np.hypot(*change[:2])) + sigmas * sigma_h)

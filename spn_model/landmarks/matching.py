@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,11 +14,13 @@ from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.solver import Sightings
 
 _MAX_ANGLE_DEG = 65.0  # between the view of a landmark and that of its descriptor
+_MIN_DEPTH_M = 0.1
 _MIN_SCALE = 0.6  # scale in working pixels below which a keypoint is not detected
 _MAX_LANDMARKS = 2500  # compared with the image; the ones seen most alike
 _MAX_RATIO = 0.88  # distance of the nearest landmark over that of the second nearest
-_MAX_DISTANCE = 0.8
+_MIN_SIMILARITY = 1 - 0.8**2 / 2  # of unit descriptors; a distance of at most 0.8
 STRONGEST = 400  # features that are compared with all landmarks
+_BLOCK = 1024  # landmarks compared at once, so that their similarities fit into the CPU cache
 _SIZE_PX = 12.0  # scale of keypoints with twice the standard deviation of small ones
 
 
@@ -86,6 +88,14 @@ class Expected:
     owner: np.ndarray
     at: np.ndarray
 
+    def seen_from(
+        self, landmarks: LandmarkMap, center: np.ndarray, rotation: np.ndarray, focal_px: float
+    ) -> Expected:
+        """Return the same landmarks as a pose close to the first one sees them."""
+        return replace(
+            self, at=projected(landmarks.xyz[self.landmarks], center, rotation, focal_px)
+        )
+
 
 def expected(
     landmarks: LandmarkMap,
@@ -117,7 +127,7 @@ def expected(
     """
     x = to_camera(landmarks.xyz, center, rotation)
     z = x[:, 2]
-    ahead = z > 0.1
+    ahead = z > _MIN_DEPTH_M
     inside = ahead & (
         np.abs(x[:, :2]) < (margin * half_view) * np.where(ahead, z, 1.0)[:, None]
     ).all(axis=1)
@@ -137,14 +147,30 @@ def expected(
     return Expected(rows, own, inverse.ravel(), x[own, :2] / z[own, None] * focal_px)
 
 
-def match(features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected) -> Sightings:
-    """Match features with expected landmarks anywhere in the image: mutual nearest, and no other as near.
+def projected(
+    xyz: np.ndarray, center: np.ndarray, rotation: np.ndarray, focal_px: float
+) -> np.ndarray:
+    """Return the projections (N, 2) of points relative to the principal point; infinity behind the camera."""
+    x = to_camera(xyz, center, rotation)
+    z = np.where(x[:, 2:] > _MIN_DEPTH_M, x[:, 2:], np.nan)
+    return np.nan_to_num(x[:, :2] / z * focal_px, nan=np.inf)
+
+
+def match(
+    features: ImageFeatures,
+    landmarks: LandmarkMap,
+    candidates: Expected,
+    radius_px: float | None = None,
+) -> Sightings:
+    """Match features with expected landmarks in much of the image: mutual nearest, and no other as near.
 
     Parameters
     ----------
     features : ImageFeatures
     landmarks : LandmarkMap
     candidates : Expected
+    radius_px : float, optional
+        Largest distance of a feature from the projection of its landmark along each axis.
 
     Returns
     -------
@@ -152,14 +178,18 @@ def match(features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected)
         At most one for each landmark and each feature.
     """
     similarity = features.units @ landmarks.units[candidates.rows].T
-    row, column = np.nonzero(similarity > 1 - _MAX_DISTANCE**2 / 2)
+    row, column = np.nonzero(similarity > _MIN_SIMILARITY)
+    if radius_px is not None:
+        off_px = np.abs(features.at[row] - candidates.at[candidates.owner[column]])
+        near = (off_px < radius_px).all(axis=1)
+        row, column = row[near], column[near]
     return _best(features, landmarks, candidates, row, column, similarity[row, column])
 
 
 def match_near(
     features: ImageFeatures, landmarks: LandmarkMap, candidates: Expected, radius_px: float
 ) -> Sightings:
-    """Match features with expected landmarks close to their projections.
+    """Match features with expected landmarks close to their projections: as `match`, fast for small radii.
 
     Parameters
     ----------
@@ -187,7 +217,8 @@ def match_near(
     similarity = np.einsum(
         "nk,nk->n", features.units[row], landmarks.units[candidates.rows[column]]
     )
-    return _best(features, landmarks, candidates, row, column, similarity)
+    alike = similarity > _MIN_SIMILARITY
+    return _best(features, landmarks, candidates, row[alike], column[alike], similarity[alike])
 
 
 def _best(
@@ -199,8 +230,7 @@ def _best(
     similarity: np.ndarray,
 ) -> Sightings:
     """Choose among pairs of a feature and a descriptor (P,): mutual nearest that pass the ratio test."""
-    kept = np.flatnonzero(2 - 2 * similarity < _MAX_DISTANCE**2)
-    order = kept[np.argsort(-similarity[kept], kind="stable")]
+    order = np.argsort(-similarity, kind="stable")
     row, owner, similarity = row[order], candidates.owner[column[order]], similarity[order]
     feature, first = np.unique(row, return_index=True)
     _, of_landmark = np.unique(owner, return_index=True)
@@ -223,16 +253,24 @@ def match_all(
 ) -> Sightings:
     """Match the strongest features with all landmarks of the map, by descriptors in a reduced space."""
     queries = features.units[:strongest] @ landmarks.basis
-    # Squared distances, less what all distances of a feature have in common.
-    distance_sq = landmarks.reduced_sq - 2 * (queries @ landmarks.reduced)
+    count, every = len(queries), np.arange(len(queries))
+    nearest = np.zeros(count, np.int64)
+    first, second = np.full((2, count), np.inf, np.float32)
+    for start in range(0, len(landmarks), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        # Squared distances, less what all distances of a feature have in common.
+        distance_sq = queries @ landmarks.reduced[:, block]
+        distance_sq *= -2
+        distance_sq += landmarks.reduced_sq[block]
+        best = distance_sq.argmin(axis=1)
+        found = distance_sq[every, best]
+        distance_sq[every, best] = np.inf
+        second = np.minimum(second, np.minimum(distance_sq.min(axis=1), np.maximum(first, found)))
+        nearer = found < first
+        nearest[nearer], first[nearer] = start + best[nearer], found[nearer]
     own_sq = (queries**2).sum(axis=1)
-    row = np.arange(len(queries))
-    best = distance_sq.argmin(axis=1)
-    first = distance_sq[row, best] + own_sq
-    distance_sq[row, best] = np.inf
-    second = distance_sq.min(axis=1, initial=np.inf) + own_sq
-    feature = np.flatnonzero(first < _MAX_RATIO**2 * second)
-    return _sightings(features, landmarks, best[feature], feature)
+    feature = np.flatnonzero(first + own_sq < _MAX_RATIO**2 * (second + own_sq))
+    return _sightings(features, landmarks, nearest[feature], feature)
 
 
 def _sightings(

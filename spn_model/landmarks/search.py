@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from spn_model.landmarks.matching import (
     match,
     match_all,
     match_near,
+    projected,
 )
 from spn_model.landmarks.solver import (
     KnownVertical,
@@ -29,11 +31,12 @@ from spn_model.landmarks.solver import (
 
 FIRST_PX = 4.0  # of RANSAC
 SEARCH_PX = 12.0  # around a projection, once there is a pose
+FOLLOW_PX = 24.0  # around a predicted one
 _MIN_FIRST = 8  # sightings that agree with a first pose
 _ROUNDS = 6  # of matching around the projections
 _SETTLED = 1.02  # growth of the landmarks that agree below which no further round follows
 ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 2.0
-WEAK = 120  # landmarks that agree below which all features are compared, not only the strongest
+WEAK = 120  # landmarks that agree below which more is tried
 MAP = "retrieval"  # among all landmarks
 _MARGIN = 1.25  # on the field of view of an uncertain hypothesis
 
@@ -107,43 +110,53 @@ class Found:
 def search(
     landmarks: LandmarkMap,
     features: ImageFeatures,
-    hypotheses: Sequence[Hypothesis] = (),
+    hypotheses: Iterable[Hypothesis] = (),
 ) -> Found | None:
     """Find the pose of an image.
 
-    The features are compared with all landmarks of the map, and with those that each hypothesis sees. What
-    does not agree with the best pose is asked for another one.
+    The strongest features are compared with all landmarks of the map. If few landmarks agree with the pose
+    that follows, the hypotheses are tried, and at last all features are compared. What does not agree with
+    the best pose is asked for another one.
 
     Parameters
     ----------
     landmarks : LandmarkMap
     features : ImageFeatures
-    hypotheses : sequence of Hypothesis
+    hypotheses : iterable of Hypothesis
+        The most promising first; one that need not be tried is not drawn, so they may be costly.
 
     Returns
     -------
     Found or None
         None if too few landmarks agree on any pose.
     """
-    found = [
-        _candidate(landmarks, features, guess.source, _guided(landmarks, features, guess))
-        for guess in hypotheses
-    ]
     compared = match_all(features, landmarks)
-    found.append(_candidate(landmarks, features, MAP, compared))
-    if max((c.agreeing for c in found if c), default=0) < WEAK:
+    found = [_candidate(landmarks, features, MAP, compared)]
+    remaining = iter(hypotheses)
+    while _is_weak(found) and (guess := next(remaining, None)) is not None:
+        seen = _guided(landmarks, features, guess)
+        found.append(_candidate(landmarks, features, guess.source, seen))
+    if _is_weak(found):
         compared = match_all(features, landmarks, len(features))
         found.append(_candidate(landmarks, features, MAP, compared))
     best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
-    if best is not None:
-        used = best.seen.features[best.pose.inliers]
-        rest = compared.select(~np.isin(compared.features, used))
-        found.append(_candidate(landmarks, features, MAP, rest))
-    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
-    if not poses:
+    if best is None:
         return None
+    # Sightings that nearly agree with the best pose would only lead to it again.
+    off_px = np.abs(
+        compared.at
+        - projected(compared.xyz, best.pose.center, best.pose.rotation, features.focal_px)
+    ).max(axis=1)
+    rest = compared.select(off_px > SEARCH_PX)
+    found.append(_candidate(landmarks, features, MAP, rest))
+    poses = sorted((c for c in found if c), key=lambda c: -c.agreeing)
     rivals = [c.agreeing for c in poses[1:] if c.is_elsewhere(poses[0])]
     return Found(poses[0], max(rivals, default=0))
+
+
+def _is_weak(found: list[Candidate | None]) -> bool:
+    """Return whether few landmarks agree with the best pose so far."""
+    return max((c.agreeing for c in found if c), default=0) < WEAK
 
 
 def follow(
@@ -151,18 +164,22 @@ def follow(
     features: ImageFeatures,
     guess: Hypothesis,
 ) -> Found | None:
-    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there."""
-    seen = _guided(landmarks, features, guess)
-    found = _candidate(landmarks, features, guess.source, seen)
+    """Find the pose of an image close to a predicted one; None if too few landmarks agree on a pose there.
+
+    Landmarks are looked for close to their projections first, which is quick and mostly enough.
+    """
+    found = _refine(landmarks, features, guess.source, guess.center, guess.rotation, FOLLOW_PX)
+    if found is None or found.agreeing < WEAK:
+        seen = _guided(landmarks, features, guess)
+        wide = _candidate(landmarks, features, guess.source, seen)
+        found = max((c for c in (found, wide) if c), key=lambda c: c.agreeing, default=None)
     return None if found is None else Found(found, 0)
 
 
 def _guided(landmarks: LandmarkMap, features: ImageFeatures, guess: Hypothesis) -> Sightings:
-    if guess.radius_px is None:
-        wanted = _seen_from(landmarks, features, guess.center, guess.rotation, _MARGIN)
-        return match(features, landmarks, wanted)
-    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, 1.0)
-    return match_near(features, landmarks, wanted, guess.radius_px)
+    margin = _MARGIN if guess.radius_px is None else 1.0
+    wanted = _seen_from(landmarks, features, guess.center, guess.rotation, margin)
+    return match(features, landmarks, wanted, guess.radius_px)
 
 
 def _candidate(
@@ -181,23 +198,28 @@ def _refine(
     source: str,
     center: np.ndarray,
     rotation: np.ndarray,
+    first_px: float = SEARCH_PX,
 ) -> Candidate | None:
-    """Match around the projections and solve, until no more landmarks agree."""
+    """Match around the projections and solve, until no more landmarks agree; at first within `first_px`."""
     best, agreeing = None, 0
+    wanted = _seen_from(landmarks, features, center, rotation, 1.0)
+    radius_px = first_px
     for _ in range(_ROUNDS):
-        wanted = _seen_from(landmarks, features, center, rotation, 1.0)
-        seen = match_near(features, landmarks, wanted, SEARCH_PX)
+        seen = match_near(features, landmarks, wanted, radius_px)
         pose = solve(seen, center, rotation) if len(seen) >= _MIN_FIRST else None
         if pose is None:
             break
         count = int(pose.inliers.sum())
         if count <= agreeing:
             break
-        settled = best is not None and count <= _SETTLED * agreeing
+        settled = count <= _SETTLED * agreeing
         best = Candidate(source=source, pose=pose, seen=seen)
-        center, rotation, agreeing = pose.center, pose.rotation, count
+        center, rotation = pose.center, pose.rotation
         if settled:
             break
+        agreeing = count if radius_px == SEARCH_PX else 0  # a wide round is only a start
+        radius_px = SEARCH_PX
+        wanted = wanted.seen_from(landmarks, center, rotation, features.focal_px)
     return best
 
 
@@ -213,15 +235,21 @@ def _seen_from(
     )
 
 
-def witness_of(
-    found: Found, features: ImageFeatures, vertical: KnownVertical | None = None
-) -> Witness:
+class HasView(Protocol):
+    """What the landmarks of a candidate were found in: features, or an anchor."""
+
+    @property
+    def half_view(self) -> np.ndarray:
+        """Tangents (2,) of half the field of view, with distortion."""
+
+
+def witness_of(found: Found, features: HasView, vertical: KnownVertical | None = None) -> Witness:
     """Return what is known about the pose of a candidate, for its judgement."""
     best, tilt = found.best, 0.0
     if vertical is not None:
         tilt = tilt_sigmas(vertical, best.pose.rotation, best.pose.covariance)
     return Witness(
-        at=best.seen.at / features.focal_px / features.half_view,
+        at=best.seen.at / best.seen.focal_px / features.half_view,
         xyz=best.seen.xyz,
         residuals=best.pose.residuals,
         jacobian=best.pose.jacobian,

@@ -143,7 +143,7 @@ def first_pose(
 def pose_by_ransac(
     xyz: np.ndarray, at: np.ndarray, matrix: np.ndarray, threshold: float, iterations: int
 ) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Find the pose that most points agree with: AP3P in RANSAC, then SQPnP of the points that agree.
+    """Find the pose that most points agree with: P3P in RANSAC, then SQPnP of the points that agree.
 
     Parameters
     ----------
@@ -166,19 +166,15 @@ def pose_by_ransac(
     if len(xyz) < _FEWEST:
         return None
     middle = np.median(xyz, axis=0)
-    found, turn, move, inliers = cv2.solvePnPRansac(
-        xyz - middle,
-        at,
-        matrix,
-        None,
-        iterationsCount=iterations,
-        reprojectionError=threshold,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
+    options = cv2.UsacParams()  # a tenth of the time of OpenCV's first RANSAC, and equal inliers
+    options.maxIterations, options.confidence = iterations, 0.9999
+    options.threshold = threshold
+    options.score, options.loMethod = cv2.SCORE_METHOD_RANSAC, cv2.LOCAL_OPTIM_NULL
+    options.final_polisher = cv2.NONE_POLISHER
+    found, _, _, _, inliers = cv2.solvePnPRansac(xyz - middle, at, matrix, None, params=options)
     if not found or inliers is None or len(inliers) < _FEWEST:
         return None
-    # OpenCV solves for all inliers by EPnP, which is metres off where points are nearly on a plane.
+    # SQPnP instead of a polisher: EPnP is metres off where points are nearly on a plane.
     kept = inliers.ravel()
     found, turn, move = cv2.solvePnP(
         (xyz - middle)[kept], at[kept], matrix, None, flags=cv2.SOLVEPNP_SQPNP
@@ -205,30 +201,33 @@ def solve(seen: Sightings, center: np.ndarray, rotation: np.ndarray) -> SolvedPo
     SolvedPose or None
         None if the sightings determine no pose.
     """
-    matrix = np.diag([seen.focal_px, seen.focal_px, 1.0])
+    sigma = _sigma_px(seen, center, rotation)
     for scale in 2.0 * np.array(_SCALES):
-        x = to_camera(seen.xyz, center, rotation)
-        if np.count_nonzero(x[:, 2] > 0) < 4:
+        step = _step(seen, sigma, center, rotation, scale)
+        if np.count_nonzero(step.weights) < 4:
             return None
-        residuals, jacobian, by_focal = _whitened(seen, x, matrix, rotation)
-        weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
-        weights[x[:, 2] <= 0] = 0
-        information = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
-        gradient = np.einsum("n,nij,ni->j", weights, jacobian, residuals)
         try:
-            step = -np.linalg.solve(information, gradient)
+            change = -np.linalg.solve(step.normal[:6, :6], step.gradient[:6])
         except np.linalg.LinAlgError:
             return None
-        if not np.isfinite(step).all():
+        if not np.isfinite(change).all():
             return None
-        center = center + step[:3]
-        rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
-        moved = np.abs(jacobian @ step).mean()
+        center = center + change[:3]
+        rotation = rotations_from_vectors(change[None, 3:])[0] @ rotation
+        moved = np.abs(step.jacobian[:, :, :6] @ change).mean()
         if scale == 2.0 and moved < _CONVERGED:
             break
     if moved > _MAX_LAST:
         return None
-    return SolvedPose(center, rotation, information, residuals, jacobian, by_focal, weights)
+    return SolvedPose(
+        center,
+        rotation,
+        step.normal[:6, :6],
+        step.residuals,
+        step.jacobian[:, :, :6],
+        step.jacobian[:, :, 6],
+        step.weights,
+    )
 
 
 def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
@@ -247,21 +246,17 @@ def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
         Its standard deviation for the stated noise, or larger where residuals are.
     """
     center, rotation, factor = pose.center, pose.rotation, 1.0
+    sigma = _sigma_px(seen, center, rotation)
     for scale in 2.0 * np.array(_FOCAL_SCALES):
-        x = to_camera(seen.xyz, center, rotation)
-        matrix = np.diag([seen.focal_px * factor, seen.focal_px * factor, 1.0])
-        residuals, jacobian, by_focal = _whitened(seen, x, matrix, rotation)
-        by = np.concatenate([jacobian, by_focal[:, :, None]], axis=2)
-        weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
-        weights[x[:, 2] <= 0] = 0
-        information = np.einsum("n,nij,nik->jk", weights, by, by) + np.diag([0.0] * 6 + [1.0])
-        step = -np.linalg.solve(information, np.einsum("n,nij,ni->j", weights, by, residuals))
-        center = center + step[:3]
-        rotation = rotations_from_vectors(step[None, 3:6])[0] @ rotation
-        factor *= float(np.exp(np.clip(step[6], -0.1, 0.1)))
-    inliers = (residuals**2).sum(axis=1) < GATE**2
-    chi_sq = max(1.0, float((residuals[inliers] ** 2).mean())) if inliers.any() else np.inf
-    return factor - 1, float(np.sqrt(np.linalg.inv(information)[6, 6] * chi_sq))
+        step = _step(seen, sigma, center, rotation, scale, factor)
+        step.normal[6, 6] += 1.0  # without it, points at one distance determine no focal length
+        change = -np.linalg.solve(step.normal, step.gradient)
+        center = center + change[:3]
+        rotation = rotations_from_vectors(change[None, 3:6])[0] @ rotation
+        factor *= float(np.exp(np.clip(change[6], -0.1, 0.1)))
+    inliers = (step.residuals**2).sum(axis=1) < GATE**2
+    chi_sq = max(1.0, float((step.residuals[inliers] ** 2).mean())) if inliers.any() else np.inf
+    return factor - 1, float(np.sqrt(np.linalg.inv(step.normal)[6, 6] * chi_sq))
 
 
 def vertical_terms(vertical: KnownVertical, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -297,26 +292,56 @@ def tilt_sigmas(vertical: KnownVertical, rotation: np.ndarray, covariance: np.nd
     return float(np.sqrt(off @ np.linalg.solve(np.eye(3) + by @ covariance @ by.T, off)))
 
 
-def _whitened(
-    seen: Sightings, x: np.ndarray, matrix: np.ndarray, rotation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals (K, 2), Jacobian (K, 2, 6), derivatives by the logarithm of the focal length (K, 2).
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Observations linearised at a pose, whitened: pose and logarithm of the focal length are unknown."""
 
-    They are divided by the standard deviation of each sighting.
+    residuals: np.ndarray  # (K, 2)
+    jacobian: np.ndarray  # (K, 2, 7)
+    weights: np.ndarray  # (K,)
+    normal: np.ndarray  # (7, 7)
+    gradient: np.ndarray  # (7,)
+
+
+def _step(
+    seen: Sightings,
+    sigma: np.ndarray,
+    center: np.ndarray,
+    rotation: np.ndarray,
+    scale: float,
+    factor: float = 1.0,
+) -> _Step:
+    """Linearise at a pose, with a Cauchy loss of this scale; points behind it have no weight.
+
+    `factor` is that of the focal length, `sigma` (K,) the standard deviation of each sighting.
+    """
+    x = to_camera(seen.xyz, center, rotation)
+    behind = x[:, 2] <= 0
+    x[behind] = [0.0, 0.0, 1.0]
+    matrix = np.diag([seen.focal_px * factor, seen.focal_px * factor, 1.0])
+    residuals, by_pose = residuals_and_jacobian(x, seen.at, matrix, rotation)
+    jacobian = np.concatenate([by_pose, (residuals + seen.at)[:, :, None]], axis=2)
+    residuals /= sigma[:, None]
+    jacobian /= sigma[:, None, None]
+    weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
+    weights[behind] = 0
+    flat = jacobian.reshape(-1, 7)
+    weighted = flat * np.repeat(weights, 2)[:, None]
+    return _Step(residuals, jacobian, weights, weighted.T @ flat, weighted.T @ residuals.ravel())
+
+
+def _sigma_px(seen: Sightings, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return the standard deviation (K,) of each sighting along one axis.
 
     The covariance of a landmark is projected into the image and added to that of the measurement; its larger
-    axis counts.
+    axis counts. It hardly changes while a pose is refined.
     """
-    safe = np.where(x[:, 2:] > 0, x, [[0.0, 0.0, 1.0]])
-    residuals, jacobian = residuals_and_jacobian(safe, seen.at, matrix, rotation)
-    by_point = -jacobian[:, :, :3]  # a shift of the camera moves a point the other way
+    x = to_camera(seen.xyz, center, rotation)
+    x[x[:, 2] <= 0] = [0.0, 0.0, 1.0]
+    matrix = np.diag([seen.focal_px, seen.focal_px, 1.0])
+    # A shift of the camera moves a point the other way; the sign does not matter here.
+    by_point = residuals_and_jacobian(x, seen.at, matrix, rotation)[1][:, :, :3]
     projected = by_point @ seen.covariance @ by_point.transpose(0, 2, 1)
     a, b, c = projected[:, 0, 0], projected[:, 0, 1], projected[:, 1, 1]
     largest = (a + c) / 2 + np.sqrt((a - c) ** 2 / 4 + b**2)
-    sigma = np.sqrt(seen.sigma_px**2 + largest)
-    projected_px = residuals + seen.at
-    return (
-        residuals / sigma[:, None],
-        jacobian / sigma[:, None, None],
-        projected_px / sigma[:, None],
-    )
+    return np.sqrt(seen.sigma_px**2 + largest)

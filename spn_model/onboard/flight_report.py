@@ -1,12 +1,43 @@
-"""Report on a flight: availability of fixes, longest outage, reasons for missing ones, processing time."""
+"""Report on a flight: availability of fixes, longest outage, reasons for missing ones, time of each step."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 
 from spn_model.integrity.fix import Fix, NoFix
+
+STEPS = ("texture", "patches", "features", "landmarks", "network", "judgement")
+
+
+class StepTimes:
+    """Times of the steps of images."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, list[float]] = {}
+
+    def add(self, steps_s: Mapping[str, float], whole_s: float) -> None:
+        """Take the times of the steps of an image, and that of the whole image."""
+        kind = "followed by patches" if "features" not in steps_s else "with features"
+        for name, seconds in (*steps_s.items(), (f"image {kind}", whole_s), ("image", whole_s)):
+            self._seconds.setdefault(name, []).append(seconds)
+
+    def median_s(self) -> float:
+        """Return the median time of an image; NaN without images."""
+        return float(np.median(self._seconds.get("image", [math.nan])))
+
+    def lines(self) -> list[str]:
+        """Return a table: images with the step, and its time at 50 and 95 % of them."""
+        wholes = sorted(name for name in self._seconds if name.startswith("image"))
+        found = [f"{'step':28} images  p50 ms  p95 ms"]
+        for name in (*STEPS, *wholes[::-1]):
+            if name in self._seconds:
+                p50, p95 = 1e3 * np.percentile(self._seconds[name], [50, 95])
+                found.append(f"{name:28} {len(self._seconds[name]):6} {p50:7.1f} {p95:7.1f}")
+        return found
 
 
 def kind_of_reason(reason: str) -> str:
@@ -20,17 +51,17 @@ class FlightReport:
     def __init__(self) -> None:
         self._usable: list[bool] = []
         self._times_us: list[int] = []
-        self._processing_s: list[float] = []
+        self._times = StepTimes()
         self._sources: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()
         self._levels_m: list[tuple[float, float]] = []
 
-    def add(self, item: Fix | NoFix) -> None:
-        """Count an image."""
+    def add(self, item: Fix | NoFix, steps_s: Mapping[str, float]) -> None:
+        """Count an image, whose steps took these times."""
         usable = isinstance(item, Fix) and item.usable
         self._usable.append(usable)
         self._times_us.append(item.time_us)
-        self._processing_s.append(item.processing_s)
+        self._times.add(steps_s, item.processing_s)
         if isinstance(item, Fix):
             self._sources[item.source.value] += usable
             if usable:
@@ -59,11 +90,10 @@ class FlightReport:
         if not self._usable:
             return ["No images."]
         usable = sum(self._usable)
-        p50, p95 = 1e3 * np.percentile(self._processing_s, [50, 95])
         found = [
             f"Usable fixes: {usable} of {len(self._usable)} images ({100 * self.availability:.1f} %); "
             f"longest outage {self.longest_outage_s:.1f} s.",
-            f"Processing time: {p50:.0f} ms (median), {p95:.0f} ms (95 %).",
+            *self._times.lines(),
         ]
         if usable:
             horizontal, vertical = np.median(self._levels_m, axis=0)

@@ -17,6 +17,8 @@ from spn_data.geometry.camera_file import read_camera
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.link import FixSink, open_link
+from spn_model.autopilot.parameters import parameter_file
+from spn_model.autopilot.profiles import PROFILES, ROS2, Message
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
 from spn_model.landmarks.solver import KnownVertical
@@ -45,6 +47,13 @@ def fly(arguments: list[str]) -> None:
         If bundle, camera or source cannot be used.
     """
     given = _parser().parse_args(arguments)
+    messages = None if given.messages is None else tuple(Message(m) for m in given.messages)
+    if given.mavlink is not None and given.profile == ROS2:
+        raise InputError(
+            "--mavlink goes to an autopilot: give --profile px4 or ardupilot; --to writes a ROS 2 bag"
+        )
+    if given.parameters is not None:
+        _write_parameters(given.parameters, given.profile, messages, use_height=given.use_height)
     cv2.setNumThreads(given.threads)
     check_sources([given.source])
     stated = None
@@ -82,13 +91,22 @@ def fly(arguments: list[str]) -> None:
         if given.to is not None:
             sinks.append(open_writer(given.to, datum=datum, mounting=mounting))
         if given.mavlink is not None:
-            sinks.append(open_link(given.profile, given.mavlink, mounting=mounting, datum=datum))
+            link = open_link(
+                given.profile,
+                given.mavlink,
+                mounting=mounting,
+                datum=datum,
+                messages=messages,
+                use_height=given.use_height,
+                coast_s=given.coast,
+            )
+            sinks.append(link)
         for sink in sinks:
             stack.callback(sink.close)
         for time_us, image, vertical in images:
             count, known = count + 1, known + (vertical is not None)
             item: Fix | NoFix = pilot.fix(image, time_us, vertical)
-            report.add(item)
+            report.add(item, pilot.steps_s)
             for sink in sinks:
                 sink.send(item)
     lines = report.lines()
@@ -108,6 +126,21 @@ def _images(
         yield _FIRST_US + round(1e6 * seconds), image, vertical
 
 
+def _write_parameters(
+    path: Path, profile: str, messages: tuple[Message, ...] | None, *, use_height: bool
+) -> None:
+    """Write the parameter file of a receiver; raise InputError if it exists or cannot be written."""
+    options = {} if profile == ROS2 else {"messages": messages, "use_height": use_height}
+    text = parameter_file(profile, **options)
+    try:
+        with path.open("x", encoding="utf-8") as handle:
+            handle.write(text)
+    except FileExistsError as error:
+        raise InputError("already exists; choose another file", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", path=path) from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="spn-onboard fly", description=__doc__)
     parser.add_argument("bundle", type=Path, help="bundle folder from `spn-model export`")
@@ -117,7 +150,28 @@ def _parser() -> argparse.ArgumentParser:
         "--to", type=Path, help="file of fixes: .jsonl, .csv, or a ROS 2 bag folder"
     )
     parser.add_argument("--mavlink", help="send to an autopilot, such as udpout:127.0.0.1:14550")
-    parser.add_argument("--profile", choices=("px4", "ardupilot"), default="px4")
+    parser.add_argument(
+        "--profile", choices=(*PROFILES, ROS2), default="px4", help="receiver of the messages"
+    )
+    parser.add_argument(
+        "--messages",
+        nargs="+",
+        choices=[m.value for m in Message],
+        help="MAVLink messages instead of those of the profile",
+    )
+    parser.add_argument(
+        "--parameters", type=Path, help="new file for the receiver's parameters, with explanations"
+    )
+    parser.add_argument(
+        "--use-height", action="store_true", help="the autopilot uses the height of the fixes"
+    )
+    parser.add_argument(
+        "--coast",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="age of a fix up to which predictions from it are sent, 0 to 1 s; 0: none",
+    )
     parser.add_argument(
         "--pitch", type=float, default=0.0, help="of the camera in the body, deg, negative: down"
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,14 +14,23 @@ import numpy as np
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size
 from spn_data.geometry.image_texture import missing_texture
-from spn_data.geometry.pose import Poses
-from spn_data.matching.features import extract
+from spn_data.geometry.pose import Poses, interpolate_pose
+from spn_data.matching.features import extract, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
+from spn_model.landmarks.anchor import LandmarkAnchor
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import ImageFeatures
-from spn_model.landmarks.search import Candidate, Found, Hypothesis, follow, search, witness_of
+from spn_model.landmarks.search import (
+    Candidate,
+    Found,
+    HasView,
+    Hypothesis,
+    follow,
+    search,
+    witness_of,
+)
 from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.bundle import verified_landmarks
 from spn_model.onboard.localizer import Localizer
@@ -42,6 +53,9 @@ class PilotOptions:
         Whether the network gives a hypothesis when an image is searched for.
     search_s : float
         Time after which an image is searched for independently although it could be followed.
+    anchor_s : float
+        Time for which the landmarks of an image are followed by their patches before features are detected
+        again.
     radius_px : float
         Search radius around predicted projections, plus `radius_px_s` for each second since the last fix.
     radius_px_s : float
@@ -52,6 +66,7 @@ class PilotOptions:
     sequence: bool = True
     network: bool = True
     search_s: float = 3.0
+    anchor_s: float = 1.0
     radius_px: float = 30.0
     radius_px_s: float = 150.0
 
@@ -70,6 +85,11 @@ class Pilot:
         Use the 8-bit graph of the network.
     threads : int
         Threads of the network.
+
+    Attributes
+    ----------
+    steps_s : dict of str to float
+        Time that each step of the last image took.
 
     Raises
     ------
@@ -94,8 +114,11 @@ class Pilot:
         self.landmarks = LandmarkMap.load(verified_landmarks(self.localizer.bundle))
         self._agreement = Agreement(self.options.motion)
         self._offset = np.array(self.localizer.bundle.view.offset)
-        self._last: tuple[int, np.ndarray, np.ndarray] | None = None  # time, centre, rotation
-        self._velocity = np.zeros(3)
+        self.steps_s: dict[str, float] = {}
+        self._passed: list[
+            tuple[float, Poses]
+        ] = []  # the last two poses that passed, with their times
+        self._anchor: tuple[int, LandmarkAnchor] | None = None  # with its time
         self._searched_us = 0
         self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
 
@@ -124,6 +147,7 @@ class Pilot:
             If the image has another aspect ratio than the camera.
         """
         begin = time.perf_counter()
+        self.steps_s = {}
         found, verdict, reason = self._found(image, time_us, vertical)
         if found is None or verdict is None or verdict.reason:
             if verdict is not None:
@@ -141,13 +165,14 @@ class Pilot:
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(verdict.covariance[:3, :3])[-1]))
             state = self._agreement.passed(time_us, pose.center, pose.rotation, sigma_m)
             if state in (FixState.COAST, FixState.LOST):
+                self._anchor = None
                 return NoFix(
                     time_us=time_us,
                     state=state,
                     reason="the pose contradicts the motion since the last fix",
                     processing_s=time.perf_counter() - begin,
                 )
-            self._remember(time_us, pose.center, pose.rotation)
+            self._remember(time_us, Poses.from_rotations(pose.center[None], pose.rotation[None]))
         shown = Poses.from_rotations((pose.center + self._offset)[None], pose.rotation[None])
         return Fix(
             time_us=time_us,
@@ -166,39 +191,89 @@ class Pilot:
         self, image: np.ndarray, time_us: int, vertical: KnownVertical | None
     ) -> tuple[Candidate | None, Judgement | None, str]:
         """Return the best pose with its judgement, or why there is none."""
-        lack = missing_texture(image)
+        with self._step("texture"):
+            lack = missing_texture(image)
         if lack:
             return None, None, lack
-        features = self._features(image)
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         guess = self._prediction(time_us)
-        if guess is not None and time_us - self._searched_us < self.options.search_s * 1e6:
-            found = follow(self.landmarks, features, guess)
+        following = guess is not None and time_us - self._searched_us < self.options.search_s * 1e6
+        if following and guess is not None:
+            found, verdict = self._followed_patches(gray, time_us, guess, vertical)
+            if found is not None:
+                return found.best, verdict, ""
+        with self._step("features"):
+            features = self._features(gray)
+        if following and guess is not None:
+            with self._step("landmarks"):
+                found = follow(self.landmarks, features, guess)
             verdict = self._judged(found, features, vertical)
             if found is not None and verdict is not None and not verdict.reason:
+                self._keep_anchor(gray, time_us, found.best, features)
                 return found.best, verdict, ""
+            guess = None  # what could not be followed is not tried again
         self._searched_us = time_us
-        guesses = [guess] if guess is not None else []
-        found = search(self.landmarks, features, [*guesses, *self._from_network(image, vertical)])
-        if found is None:
+        hypotheses = self._hypotheses(image, guess, vertical)
+        with self._step("landmarks"):
+            found = search(self.landmarks, features, hypotheses)
+        verdict = self._judged(found, features, vertical)
+        if found is None or verdict is None:
             return None, None, "too few landmarks agree on any pose"
-        return found.best, self._judged(found, features, vertical), ""
+        if not verdict.reason:
+            self._keep_anchor(gray, time_us, found.best, features)
+        return found.best, verdict, ""
+
+    def _followed_patches(
+        self, gray: np.ndarray, time_us: int, guess: Hypothesis, vertical: KnownVertical | None
+    ) -> tuple[Found | None, Judgement | None]:
+        """Return pose and judgement by the patches of the anchor, or None and None if they do not do."""
+        if self._anchor is None or time_us - self._anchor[0] > self.options.anchor_s * 1e6:
+            return None, None
+        anchor = self._anchor[1]
+        with self._step("patches"):
+            small = reduced(gray, self.landmarks.facts.features.max_image_size_px)
+            if small.shape != anchor.gray.shape:
+                return None, None
+            found = anchor.follow(small, guess)
+        verdict = self._judged(found, anchor, vertical)
+        if verdict is None or verdict.reason:
+            return None, None
+        return found, verdict
+
+    def _keep_anchor(
+        self, gray: np.ndarray, time_us: int, candidate: Candidate, features: ImageFeatures
+    ) -> None:
+        if self.options.sequence:
+            small = reduced(gray, self.landmarks.facts.features.max_image_size_px)
+            camera = self.camera.scaled(small.shape[1], small.shape[0])
+            self._anchor = (
+                time_us,
+                LandmarkAnchor.of(small, camera, candidate, features.half_view),
+            )
 
     def _judged(
-        self, found: Found | None, features: ImageFeatures, vertical: KnownVertical | None
+        self, found: Found | None, view: HasView, vertical: KnownVertical | None
     ) -> Judgement | None:
         if found is None:
             return None
-        witness = witness_of(found, features, vertical)
-        verdict = judge(witness, self.options.limits)
-        reason = verdict.reason or (self._lens_over_time(witness) if self.options.sequence else "")
-        return replace(verdict, reason=reason)
+        with self._step("judgement"):
+            witness = witness_of(found, view, vertical)
+            verdict = judge(witness, self.options.limits)
+        if not self.options.sequence:
+            return verdict
+        if not isinstance(view, LandmarkAnchor):  # which has the errors of an image before
+            self._weigh_lens(witness)
+        return replace(verdict, reason=verdict.reason or self._lens_over_time())
 
-    def _lens_over_time(self, witness: Witness) -> str:
-        """Return why the stated lens cannot be right, from all images so far that determine it together."""
+    def _weigh_lens(self, witness: Witness) -> None:
+        """Add what an image says about the focal length to what those before said."""
         change, sigma = witness.focal_change
         weight = 1 / (sigma**2 + self.options.limits.focal_sigma**2)
-        kept = np.array([weight, weight * change]) + _FORGET * self._focal
-        self._focal = kept
+        self._focal = np.array([weight, weight * change]) + _FORGET * self._focal
+
+    def _lens_over_time(self) -> str:
+        """Return why the stated lens cannot be right, from all images so far that determine it together."""
+        kept = self._focal
         mean = kept[1] / kept[0]
         allowed = self.options.limits.max_focal_sigmas * max(
             kept[0] ** -0.5, self.options.limits.focal_sigma
@@ -207,12 +282,31 @@ class Pilot:
             return ""
         return f"the landmarks of many images fit a focal length {100 * mean:+.1f} % from the stated one"
 
-    def _features(self, image: np.ndarray) -> ImageFeatures:
-        height, width = image.shape[:2]
+    def _features(self, gray: np.ndarray) -> ImageFeatures:
+        height, width = gray.shape
         camera = camera_at_size(self.camera, width, height)
         options = self.landmarks.facts.features
-        found = extract(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), None, options)
-        return ImageFeatures.of(found, camera, options.max_image_size_px)
+        return ImageFeatures.of(extract(gray, None, options), camera, options.max_image_size_px)
+
+    def _hypotheses(
+        self, image: np.ndarray, guess: Hypothesis | None, vertical: KnownVertical | None
+    ) -> Iterator[Hypothesis]:
+        """Yield the hypotheses of a search; the network runs only if it is reached."""
+        if guess is not None:
+            yield guess
+        with self._step("network"):
+            found = self._from_network(image, vertical)
+        yield from found
+
+    @contextmanager
+    def _step(self, name: str) -> Iterator[None]:
+        """Add the time of a step; a step within another one counts for itself alone."""
+        begin, inner = time.perf_counter(), sum(self.steps_s.values())
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - begin - (sum(self.steps_s.values()) - inner)
+            self.steps_s[name] = self.steps_s.get(name, 0.0) + spent
 
     def _from_network(self, image: np.ndarray, vertical: KnownVertical | None) -> list[Hypothesis]:
         if not self.options.network:
@@ -224,18 +318,19 @@ class Pilot:
         return [Hypothesis("network", center, located.poses.rotations[0])]
 
     def _prediction(self, time_us: int) -> Hypothesis | None:
-        """Return the last pose moved on at the last velocity, while the localization is not lost."""
-        if self._last is None or self._agreement.state not in (FixState.TRACK, FixState.COAST):
+        """Return the last pose moved on at constant velocity, while the localization is not lost."""
+        if not self._passed or self._agreement.state not in (FixState.TRACK, FixState.COAST):
             return None
-        since_s = (time_us - self._last[0]) * 1e-6
+        last_s, pose = self._passed[-1]
+        since_s = time_us * 1e-6 - last_s
         radius = self.options.radius_px + self.options.radius_px_s * since_s
-        return Hypothesis("track", self._last[1] + self._velocity * since_s, self._last[2], radius)
+        if len(self._passed) > 1:
+            pose = interpolate_pose(self._passed[0], self._passed[1], time_us * 1e-6)
+        return Hypothesis("track", pose.centers[0], pose.rotations[0], radius)
 
-    def _remember(self, time_us: int, center: np.ndarray, rotation: np.ndarray) -> None:
-        if self._last is not None and time_us > self._last[0]:
-            between_s = (time_us - self._last[0]) * 1e-6
-            if between_s < self.options.motion.coast_s:
-                self._velocity = (center - self._last[1]) / between_s
-            else:
-                self._velocity = np.zeros(3)
-        self._last = (time_us, center, rotation)
+    def _remember(self, time_us: int, pose: Poses) -> None:
+        """Keep two poses for the prediction, unless too much time passed between them."""
+        recent = [
+            p for p in self._passed if 0 < time_us * 1e-6 - p[0] < self.options.motion.coast_s
+        ]
+        self._passed = [*recent[-1:], (time_us * 1e-6, pose)]

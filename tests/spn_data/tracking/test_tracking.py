@@ -12,8 +12,9 @@ from spn_data.capture.frames import FrameStatus
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.pose_fit import fit_pose
 from spn_data.geometry.rotations import rotations_from_angles
+from spn_data.matching.patches import track_points
 from spn_data.tracking.label_video import drop_jumps, track_frames
-from spn_data.tracking.point_tracking import spread_points, track_points, track_segment
+from spn_data.tracking.point_tracking import spread_points, track_segment
 from spn_data.tracking.segments import read_segments
 from spn_data.tracking.tracked_frames import TrackedFrame, TrackingOptions
 from tests.worlds.tracking_world import CAMERA, LABELLED, TEXTURE, N, World, visible
@@ -102,7 +103,15 @@ def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
     x, y = np.meshgrid(np.arange(40.5, 360, 40), np.arange(40.5, 360, 40))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     pixels[0] = (398.0, 200.0)
-    there, found = track_points(before, moved, pixels, pixels + np.array([9.0, 8.0]), 3, OPTIONS)
+    there, found = track_points(
+        before,
+        moved,
+        pixels,
+        pixels + np.array([9.0, 8.0]),
+        levels=3,
+        window_px=OPTIONS.window_px,
+        round_trip_px=OPTIONS.round_trip_px,
+    )
     behind = np.all((pixels > 150) & (pixels < 250), axis=1)
     clear = np.any((pixels < 110) | (pixels > 290), axis=1)
     assert behind.sum() == 9

@@ -132,15 +132,83 @@ def test_ardupilots_times_keep_one_delay_over_a_loss():
         now += 33_000
         if not 100 <= step < 300:
             sender.offer(make_fix(time_us=now - 60_000 - 1000 * (step % 30)))
-        before = len(autopilot.fused)
         for message in said(sender, now):
-            autopilot.take(message, now + 2000)
-        if len(autopilot.fused) > before:
-            exposure = now - 60_000 - 1000 * (step % 30)
-            lags.append(autopilot.fused[-1]["time_ms"] - exposure // 1000)
+            if not autopilot.take(message, now + 2000):
+                lags.append(autopilot.fused[-1]["time_ms"] - message.time_usec // 1000)
     assert len(lags) > 180
     assert sender.report.least_age_us == 60_000
     assert set(lags) <= {61, 62, 63}
+
+
+# Between images
+
+
+def moving(step, latency_us=60_000, **changes):
+    """Return the fix of an image each 0.2 s of a camera that flies east at 5 m/s."""
+    covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])
+    values = {"center": [10.0 + step, 20.0, 30.0], "covariance": covariance}
+    time_us = NOW_US + 200_000 * step - latency_us
+    return make_fix(time_us=time_us, **{**values, **changes})
+
+
+def flown(sender, fixes, slots=100):
+    """Return the messages of slots at 50 a second, with the fixes offered at the slots of their keys."""
+    found = []
+    for slot in range(slots):
+        if slot in fixes:
+            sender.offer(fixes[slot])
+        found += said(sender, NOW_US + SLOT_US * slot)
+    return found
+
+
+def test_predictions_fill_the_time_between_images():
+    """At 5 images a second PX4 gets a pose each 20 ms: right, marked as predictions, and heavier never."""
+    sender, taker = make_sender("px4", messages=(Message.ODOMETRY,)), Px4()
+    messages = flown(sender, {10 * k: moving(k) for k in range(10)})
+    assert all(taker.take(message) == "" for message in messages)
+    stamps = np.array([m.time_usec for m in messages])
+    assert np.diff(stamps).max() <= 200_000  # until the motion is known
+    assert np.diff(stamps[2:]).max() <= SLOT_US
+    np.testing.assert_allclose(
+        [m.y for m in messages], 10 + (stamps + 60_000 - NOW_US) * 5e-6, atol=0.1
+    )
+    measured = np.array([m.quality == 80 for m in messages])
+    assert np.count_nonzero(measured) == sender.report.sent == 10
+    assert all(m.quality <= 49 for m in np.array(messages)[~measured])
+    weights = np.array([1 / m.pose_covariance[6] for m in messages])
+    assert weights[~measured].sum() < weights[measured].sum()
+    last = np.flatnonzero(measured)[5]
+    assert (np.diff([m.pose_covariance[6] for m in messages[last : last + 10]]) > 0).all()
+    assert sender.report.coasted == np.count_nonzero(~measured)
+
+
+def test_predictions_end():
+    """They end 0.5 s after the last fix, at once after a loss, and none comes if they are switched off."""
+    for options, item, longest in (
+        ({}, None, 500_000),
+        ({}, no_fix(NOW_US + 220_000, FixState.COAST), 500_000),
+        ({}, no_fix(NOW_US + 220_000, FixState.LOST), 100_000),
+        ({"coast_s": 0.0}, None, 0),
+    ):
+        sender = make_sender("px4", messages=(Message.ODOMETRY,), **options)
+        fixes = {0: moving(0), 10: moving(1)} | ({} if item is None else {15: item})
+        poses = [m for m in flown(sender, fixes) if m.quality >= 0]
+        assert poses[-1].time_usec - moving(1).time_us <= longest
+        assert longest == 0 or poses[-1].time_usec - moving(1).time_us > longest - 2 * SLOT_US
+    with pytest.raises(InputError, match="predictions go out for"):
+        make_sender(coast_s=3.0)
+
+
+def test_a_fix_that_comes_after_a_prediction_is_moved_on():
+    """One whose image took longer is no older than the last pose, is counted, and keeps its weight."""
+    sender = make_sender("px4", messages=(Message.ODOMETRY,))
+    late = moving(2)
+    messages = flown(sender, {0: moving(0), 10: moving(1), 22: late}, slots=23)
+    assert messages[-1].time_usec == messages[-2].time_usec + 1000 > late.time_us
+    assert sender.report.sent == 3
+    assert sender.report.repeated == 0
+    assert messages[-1].pose_covariance[6] < messages[-2].pose_covariance[6] / 10
+    assert messages[-1].quality == 49
 
 
 # PX4
