@@ -224,7 +224,8 @@ def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
     change : float
         Relative change of the focal length.
     sigma : float
-        Its standard deviation for the stated noise, or larger where residuals are.
+        Its standard deviation for the stated noise, or larger where residuals are. 1, as assumed before, if
+        the sightings do not determine it.
     """
     center, rotation, factor = pose.center, pose.rotation, 1.0
     for scale in 2.0 * np.array(_FOCAL_SCALES):
@@ -235,7 +236,10 @@ def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
         weights = 1 / (1 + (residuals**2).sum(axis=1) / scale**2)
         weights[x[:, 2] <= 0] = 0
         information = np.einsum("n,nij,nik->jk", weights, by, by) + np.diag([0.0] * 6 + [1.0])
-        step = -np.linalg.solve(information, np.einsum("n,nij,ni->j", weights, by, residuals))
+        try:
+            step = -np.linalg.solve(information, np.einsum("n,nij,ni->j", weights, by, residuals))
+        except np.linalg.LinAlgError:  # few landmarks, and the fit left them behind the camera
+            return 0.0, 1.0
         center = center + step[:3]
         rotation = rotations_from_vectors(step[None, 3:6])[0] @ rotation
         factor *= float(np.exp(np.clip(step[6], -0.1, 0.1)))
