@@ -322,7 +322,7 @@ class RunFacts:
     notes: tuple[str, ...]
     figures: tuple[Figure, ...]
     left_out: int = 0
-    fixes: BundleFixes = BundleFixes()
+    fixes: BundleFixes = field(default_factory=BundleFixes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

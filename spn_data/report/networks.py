@@ -165,9 +165,9 @@ def _fixes(run: RunFacts) -> str:
     return (
         f"<h3>{escape(run.name)}: fixes of its bundle</h3>{said}"
         + (_table(_FIX_HEADER, rows, "fixes") if rows else "")
-        + '<p class="note">Coarse: the network alone. Search: fixes of single images. Track: of the images one '
-        "after the other. Misleading: published as usable and off by more than 0.5 m, 2&deg; or its protection "
-        "level; in brackets the upper bound of its share, with 95 % confidence.</p>"
+        + '<p class="note">Coarse: the network alone. Search: fixes of single images. Track: of the images '
+        "one after the other. Misleading: published as usable and off by more than 0.5 m, 2&deg; or its "
+        "protection level; in brackets the upper bound of its share, with 95 % confidence.</p>"
     )
 
 

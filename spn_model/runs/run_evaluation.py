@@ -9,13 +9,17 @@ from typing import Any
 
 from spn_data.area.names import COMPARED, GEO, MODEL, RETRIEVAL
 from spn_data.errors import InputError
+from spn_data.storage.files import write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import load_json
 from spn_data.work.timing import Progress
 from spn_model.evaluation.comparison_files import network_facts, select_network, write_comparison
 from spn_model.evaluation.evaluate import EvaluateOptions, NetworkComparison, compare
 from spn_model.evaluation.fix_figures import stanford_diagrams
 from spn_model.evaluation.fix_files import RunFixes, Verdict, verdicts_of, write_fixes
+from spn_model.export.model_card import card_with_metrics
 from spn_model.models.checkpoint import load
+from spn_model.onboard.bundle import CARD
 from spn_model.runs.run_files import RunFiles
 from spn_model.training import machine
 from spn_model.training.training_figure import read_log, training_figure
@@ -166,6 +170,13 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
         drawings = {**figures[run.name], **stanford_diagrams(fixes.flights)}
         document = fixes.to_json(evaluated.verdicts(run.name))
         _write(run, select_network(comparison, run.name), own, drawings, document)
+        card = run.bundle / CARD
+        if fixes.flights and card.is_file():
+            trained_on = facts[run.name]["training"].get("trained_on", ())
+            text = card.read_text(encoding="utf-8")
+            metrics = load_json(run.metrics)
+            text = card_with_metrics(text, metrics, run=run.name, trained_on=trained_on)
+            write_atomically(card, text)
     folders = [run.folder for run in evaluated.runs]
     if len(evaluated.runs) > 1:
         folders.append(folders[0].parent / COMPARED)
