@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from spn_data.area.names import COMPARED, GEO, MODEL, RETRIEVAL
-from spn_data.errors import InputError
+from spn_data.errors import FormatError, InputError
 from spn_data.storage.files import write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import load_json
@@ -21,6 +21,7 @@ from spn_model.export.model_card import card_with_metrics
 from spn_model.models.checkpoint import load
 from spn_model.onboard.bundle import CARD
 from spn_model.runs.run_files import RunFiles
+from spn_model.runs.run_fixes import own_bundle
 from spn_model.training import machine
 from spn_model.training.training_figure import read_log, training_figure
 
@@ -170,18 +171,28 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
         drawings = {**figures[run.name], **stanford_diagrams(fixes.flights)}
         document = fixes.to_json(evaluated.verdicts(run.name))
         _write(run, select_network(comparison, run.name), own, drawings, document)
-        card = run.bundle / CARD
-        if fixes.flights and card.is_file():
-            trained_on = facts[run.name]["training"].get("trained_on", ())
-            text = card.read_text(encoding="utf-8")
-            metrics = load_json(run.metrics)
-            text = card_with_metrics(text, metrics, run=run.name, trained_on=trained_on)
-            write_atomically(card, text)
+        if run.bundle.exists():
+            try:
+                _complete_card(run, facts[run.name]["training"].get("trained_on", ()))
+            except (InputError, FormatError, OSError) as error:
+                notes.append(f"the model card of the bundle was not completed: {error}")
     folders = [run.folder for run in evaluated.runs]
     if len(evaluated.runs) > 1:
         folders.append(folders[0].parent / COMPARED)
         _write(RunFiles(folders[-1]), comparison, facts, {})
     return WrittenEvaluation(folders=tuple(folders), notes=tuple(notes))
+
+
+def _complete_card(run: RunFiles, trained_on: Collection[str]) -> None:
+    """Write the errors and fixes of metrics.json into the model card of the bundle."""
+    card = own_bundle(run).folder / CARD
+    text = card_with_metrics(
+        card.read_text(encoding="utf-8"),
+        load_json(run.metrics),
+        run=run.name,
+        trained_on=trained_on,
+    )
+    write_atomically(card, text)
 
 
 def _write(

@@ -15,13 +15,20 @@ from spn_model.onboard.bundle import DOCUMENT, FLOAT32, Bundle, read_bundle, ver
 from spn_model.runs.run_files import RunFiles
 
 
-def require_bundle(run: RunFiles) -> Bundle:
-    """Return the bundle of a run; raise InputError if there is none."""
+def own_bundle(run: RunFiles) -> Bundle:
+    """Return the bundle of a run; raise InputError if there is none, or one of an earlier network."""
+    export = f"run spn-model export --run {run.name}"
     if not (run.bundle / DOCUMENT).is_file():
+        raise InputError(f"there is no bundle; {export} first", path=run.bundle)
+    bundle = read_bundle(run.bundle)
+    facts = bundle.document.get("run")
+    made_of = facts.get("checkpoint") if isinstance(facts, dict) else None
+    if made_of != content_fingerprint(run.require_checkpoint()):
         raise InputError(
-            f"there is no bundle; run spn-model export --run {run.name} first", path=run.bundle
+            f"the bundle is of an earlier network of this run; {export} --overwrite",
+            path=run.bundle,
         )
-    return read_bundle(run.bundle)
+    return bundle
 
 
 def flown_bundle(run: RunFiles, map_hash: str) -> Bundle:
@@ -44,19 +51,12 @@ def flown_bundle(run: RunFiles, map_hash: str) -> Bundle:
     FormatError
         If it is damaged.
     """
-    export = f"run spn-model export --run {run.name}"
-    bundle = require_bundle(run)
-    facts = bundle.document.get("run")
-    made_of = facts.get("checkpoint") if isinstance(facts, dict) else None
-    if made_of != content_fingerprint(run.require_checkpoint()):
-        raise InputError(
-            f"the bundle is of an earlier network of this run; {export} --overwrite",
-            path=run.bundle,
-        )
+    bundle = own_bundle(run)
     landmarks = LandmarkMap.load(verified_landmarks(bundle))
     if landmarks.facts.map_hash != map_hash:
         raise InputError(
-            f"the landmarks of the bundle are of another map than that of the area; {export} --overwrite",
+            "the landmarks of the bundle are of another map than that of the area; run spn-model export "
+            f"--run {run.name} --overwrite",
             path=run.bundle,
         )
     return bundle
@@ -96,7 +96,7 @@ def fixes_of_runs(
     flights = None
     for run in runs:
         try:
-            require_bundle(run)
+            own_bundle(run)
             flights = flights or read_flights()
             found[run.name] = measure_fixes(run, flights, progress)
         except (InputError, StageError) as error:

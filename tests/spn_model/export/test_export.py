@@ -263,8 +263,8 @@ def test_the_command_makes_a_bundle_once(hall, network, tmp_path):
         },
     )
     third = CliRunner().invoke(main, arguments)
-    assert third.exit_code == 1
-    assert "--overwrite" in third.output
+    assert third.exit_code == 0
+    assert "unchanged" in third.output
     fourth = CliRunner().invoke(main, [*arguments, "--overwrite"])
     assert fourth.exit_code == 0, fourth.output
     card = (run / "bundle" / "MODEL_CARD.md").read_text(encoding="utf-8")
