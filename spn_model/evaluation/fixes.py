@@ -15,7 +15,6 @@ from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
 from spn_model.integrity.fix import Fix, NoFix
-from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
@@ -131,14 +130,11 @@ class FlightFixes:
     method : str
         `COARSE`, `SEARCH` or `TRACK`.
     images : tuple of JudgedImage
-    longest_outage_s : float
-        NaN except for `TRACK`.
     """
 
     flight: str
     method: str
     images: tuple[JudgedImage, ...]
-    longest_outage_s: float = math.nan
 
     def summary(self) -> FixSummary:
         """Return the figures."""
@@ -157,8 +153,14 @@ class FlightFixes:
             protected=math.nan
             if self.method == COARSE
             else _of(np.mean, [float(error.is_protected) for error in errors]),
-            longest_outage_s=self.longest_outage_s,
+            longest_outage_s=self._longest_outage_s() if self.method == TRACK else math.nan,
         )
+
+    def _longest_outage_s(self) -> float:
+        """Return the longest time between usable fixes, begin and end of the flight included."""
+        times = [image.time_s for image in self.images]
+        marks = [*times[:1], *(i.time_s for i in self.images if i.is_usable), *times[-1:]]
+        return float(np.diff(marks).max(initial=0))
 
 
 def fix_error(fix: Fix, truth: Poses) -> FixError:
@@ -173,12 +175,7 @@ def largest_share(events: int, of: int, confidence: float = CONFIDENCE) -> float
     return 1.0 if events >= of else float(beta.ppf(confidence, events + 1, of - events))
 
 
-def search_each(
-    pilot: Pilot,
-    flight: EvaluationFlight,
-    done: Callable[[], None],
-    each: Callable[[int, np.ndarray, Fix | NoFix], None] | None = None,
-) -> FlightFixes:
+def search_each(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) -> FlightFixes:
     """Search for each chosen frame of a flight that has a label, alone.
 
     Parameters
@@ -188,8 +185,6 @@ def search_each(
     flight : EvaluationFlight
     done : callable
         Called after each image.
-    each : callable, optional
-        Receives row, image and result.
 
     Returns
     -------
@@ -197,10 +192,7 @@ def search_each(
     """
     judged = []
     for row, image in flight.images(chosen_rows(flight)):
-        item = pilot.fix(image, _FIRST_US)
-        judged.append(_judged(item, flight, row))
-        if each is not None:
-            each(row, image, item)
+        judged.append(_judged(pilot.fix(image, _FIRST_US), flight, row))
         done()
     return FlightFixes(flight=flight.name, method=SEARCH, images=tuple(judged))
 
@@ -221,18 +213,12 @@ def track_all(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) 
     -------
     FlightFixes
     """
-    judged, report = [], FlightReport()
+    judged = []
     for row, image in flight.images(np.arange(len(flight.labels))):
         item = pilot.fix(image, _FIRST_US + round(1e6 * float(flight.labels.time_s[row])))
-        report.add(item)
         judged.append(_judged(item, flight, row))
         done()
-    return FlightFixes(
-        flight=flight.name,
-        method=TRACK,
-        images=tuple(judged),
-        longest_outage_s=report.longest_outage_s,
-    )
+    return FlightFixes(flight=flight.name, method=TRACK, images=tuple(judged))
 
 
 def coarse_each(
