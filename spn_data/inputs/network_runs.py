@@ -24,8 +24,6 @@ _MAX_FIGURES_BYTES = 12_000_000  # in all runs
 _MAX_RUNS, _MAX_FIGURES = 50, 60
 _MAX_TEXT = 200
 _MAX_FIX_ROWS, _MAX_VERDICT = 100, 600
-_FIX_COUNTS = ("images", "usable", "compared", "misleading")
-_FIX_NUMBERS = ("error_m", "error_deg", "nees", "protected", "longest_outage_s")
 _KINDS = ("protection", "trajectories", "histograms", "distance", "calibration")
 _SVG = re.compile(rb'<svg [^<>]*?viewBox="0 0 (\d{1,5}) \d{1,5}"')
 
@@ -182,9 +180,16 @@ def _fixes(value: Mapping[str, Any]) -> BundleFixes:
         FixFigures(
             flight=_text(flight),
             method=_text(method),
-            **{name: int(_required(of[name])) for name in _FIX_COUNTS},
+            images=int(_required(of["images"])),
+            usable=int(_required(of["usable"])),
+            compared=int(_required(of["compared"])),
+            error_m=_number(of["error_m"]),
+            error_deg=_number(of["error_deg"]),
+            misleading=int(_required(of["misleading"])),
             misleading_at_most=_required(of["misleading_at_most"]),
-            **{name: _number(of[name]) for name in _FIX_NUMBERS},
+            nees=_number(of["nees"]),
+            protected=_number(of["protected"]),
+            longest_outage_s=_number(of["longest_outage_s"]),
         )
         for flight, methods in value["flights"].items()
         for method, of in methods.items()

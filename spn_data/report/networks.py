@@ -151,7 +151,9 @@ def _fixes(run: RunFacts) -> str:
             escape(one.method),
             f"{one.usable:,} of {one.images:,}",
             _fix_error(one),
-            f"{one.misleading:,} (&lt; {100 * one.misleading_at_most:.1f} %)",
+            f"{one.misleading:,} (&le; {100 * one.misleading_at_most:.1f} %)"
+            if one.compared
+            else _NOTHING,
             _NOTHING if one.nees is None else f"{one.nees:.2f}",
             _NOTHING if one.protected is None else f"{one.protected:.1%}",
             _NOTHING if one.longest_outage_s is None else f"{one.longest_outage_s:.1f} s",

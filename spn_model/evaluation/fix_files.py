@@ -183,7 +183,7 @@ def write_fixes(path: Path, flights: Sequence[FlightFixes]) -> None:
 
 
 FIX_HEADER = (
-    *("flight", "from", "usable", "median", "misleading", "NEES/6", "within level", "outage"),
+    *("flight", "from", "usable", "median", "misleading", "NEES/6", "in level", "outage"),
 )
 
 
@@ -199,7 +199,9 @@ def fix_rows(flights: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> list[tup
                     method,
                     f"{one.usable} of {one.images}",
                     _median(one),
-                    f"{one.misleading} (< {100 * one.misleading_at_most:.1f} %)",
+                    f"{one.misleading} (<= {100 * one.misleading_at_most:.1f} %)"
+                    if one.compared
+                    else "",
                     _text(one.nees, ".2f"),
                     _text(100 * one.protected, ".1f", " %"),
                     _text(one.longest_outage_s, ".1f", " s"),

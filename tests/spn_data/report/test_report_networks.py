@@ -114,7 +114,7 @@ def test_fixes_stand_beside_coarse_poses(root):
     part = shown[shown.index("<h3>first: fixes of its bundle") :].split("</table>")[0]
     assert "<td>coarse</td><td>1,199 of 1,200</td><td>12.30 m, 0.04&deg;</td>" in part
     assert "<td>track</td><td>1,199 of 1,200</td><td>1.2 cm, 0.04&deg;</td>" in part
-    assert "<td>0 (&lt; 0.3 %)</td><td>0.90</td><td>&ndash;</td><td>0.4 s</td>" in part
+    assert "<td>0 (&le; 0.3 %)</td><td>0.90</td><td>&ndash;</td><td>0.4 s</td>" in part
     assert '<p class="note">Fixes can be used.</p><p class="note warn">Not &lt; 2</p>' in part
 
 

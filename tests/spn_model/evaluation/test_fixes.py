@@ -208,7 +208,7 @@ def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     assert "old" not in made
     assert made.startswith("# first\n\n## Errors\n\nMeasured by")
     assert made.endswith("\n\n## Limits\n\nnone\n")
-    assert "| low | search | 2 of 3 | 1.0 cm, 0.00 deg | 0 (< 77.6 %) |" in made
+    assert "| low | search | 2 of 3 | 1.0 cm, 0.00 deg | 0 (<= 77.6 %) |" in made
     assert "- Coarse poses of first alone are not to be flown" in made
     assert len(fix_rows(document["flights"])) == 1
     assert card_with_metrics("# other\n", metrics, run="first", trained_on=()) == "# other\n"
