@@ -123,18 +123,25 @@ def availability(
 def _show_plan(found: dict[str, list[ExpectedFix]]) -> None:
     """Print how many waypoints have a fix to be expected, and those that have none."""
     for name, part in found.items():
-        lacking = [one for one in part if not one.is_expected]
+        lacking = [one for one in part if one.reason]
         console.out.print(
             f"{name}: a fix is to be expected at {len(part) - len(lacking)} of {len(part)} waypoints."
         )
         if not lacking:
             continue
         rows = [
-            (one.name, str(one.landmarks), f"{one.spread:.0%}", f"{one.shown:.0%}", one.reason)
+            (
+                one.name,
+                one.expectation.value,
+                str(one.landmarks),
+                f"{one.spread:.0%}",
+                f"{one.shown:.0%}",
+                one.reason,
+            )
             for one in lacking[:_SHOWN]
         ]
-        header = ("waypoint", "landmarks", "spread", "shown", "reason")
-        console.table(f"{name}: no fix to be expected", rows, header)
+        header = ("waypoint", "fix", "landmarks", "spread", "shown", "reason")
+        console.table(f"{name}: waypoints without a fix in the rendered view", rows, header)
         if len(lacking) > _SHOWN:
             console.out.print(f"... and {len(lacking) - _SHOWN} more; --to writes all.\n")
 
@@ -143,14 +150,14 @@ def _show_comparison(found: dict[str, list[ExpectedFix]], measured: dict[str, bo
     """Print what was expected of the frames of evaluation flights against what they had."""
     rows = []
     for name, part in found.items():
-        both = [(one.is_expected, measured[one.name]) for one in part if one.name in measured]
-        counts = [str(both.count(pair)) for pair in _PAIRS]
-        rows.append((name, str(len(both)), *counts))
-    console.table("Fixes expected in rendered views, against fixes of the images", rows, _HEADER)
-
-
-_PAIRS = ((True, True), (True, False), (False, True), (False, False))
-_HEADER = (
-    *("flight", "frames", "expected, had one", "expected, had none"),
-    *("not expected, had one", "not expected, had none"),
-)
+        both = [(one.expectation.value, measured[one.name]) for one in part if one.name in measured]
+        counts = [
+            f"{both.count((said, True))} of {sum(one == said for one, _ in both)}"
+            for said in ("yes", "perhaps", "no")
+        ]
+        rows.append((name, *counts))
+    console.table(
+        "Frames that had a fix, by what was expected of the rendered view",
+        rows,
+        ("flight", "yes", "perhaps", "no"),
+    )

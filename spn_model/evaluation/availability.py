@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,18 @@ from spn_model.onboard.pilot import Pilot, PilotOptions
 
 _FILL = (128, 128, 128)  # what no training image shows
 _GRID = (8, 5)  # parts of the image, as in the judgement of a fix
+_MANY = 10  # times the landmarks that have to agree: about a seventh of those in view did, from far above
 _LITTLE = 0.1  # share of a view; where less is shown, nothing else matters
 _MOST_ASPECT = 8.0  # of the images of a camera, either way
 _FIRST_US = 1
+
+
+class Expectation(StrEnum):
+    """Whether a fix is to be expected."""
+
+    YES = "yes"  # the rendered view has one
+    PERHAPS = "perhaps"  # it has none, but many landmarks are in view
+    NO = "no"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +45,9 @@ class ExpectedFix:
     Attributes
     ----------
     name : str
-    is_expected : bool
-        Whether the rendered view has a usable fix at this pose.
+    expectation : Expectation
     reason : str
-        Why not; empty if it has.
+        Why the rendered view has no usable fix at this pose; empty if it has.
     landmarks : int
         Landmarks of the bundle in the view, seen from a direction and distance known to the map. Some of
         them may be hidden.
@@ -53,7 +62,7 @@ class ExpectedFix:
     """
 
     name: str
-    is_expected: bool
+    expectation: Expectation
     reason: str
     landmarks: int
     spread: float
@@ -117,23 +126,30 @@ class PlannedViews:
         image, shown = self.render(pose, pinhole)
         pilot = self._pilot(pinhole)
         landmarks, spread = self._visible(pilot, pose, pinhole)
-        seen = {"name": name, "landmarks": landmarks, "spread": spread, "shown": shown}
         item = pilot.fix(image, _FIRST_US)
+        error_m, levels, reason = math.nan, (math.nan, math.nan), ""
         if isinstance(item, NoFix):
             unseen = f"the training images show {shown:.0%} of this view"
             reason = unseen if shown < _LITTLE else item.reason
-            return ExpectedFix(is_expected=False, reason=reason, **seen)
-        error = fix_error(item, pose)
-        levels = (item.horizontal_protection_m, item.vertical_protection_m)
-        reason = ""
-        if error.error_m > MISLEADING_M or error.error_deg > MISLEADING_DEG:
-            reason = f"the fix in the rendered view is {error.error_m:.2f} m beside the pose"
+        else:
+            error = fix_error(item, pose)
+            error_m = error.error_m
+            levels = (item.horizontal_protection_m, item.vertical_protection_m)
+            if error.error_m > MISLEADING_M or error.error_deg > MISLEADING_DEG:
+                reason = f"the fix in the rendered view is {error_m:.2f} m beside the pose"
+        expectation = Expectation.YES
+        if reason:
+            many = landmarks >= _MANY * pilot.options.limits.min_inliers
+            expectation = Expectation.PERHAPS if many else Expectation.NO
         return ExpectedFix(
-            is_expected=not reason,
+            name=name,
+            expectation=expectation,
             reason=reason,
-            error_m=error.error_m,
+            landmarks=landmarks,
+            spread=spread,
+            shown=shown,
+            error_m=error_m,
             protection_m=levels,
-            **seen,
         )
 
     def render(self, pose: Poses, pinhole: Camera) -> tuple[np.ndarray, float]:

@@ -89,7 +89,7 @@ def write_expected(path: Path, expected: Sequence[ExpectedFix]) -> None:
         path,
         {
             "name": [one.name for one in expected],
-            "expected": [str(int(one.is_expected)) for one in expected],
+            "expected": [one.expectation.value for one in expected],
             "reason": [one.reason for one in expected],
             "landmarks": [str(one.landmarks) for one in expected],
             "spread": [f"{one.spread:.3f}" for one in expected],
