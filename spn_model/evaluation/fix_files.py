@@ -10,6 +10,7 @@ from typing import Any
 
 from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_csv
+from spn_data.storage.json_files import number_or
 from spn_model.evaluation.evaluate import EvaluatedGroup
 from spn_model.evaluation.fixes import (
     COARSE,
@@ -189,10 +190,10 @@ FIX_HEADER = (
 
 def fix_rows(flights: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> list[tuple[str, ...]]:
     """Return a row of text for each flight and method, from `flights` of `RunFixes.to_json`."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for flight, methods in flights.items():
         for method, values in methods.items():
-            one = FixSummary(**{k: math.nan if v is None else v for k, v in values.items()})
+            one = _summary(values)
             rows.append(
                 (
                     flight,
@@ -208,6 +209,23 @@ def fix_rows(flights: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> list[tup
                 )
             )
     return rows
+
+
+def _summary(values: Mapping[str, Any]) -> FixSummary:
+    """Parse a summary; raise KeyError, TypeError or ValueError if it is none."""
+    return FixSummary(
+        images=int(values["images"]),
+        usable=int(values["usable"]),
+        compared=int(values["compared"]),
+        error_m=number_or(values["error_m"]),
+        error_deg=number_or(values["error_deg"]),
+        largest_m=number_or(values["largest_m"]),
+        misleading=int(values["misleading"]),
+        misleading_at_most=number_or(values["misleading_at_most"]),
+        nees=number_or(values["nees"]),
+        protected=number_or(values["protected"]),
+        longest_outage_s=number_or(values["longest_outage_s"]),
+    )
 
 
 def _median(one: FixSummary) -> str:
