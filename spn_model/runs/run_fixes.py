@@ -17,15 +17,17 @@ from spn_model.runs.run_files import RunFiles
 
 def own_bundle(run: RunFiles) -> Bundle:
     """Return the bundle of a run; raise InputError if there is none, or one of an earlier network."""
-    export = f"run spn-model export --run {run.name}"
     if not (run.bundle / DOCUMENT).is_file():
-        raise InputError(f"there is no bundle; {export} first", path=run.bundle)
+        raise InputError(
+            f"there is no bundle; run spn-model export --run {run.name} first", path=run.bundle
+        )
     bundle = read_bundle(run.bundle)
     facts = bundle.document.get("run")
     made_of = facts.get("checkpoint") if isinstance(facts, dict) else None
     if made_of != content_fingerprint(run.require_checkpoint()):
         raise InputError(
-            f"the bundle is of an earlier network of this run; {export} --overwrite",
+            "the bundle is of an earlier network of this run; run spn-model export "
+            f"--run {run.name} --overwrite",
             path=run.bundle,
         )
     return bundle
