@@ -33,6 +33,12 @@ from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
     "[default: where the run has one with landmarks]",
 )
 @click.option(
+    "--video",
+    "video_folder",
+    type=click.Path(path_type=Path),
+    help="Folder with the videos of the evaluation flights.  [default: where they were registered from]",
+)
+@click.option(
     "--dropout-samples",
     type=click.IntRange(7, 1000),
     help="Also estimate the covariance by Monte-Carlo dropout with this many samples.  [default: off]",
@@ -61,6 +67,7 @@ def evaluate(
     names: tuple[str, ...],
     baselines: bool,
     fixes: bool | None,
+    video_folder: Path | None,
     dropout_samples: int | None,
     training_images: int,
     batch: int,
@@ -104,7 +111,10 @@ def evaluate(
             {run.name: RunFixes(reason="--no-fixes was given") for run in runs}
             if fixes is False
             else fixes_of_runs(
-                runs, lambda: read_evaluation_flights(area), progress, required=bool(fixes)
+                runs,
+                lambda: read_evaluation_flights(area, video_folder=video_folder),
+                progress,
+                required=bool(fixes),
             )
         )
         evaluated = evaluate_runs(
