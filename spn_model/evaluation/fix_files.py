@@ -19,8 +19,14 @@ from spn_model.evaluation.fixes import (
     MISLEADING_M,
     FixSummary,
     FlightFixes,
+    JudgedImage,
 )
 
+FIX_COLUMNS = (
+    *("flight", "method", "name", "time_s", "usable", "state", "source", "reason"),
+    *("error", "error_deg", "error_horizontal", "error_vertical"),
+    *("protection_horizontal", "protection_vertical", "nees", "misleading"),
+)
 LEAST_USABLE = 0.5  # share of usable fixes below which a flight is not to be flown on them
 
 
@@ -156,31 +162,28 @@ def write_fixes(path: Path, flights: Sequence[FlightFixes]) -> None:
 
     Raises StageError if the file cannot be written.
     """
-    columns: dict[str, list[str]] = {}
-    for one in flights:
-        for image in one.images:
-            error = image.error
-            cells = {
-                "flight": one.flight,
-                "method": one.method,
-                "name": image.name,
-                "time_s": _cell(image.time_s, 3),
-                "usable": str(int(image.is_usable)),
-                "state": image.state,
-                "source": image.source,
-                "reason": image.reason,
-                "error": "" if error is None else _cell(error.error_m, 4),
-                "error_deg": "" if error is None else _cell(error.error_deg, 4),
-                "error_horizontal": "" if error is None else _cell(error.horizontal_m, 4),
-                "error_vertical": "" if error is None else _cell(error.vertical_m, 4),
-                "protection_horizontal": _cell(image.protection_m[0], 4),
-                "protection_vertical": _cell(image.protection_m[1], 4),
-                "nees": "" if error is None else _cell(error.nees, 4),
-                "misleading": "" if error is None else str(int(error.is_misleading)),
-            }
-            for name, cell in cells.items():
-                columns.setdefault(name, []).append(cell)
-    write_csv(path, columns)
+    rows = [_cells(one, image) for one in flights for image in one.images]
+    write_csv(path, {name: [row[k] for row in rows] for k, name in enumerate(FIX_COLUMNS)})
+
+
+def _cells(one: FlightFixes, image: JudgedImage) -> tuple[str, ...]:
+    """Return the cells of an image, in the order of `FIX_COLUMNS`."""
+    error = image.error
+    errors: tuple[str, ...] = ("",) * 6
+    if error is not None:
+        errors = (
+            *(_cell(v) for v in (error.error_m, error.error_deg)),
+            *(_cell(v) for v in (error.horizontal_m, error.vertical_m)),
+            _cell(error.nees),
+            str(int(error.is_misleading)),
+        )
+    return (
+        *(one.flight, one.method, image.name, _cell(image.time_s)),
+        *(str(int(image.is_usable)), image.state, image.source, image.reason),
+        *errors[:4],
+        *(_cell(level) for level in image.protection_m),
+        *errors[4:],
+    )
 
 
 FIX_HEADER = (
@@ -239,5 +242,5 @@ def _text(value: float, spec: str, unit: str = "") -> str:
     return "" if math.isnan(value) else f"{value:{spec}}{unit}"
 
 
-def _cell(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+def _cell(value: float) -> str:
+    return f"{value:.4f}" if math.isfinite(value) else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +9,12 @@ from pathlib import Path
 from spn_data.coverage.sequence_table import Queries
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.dataset.hdf5_schema import Role
-from spn_data.errors import FormatError, InputError
+from spn_data.errors import InputError
 from spn_data.inputs.evaluation_flights import EvaluationFlight
-from spn_data.storage.files import write_csv
+from spn_data.storage.files import read_csv, write_csv
 from spn_data.work.timing import Progress
 from spn_model.evaluation.availability import ExpectedFix, PlannedViews
+from spn_model.evaluation.fix_files import FIX_COLUMNS
 from spn_model.evaluation.fixes import SEARCH, chosen_rows
 from spn_model.examples.training_set import TrainingSet
 from spn_model.runs.run_files import RunFiles
@@ -104,18 +104,21 @@ def write_expected(path: Path, expected: Sequence[ExpectedFix]) -> None:
 def measured_usable(run: RunFiles) -> dict[str, bool]:
     """Return which frames had a usable fix when they were searched for in the last evaluation of a run.
 
-    Raises InputError if fixes were not evaluated, FormatError if fixes.csv is damaged.
+    Raises InputError if fixes were not evaluated, or fixes.csv is damaged.
     """
     if not run.fixes.is_file():
         raise InputError(
             f"does not exist; run spn-model evaluate --run {run.name} first", path=run.fixes
         )
-    try:
-        with run.fixes.open(encoding="utf-8", newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["method"] == SEARCH]
-        return {row["name"]: {"0": False, "1": True}[row["usable"]] for row in rows}
-    except (OSError, csv.Error, KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{run.fixes}: cannot be read ({error!r})") from error
+    usable = {}
+    for line, row in read_csv(run.fixes, FIX_COLUMNS):
+        if row["usable"] not in ("0", "1"):
+            raise InputError(
+                f"usable is {row['usable'][:40]!r}, not 0 or 1", path=run.fixes, line=line
+            )
+        if row["method"] == SEARCH:
+            usable[row["name"]] = row["usable"] == "1"
+    return usable
 
 
 def _cell(value: float) -> str:
