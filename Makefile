@@ -32,8 +32,8 @@ demo: $(VENV)/installed
 	$(BIN)/python benchmarks/truth.py $(DEMO)/area $(DEMO)/flights
 	$(BIN)/python benchmarks/labels.py $(DEMO)/area $(DEMO)/flights
 	$(BIN)/spn-model train --area $(DEMO)/area --minutes 3 --validations 3
-	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
 	$(BIN)/spn-model export --run default --area $(DEMO)/area
+	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
 	$(BIN)/spn-onboard fly $(DEMO)/area/runs/default/bundle $(DEMO)/flights/evaluation/medium.mp4 \
 		--camera $(DEMO)/area/4-eval/medium/camera.json --to $(DEMO)/fixes.jsonl

@@ -26,16 +26,15 @@ import numpy as np
 import spn_data
 from spn_data.area.area import Area
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.pose import Poses, pose_errors
-from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
+from spn_data.geometry.pose import pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels
+from spn_model.evaluation.fixes import fix_error
 from spn_model.integrity.fix import Fix
 from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.flight_report import StepTimes
 from spn_model.onboard.pilot import Pilot, PilotOptions
-
-MISLEADING_M, MISLEADING_DEG = 0.5, 2.0
 
 
 def spoilt(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, np.ndarray, Camera]]:
@@ -64,17 +63,8 @@ def spoilt(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, np.ndarray,
 
 def errors(fix: Fix, labels: Labels, row: int) -> tuple[float, float, float, bool]:
     """Return position and rotation error, NEES / 6, and whether the fix is misleading."""
-    truth = labels.poses[row : row + 1]
-    pose = Poses(fix.center[None], fix.quat_wxyz[None])
-    away, turn = (float(v[0]) for v in pose_errors(pose, truth))
-    off = truth.centers[0] - fix.center
-    by = rotation_vectors(truth.rotations @ pose.rotations.transpose(0, 2, 1))[0]
-    both = np.concatenate([off, by])
-    outside = (
-        np.hypot(*off[:2]) > fix.horizontal_protection_m or abs(off[2]) > fix.vertical_protection_m
-    )
-    wrong = bool(away > MISLEADING_M or turn > MISLEADING_DEG or outside)
-    return away, turn, float(both @ np.linalg.solve(fix.covariance, both) / 6), wrong
+    found = fix_error(fix, labels.poses[row : row + 1])
+    return found.error_m, found.error_deg, found.nees, found.is_misleading
 
 
 def noisy_vertical(

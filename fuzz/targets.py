@@ -57,6 +57,8 @@ from spn_model.onboard.bundle import GRAPHS, read_bundle, sha256_of
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import frames as onboard_frames
 from spn_model.pretrained.tensors import read_tensors
+from spn_model.runs.run_availability import measured_usable
+from spn_model.runs.run_files import RunFiles
 from spn_model.training.recipe import read_recipe
 from spn_model.training.training_figure import read_log
 from spn_model.training.training_state import read_state
@@ -187,6 +189,9 @@ def _area(path: Path) -> None:
 def _run(path: Path) -> None:
     read_runs(Area(_root(path)))
     _ = read_run(path.parent).errors
+    run = RunFiles(path.parent)
+    if run.fixes.is_file():
+        measured_usable(run)
 
 
 def _bundle(path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from spn_cli import console, options
-from spn_data.area.names import ERRORS, FIGURES, METRICS
+from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
 
 
 @click.command()
@@ -25,6 +25,18 @@ from spn_data.area.names import ERRORS, FIGURES, METRICS
     default=True,
     show_default=True,
     help="Compare with baselines that need no network.",
+)
+@click.option(
+    "--fixes/--no-fixes",
+    default=None,
+    help="Localize the images of the evaluation flights with the exported bundle.  "
+    "[default: where the run has one with landmarks]",
+)
+@click.option(
+    "--video",
+    "video_folder",
+    type=click.Path(path_type=Path),
+    help="Folder with the videos of the evaluation flights.  [default: where they were registered from]",
 )
 @click.option(
     "--dropout-samples",
@@ -54,6 +66,8 @@ def evaluate(
     *,
     names: tuple[str, ...],
     baselines: bool,
+    fixes: bool | None,
+    video_folder: Path | None,
     dropout_samples: int | None,
     training_images: int,
     batch: int,
@@ -64,17 +78,21 @@ def evaluate(
     """Evaluate trained networks on test and validation frames.
 
     DATASET is a dataset.h5 of the world that the networks were trained in, by default that of the area.
-    Poses are not aligned to the labels. Tables are printed; metrics.json, errors.csv and figures are written
-    to the folder of each run.
+    Poses are not aligned to the labels. Fixes are those of the bundle of the run, on the full-size images of
+    the evaluation flights of the area. Tables are printed; metrics.json, errors.csv, fixes.csv and figures
+    are written to the folder of each run.
 
     \b
     Example:
         spn-model evaluate --area fields/north --run first
     """
     from spn_cli import page, show_networks
+    from spn_data.inputs.evaluation_flights import read_evaluation_flights
     from spn_model.evaluation.evaluate import EvaluateOptions
+    from spn_model.evaluation.fix_files import RunFixes
     from spn_model.runs.run_evaluation import evaluate_runs, write_evaluation
     from spn_model.runs.run_files import RunFiles
+    from spn_model.runs.run_fixes import fixes_of_runs
 
     area = options.open_area(area_folder)
     runs = [RunFiles(area.run_folder(name)) for name in dict.fromkeys(names)]
@@ -89,11 +107,27 @@ def evaluate(
         seed=seed,
     )
     with console.progress() as progress:
-        evaluated = evaluate_runs(runs, path, progress, wanted, device=device, threads=threads or 0)
+        measured = (
+            {run.name: RunFixes(reason="--no-fixes was given") for run in runs}
+            if fixes is False
+            else fixes_of_runs(
+                runs,
+                lambda: read_evaluation_flights(area, video_folder=video_folder),
+                progress,
+                required=bool(fixes),
+            )
+        )
+        evaluated = evaluate_runs(
+            runs, path, progress, wanted, fixes=measured, device=device, threads=threads or 0
+        )
     show_networks.comparison(evaluated.comparison)
+    show_networks.fixes(evaluated)
     written = write_evaluation(evaluated)
     for note in written.notes:
         console.note(note)
     for folder in written.folders:
-        console.out.print(f"{folder}: {METRICS}, {ERRORS}, {FIGURES}/.")
+        has_fixes = (folder / FIXES).is_file()
+        console.out.print(
+            f"{folder}: {METRICS}, {ERRORS}, {f'{FIXES}, ' if has_fixes else ''}{FIGURES}/."
+        )
     page.refresh_if_free(area)

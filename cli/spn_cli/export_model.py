@@ -97,8 +97,8 @@ def export(
         _show(exported.bundle)
         if not exported.is_evaluated:
             console.note(
-                f"the run was not evaluated, so its model card contains no errors: run spn-model evaluate "
-                f"--run {name}, then export again with --overwrite."
+                f"the run was not evaluated, so its model card contains neither errors nor fixes: run "
+                f"spn-model evaluate --run {name}, which completes it."
             )
     page.refresh_if_free(area)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from spn_cli.availability import availability
 from spn_cli.benchmark_model import benchmark
 from spn_cli.console import Group
 from spn_cli.evaluate import evaluate
@@ -24,5 +25,6 @@ main.add_command(train)
 main.add_command(evaluate)
 main.add_command(predict)
 main.add_command(export)
+main.add_command(availability)
 main.add_command(benchmark)
 main.add_command(weights)

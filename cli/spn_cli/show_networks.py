@@ -8,7 +8,9 @@ from spn_cli import console
 from spn_data.dataset.hdf5_schema import Role
 from spn_model.evaluation.baselines import GEM, MEAN, ORACLE, PAPER_TABLE_1, VLAD
 from spn_model.evaluation.evaluate import EvaluatedGroup, NetworkComparison
+from spn_model.evaluation.fix_files import FIX_HEADER, fix_rows
 from spn_model.evaluation.metrics import Evaluation, Summary
+from spn_model.runs.run_evaluation import EvaluatedRuns
 
 # Short names for tables with many columns; the table of errors has the full ones.
 _SHORT = {MEAN: "mean pose", VLAD: "VLAD", GEM: "GeM", ORACLE: "oracle"}
@@ -46,6 +48,19 @@ def comparison(found: NetworkComparison) -> None:
         console.note("lengths are in model units, not metres.")
     for note in found.notes:
         console.note(note)
+
+
+def fixes(evaluated: EvaluatedRuns) -> None:
+    """Print the fixes of each run, and what they mean for a flight."""
+    for name, found in evaluated.fixes.items():
+        verdicts = evaluated.verdicts(name)
+        rows = fix_rows(found.to_json(verdicts)["flights"])
+        if rows:
+            console.table(f"{name}: fixes of its bundle on evaluation flights", rows, FIX_HEADER)
+        for note in found.notes:
+            console.note(note)
+        for one in verdicts:
+            (console.out.print if one.may_fly else console.note)(one.text)
 
 
 def _errors(group: EvaluatedGroup, unit: str) -> None:

@@ -41,7 +41,7 @@ REPORT = "report.html"
 # Trained networks, a folder each; made by spn-model.
 RUNS = "runs"
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
-ERRORS, FIGURES, BUNDLE = "errors.csv", "figures", "bundle"
+ERRORS, FIXES, FIGURES, BUNDLE = "errors.csv", "fixes.csv", "figures", "bundle"
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
 RETRIEVAL = ".retrieval.json"  # in RUNS: cache of the retrieval baselines
 COMPARED = "compared"  # in RUNS: several runs evaluated together

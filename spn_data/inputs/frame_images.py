@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 
 import cv2
@@ -21,7 +23,7 @@ STORED = "frames"  # subfolder of the stage of an evaluation sequence, with its 
 def frame_images(
     area: Area, labels: Labels, *, video_folder: Path | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Iterate over the full-size images of frames, with one image in memory at a time.
+    """Iterate over the full-size images of frames, with two images in memory at a time.
 
     Parameters
     ----------
@@ -34,7 +36,7 @@ def frame_images(
     Yields
     ------
     row : int
-        Row of `labels`; each row once, sequence by sequence.
+        Row of `labels`; each row once, sequence by sequence, in their order, as far as that of the video.
     image : ndarray, shape (H, W, 3), uint8
         BGR image.
 
@@ -53,11 +55,13 @@ def frame_images(
     }
     for sequence in sequences:
         mine = np.flatnonzero(labels.sequences == sequence)
-        for row in mine[~labels.tracked[mine]].tolist():
-            yield row, _stored(area, str(labels.names[row]), sequence)
+        stored = (
+            (row, _stored(area, str(labels.names[row]), sequence))
+            for row in mine[~labels.tracked[mine]].tolist()
+        )
         tracked = mine[labels.tracked[mine]]
-        if len(tracked):
-            yield from _decoded(videos[sequence], labels, tracked)
+        decoded = _decoded(videos[sequence], labels, tracked) if len(tracked) else iter(())
+        yield from heapq.merge(stored, decoded, key=itemgetter(0))
 
 
 def image_path(area: Area, name: str, sequence: str) -> Path:

@@ -12,6 +12,7 @@ from spn_data.area.names import BUNDLE, CHECKPOINT, COMPARED, DATASET, FIGURES, 
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
+from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.network_state import NetworkState
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json
@@ -22,7 +23,8 @@ _MAX_FIGURE_BYTES = 3_000_000
 _MAX_FIGURES_BYTES = 12_000_000  # in all runs
 _MAX_RUNS, _MAX_FIGURES = 50, 60
 _MAX_TEXT = 200
-_KINDS = ("trajectories", "histograms", "distance", "calibration")
+_MAX_FIX_ROWS, _MAX_VERDICT = 100, 600
+_KINDS = ("protection", "trajectories", "histograms", "distance", "calibration")
 _SVG = re.compile(rb'<svg [^<>]*?viewBox="0 0 (\d{1,5}) \d{1,5}"')
 
 
@@ -123,6 +125,7 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
             notes=tuple(_text(note) for note in facts["notes"][:50]),
             figures=figures,
             left_out=left_out,
+            fixes=_fixes(table["fixes"]) if "fixes" in table else BundleFixes(),
         )
     except (*DAMAGE, OSError, FormatError) as error:
         raise FormatError(
@@ -172,6 +175,31 @@ def _errors(value: Mapping[str, Any]) -> MethodErrors:
     )
 
 
+def _fixes(value: Mapping[str, Any]) -> BundleFixes:
+    rows = [
+        FixFigures(
+            flight=_text(flight),
+            method=_text(method),
+            images=int(_required(of["images"])),
+            usable=int(_required(of["usable"])),
+            compared=int(_required(of["compared"])),
+            error_m=_number(of["error_m"]),
+            error_deg=_number(of["error_deg"]),
+            misleading=int(_required(of["misleading"])),
+            misleading_at_most=_required(of["misleading_at_most"]),
+            nees=_number(of["nees"]),
+            protected=_number(of["protected"]),
+            longest_outage_s=_number(of["longest_outage_s"]),
+        )
+        for flight, methods in value["flights"].items()
+        for method, of in methods.items()
+    ]
+    verdicts = [
+        (one["may_fly"] is True, _text(one["text"], _MAX_VERDICT)) for one in value["verdict"]
+    ]
+    return BundleFixes(rows=tuple(rows[:_MAX_FIX_ROWS]), verdicts=tuple(verdicts[:_MAX_FIX_ROWS]))
+
+
 def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:
     """Return the figures of a folder, and how many are left out: too large, or not of this program."""
     if not folder.is_dir() or folder.is_symlink():
@@ -202,10 +230,10 @@ def _reading_order(path: Path) -> tuple[bool, str, int, str]:
     return path.stem != "training", group, _KINDS.index(what) if what in _KINDS else 9, path.stem
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, most: int = _MAX_TEXT) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} instead of text")
-    return value[:_MAX_TEXT]
+    return value[:most]
 
 
 def _number(value: Any) -> float | None:

@@ -23,7 +23,7 @@ from spn_data.coverage.sequence_table import (
     write_coverage,
 )
 from spn_data.coverage.view_share import SeenMap
-from spn_data.coverage.waypoints import WaypointFrame, Waypoints, read_waypoints, waypoint_columns
+from spn_data.coverage.waypoints import WaypointFrame, read_waypoints, waypoint_columns
 from spn_data.errors import FormatError, InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.geodesy import HeightReference
@@ -142,12 +142,7 @@ def cover_area(
             )
     else:
         folder = area.folder(PLANNED_COVERAGE)
-        if frame is None:
-            raise StageError(
-                f"{area.root}: --waypoints needs a georegistered map; run spn-data georegister first"
-            )
-        plan = read_waypoints(waypoints, frame)
-        queries = {WAYPOINTS: _waypoint_queries(plan, labelled, options, waypoints)}
+        queries = {WAYPOINTS: read_plan(area, labelled, options, waypoints)}
     result = _assess(labelled, queries, frame, options, folder, progress)
     _write(area, result, options, str(waypoints.name) if waypoints else "")
     return result
@@ -296,10 +291,20 @@ def _queries_of(labels: Labels, labelled: LabelledArea) -> Queries:
     )
 
 
-def _waypoint_queries(
-    plan: Waypoints, labelled: LabelledArea, options: CoverageStageOptions, path: Path
+def read_plan(
+    area: Area, labelled: LabelledArea, options: CoverageStageOptions, path: Path
 ) -> Queries:
-    """Return the poses of a plan; raise InputError, with the line, for an unknown camera."""
+    """Read planned waypoints with their cameras.
+
+    Raises StageError if the map is not georegistered, InputError, with the line, for invalid waypoints or an
+    unknown camera.
+    """
+    frame = _waypoint_frame(area, labelled)
+    if frame is None:
+        raise StageError(
+            f"{area.root}: --waypoints needs a georegistered map; run spn-data georegister first"
+        )
+    plan = read_waypoints(path, frame)
     default = _main_camera(labelled)
     if options.camera is not None:
         default = options.camera

@@ -15,6 +15,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
+from spn_data.report.fix_facts import BundleFixes
 from spn_data.report.network_state import NetworkState
 from spn_data.split import audit
 from spn_data.split.groups import Split
@@ -305,6 +306,8 @@ class RunFacts:
         Figures to show.
     left_out : int
         Number of figures not shown.
+    fixes : BundleFixes
+        Without rows and verdicts in an evaluation of several runs.
     """
 
     name: str
@@ -319,6 +322,7 @@ class RunFacts:
     notes: tuple[str, ...]
     figures: tuple[Figure, ...]
     left_out: int = 0
+    fixes: BundleFixes = field(default_factory=BundleFixes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,11 +7,15 @@ from collections.abc import Iterable
 from html import escape
 
 from spn_data.report.data import MethodErrors, NetworkFacts, ReportData, RunFacts
+from spn_data.report.fix_facts import FixFigures
 
 # A training with fewer images is called short: two cores process several times as many in 30 minutes.
 SHORT_IMAGES = 30_000
 _ROLES = {"test": "test frames", "validation": "validation frames", "train": "training images"}
 _ORDER = tuple(_ROLES)
+_FIX_HEADER = (
+    *("flight", "from", "usable", "median", "misleading", "NEES / 6", "within level", "outage"),
+)
 _NOTHING = "&ndash;"
 
 
@@ -34,6 +38,7 @@ def networks(data: ReportData) -> str:
             )
         parts.append(_trained(runs))
         parts += _tables(runs)
+        parts += [_fixes(run) for run in runs if not run.is_outdated]
     for run in data.runs:
         if run.is_outdated:
             parts.append(
@@ -134,6 +139,45 @@ def _group(name: str, role: str, runs: list[RunFacts]) -> str:
         f'<p class="note">{note}Estimates are not aligned to the labels. {_axis(first)}'
         "Covariance: median NEES relative to its expected median; 1 is ideal.</p>"
     )
+
+
+def _fixes(run: RunFacts) -> str:
+    """Return the fixes of the bundle of a run, and what they mean for a flight."""
+    if not run.fixes.verdicts:
+        return ""
+    rows = [
+        (
+            escape(one.flight),
+            escape(one.method),
+            f"{one.usable:,} of {one.images:,}",
+            _fix_error(one),
+            f"{one.misleading:,} (&le; {100 * one.misleading_at_most:.1f} %)"
+            if one.compared
+            else _NOTHING,
+            _NOTHING if one.nees is None else f"{one.nees:.2f}",
+            _NOTHING if one.protected is None else f"{one.protected:.1%}",
+            _NOTHING if one.longest_outage_s is None else f"{one.longest_outage_s:.1f} s",
+        )
+        for one in run.fixes.rows
+    ]
+    said = "".join(
+        f'<p class="note{"" if may_fly else " warn"}">{escape(text)}</p>'
+        for may_fly, text in run.fixes.verdicts
+    )
+    return (
+        f"<h3>{escape(run.name)}: fixes of its bundle</h3>{said}"
+        + (_table(_FIX_HEADER, rows, "fixes") if rows else "")
+        + '<p class="note">Coarse: the network alone. Search: fixes of single images. Track: of the images '
+        "one after the other. Misleading: published as usable and off by more than 0.5 m, 2&deg; or its "
+        "protection level; in brackets the upper bound of its share, with 95 % confidence.</p>"
+    )
+
+
+def _fix_error(one: FixFigures) -> str:
+    if one.error_m is None or one.error_deg is None:
+        return _NOTHING
+    position = f"{one.error_m:.2f} m" if one.error_m >= 1 else f"{100 * one.error_m:.1f} cm"
+    return f"{position}, {one.error_deg:.2f}&deg;"
 
 
 def _axis(errors: MethodErrors) -> str:

@@ -1,4 +1,4 @@
-"""The next step for the state of an area: what stands in the way, then train, evaluate, export and fly."""
+"""The next step for the state of an area: what stands in the way, then train, export, evaluate and fly."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def next_step(verdict: AreaVerdict, trained: Sequence[NetworkState]) -> VerdictR
         return VerdictReason(Level.GOOD, "", "Train a network", "spn-model train")
     run = trained[0]
     name = shlex.quote(run.name)
-    if not run.is_evaluated:
-        do = f"Evaluate the network {run.name} on frames that it was not trained on"
-        return VerdictReason(Level.GOOD, "", do, f"spn-model evaluate --run {name}")
     if not run.is_exported:
         do = f"Export the network {run.name} with its landmarks"
         again = " --overwrite" if run.has_bundle else ""
         return VerdictReason(Level.GOOD, "", do, f"spn-model export --run {name}{again}")
+    if not run.is_evaluated:
+        do = f"Evaluate the network {run.name} and its bundle on flights that it was not trained on"
+        return VerdictReason(Level.GOOD, "", do, f"spn-model evaluate --run {name}")
     bundle = f"{_IN_AREA}{run.bundle}"
     do = f"Fly a recorded flight with the bundle of {run.name}"
     command = f"spn-onboard fly {shlex.quote(bundle)} VIDEO --camera CAMERA.json --to fixes.jsonl"

@@ -56,6 +56,7 @@ def write_comparison(
     errors: Path,
     drawings: Path,
     more_drawings: Mapping[str, str] | None = None,
+    fixes: Mapping[str, Any] | None = None,
 ) -> None:
     """Write metrics.json, errors.csv and a folder of SVG figures.
 
@@ -72,6 +73,8 @@ def write_comparison(
         Files metrics.json and errors.csv, and folder of figures.
     more_drawings : mapping, optional
         Further SVG figures by name, without suffix.
+    fixes : mapping, optional
+        Fixes of the run, as plain values.
 
     Raises
     ------
@@ -81,7 +84,8 @@ def write_comparison(
     metrics.unlink(missing_ok=True)
     shutil.rmtree(drawings, ignore_errors=True)
     drawings.mkdir(parents=True)
-    for name, group in zip(_file_names(comparison.groups), comparison.groups, strict=True):
+    names = file_names([group.frames.group for group in comparison.groups])
+    for name, group in zip(names, comparison.groups, strict=True):
         for what, drawing in draw_figures(group, comparison).items():
             write_atomically(drawings / f"{name}-{what}.svg", drawing)
     for what, drawing in (more_drawings or {}).items():
@@ -101,6 +105,7 @@ def write_comparison(
             "notes": list(comparison.notes),
             **facts,
         },
+        fixes=fixes,
     )
 
 
@@ -151,11 +156,11 @@ def _select_methods(found: Sequence[Any], methods: Sequence[str]) -> list[Any]:
     return [by_method[method] for method in methods]
 
 
-def _file_names(groups: Sequence[EvaluatedGroup]) -> list[str]:
+def file_names(groups: Sequence[str]) -> list[str]:
     """Return unique file names of groups that every file system accepts."""
     names: list[str] = []
     for group in groups:
-        base = name = safe_name(group.frames.group, "group").lower()
+        base = name = safe_name(group, "group").lower()
         number = 2
         while name in names:
             name, number = f"{base}-{number}", number + 1

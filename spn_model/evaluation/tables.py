@@ -29,12 +29,13 @@ def write_metrics(
     units: str,
     retrieval: Mapping[str, str],
     facts: Mapping[str, Any],
+    fixes: Mapping[str, Any] | None = None,
 ) -> None:
     """Write metrics.json atomically.
 
     units : "m" or "model", of all lengths. retrieval : name of the better retrieval method, by group. facts :
-    additional plain values of the run (times, memory, seeds). Raises ValueError for two evaluations of the
-    same method and group.
+    additional plain values of the run (times, memory, seeds). fixes : those of the run, None for several
+    runs. Raises ValueError for two evaluations of the same method and group.
     """
     groups: dict[str, dict[str, Any]] = {}
     for one in evaluations:
@@ -54,6 +55,7 @@ def write_metrics(
         "retrieval": dict(retrieval),
         "paper": {"source": PAPER_SOURCE, "table_1": [asdict(row) for row in PAPER_TABLE_1]},
         "facts": dict(facts),
+        **({} if fixes is None else {"fixes": dict(fixes)}),
     }
     write_json(path, finite(document))
 

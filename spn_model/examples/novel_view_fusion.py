@@ -40,6 +40,7 @@ def fused_view(
     shrink: int,
     fill: tuple[int, int, int],
     options: SurfaceOptions,
+    size: tuple[int, int] | None = None,
 ) -> tuple[np.ndarray, Surface]:
     """Render image and surface that a camera at a new pose would see, from several training images.
 
@@ -60,13 +61,15 @@ def fused_view(
     pose : Poses
         One pose, of the new camera.
     matrix : ndarray, shape (3, 3)
-        Intrinsic matrix K for images of the data set's size.
+        Intrinsic matrix K for images of the given size.
     shrink : int
-        Factor by which the rendered view is smaller than the data set's images.
+        Factor by which the rendered view is smaller than that.
     fill : tuple of int
         RGB colour of unknown pixels.
     options : SurfaceOptions
         Limits of the triangles.
+    size : tuple of int, optional
+        Width and height of the camera's images; by default those of the data set's.
 
     Returns
     -------
@@ -74,12 +77,11 @@ def fused_view(
     surface : Surface
         With one cell for each pixel of the image.
     """
-    chosen = sources.best(pose, matrix, data.size, _SOURCES)
-    points = _points(data, sources, chosen, pose, matrix)
+    size = size or data.size
+    chosen = sources.best(pose, matrix, size, _SOURCES)
+    points = _points(data, sources, chosen, pose, matrix, size)
     small = np.diag([1 / shrink, 1 / shrink, 1.0]) @ matrix
-    between = surface(
-        points, pose, matrix, data.size, replace(options, step_px=shrink)
-    ).inverse_depth
+    between = surface(points, pose, matrix, size, replace(options, step_px=shrink)).inverse_depth
     seen = Surface(np.full_like(between, np.nan), 1, pose, small)
     rows, columns = between.shape
     image = np.empty((rows, columns, 3), np.uint8)
@@ -87,7 +89,7 @@ def fused_view(
     ground = sources.ground
     hypotheses = [(between, True)]
     if ground is not None:
-        hypotheses.append((_ground_depth(ground, points, pose, small, data.size, shrink), False))
+        hypotheses.append((_ground_depth(ground, points, pose, small, size, shrink), False))
     for inverse, confirmed in hypotheses:
         # Normals of this hypothesis alone, so that none are mixed where two surfaces meet.
         normals = _normals(inverse, small)
@@ -189,7 +191,12 @@ def _agreed(values: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _points(
-    data: TrainingSet, sources: SourceImages, chosen: list[int], pose: Poses, matrix: np.ndarray
+    data: TrainingSet,
+    sources: SourceImages,
+    chosen: list[int],
+    pose: Poses,
+    matrix: np.ndarray,
+    size: tuple[int, int],
 ) -> FramePoints:
     """Return the map points of the chosen sources that a camera would see, in and around its image."""
     points = [data.points(int(sources.rows[k])) for k in chosen]
@@ -197,8 +204,8 @@ def _points(
     if points:
         ids, first = np.unique(np.concatenate([p.ids for p in points]), return_index=True)
         xyz = np.concatenate([p.xyz for p in points])[first]
-    index, at, depth = projected(xyz, pose, matrix, data.size, _MARGIN_PX)
-    shown = ~_hidden(at, depth, data.size)
+    index, at, depth = projected(xyz, pose, matrix, size, _MARGIN_PX)
+    shown = ~_hidden(at, depth, size)
     return FramePoints(ids[index[shown]], at[shown], xyz[index[shown]])
 
 

@@ -169,7 +169,7 @@ def export(
                 "options": asdict(options),
             }
             write_json(partial / DOCUMENT, document)
-            write_atomically(partial / CARD, model_card(checkpoint, made, facts, metrics))
+            write_atomically(partial / CARD, model_card(checkpoint, made, facts, metrics, document))
             read_bundle(partial)
             replace_folder(partial, folder)
         except OSError as error:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from spn_data.errors import InputError
 from spn_data.geometry.pose import position_text
+from spn_model.evaluation.fix_files import FIX_HEADER, fix_rows
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.bundle import FLOAT32, GRAPHS, INT8
 from spn_model.pretrained.weights import by_name
@@ -22,13 +23,15 @@ def model_card(
     made: ExportedBundle,
     facts: Mapping[str, Any],
     metrics: Mapping[str, Any] | None,
+    document: Mapping[str, Any],
 ) -> str:
     """Return the model card as Markdown.
 
     metrics : evaluation of the run, as in metrics.json; if None, the card says that there is none.
+    document : bundle.json, which tells whether fixes were measured with these very files.
     """
     view, model = checkpoint.view, checkpoint.model
-    unit = "m" if view.units == "m" else "units of the model"
+    unit = _unit(view.units)
     parameters = sum(p.numel() for p in model.network.parameters())
     place = view.origin
     parts = [
@@ -67,6 +70,8 @@ def model_card(
         ),
         "## Errors",
         *_error_section(metrics, str(facts.get("run", "")), unit, facts.get("trained_on", ())),
+        "## Fixes",
+        *fix_section(_fixes_of(metrics, document)),
         "## Accuracy of the bundle",
         f"On {made.parity.images} images, the outputs of the float32 graph differ from PyTorch's by at most "
         f"{made.parity.output:.1e} of the output's largest value. Half of the poses differ by at most "
@@ -85,6 +90,64 @@ def model_card(
         _licence(checkpoint, facts),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def card_with_metrics(
+    card: str, metrics: Mapping[str, Any], *, run: str, trained_on: Collection[str]
+) -> str:
+    """Return a model card with the errors and fixes of a later evaluation of its bundle.
+
+    metrics : as in metrics.json. trained_on : groups that the network was trained on.
+    """
+    unit = _unit(metrics["units"])
+    card = _with_section(card, "Errors", _error_section(metrics, run, unit, trained_on))
+    return _with_section(card, "Fixes", fix_section(metrics["fixes"]))
+
+
+def _with_section(card: str, title: str, parts: Sequence[str]) -> str:
+    """Replace a section before the last one; a card without it, of an earlier version, stays as it is."""
+    head, heading, rest = card.partition(f"## {title}\n\n")
+    _, next_heading, tail = rest.partition("\n\n## ")
+    return head + heading + "\n\n".join(parts) + next_heading + tail if tail else card
+
+
+def _unit(units: str) -> str:
+    return "m" if units == "m" else "units of the model"
+
+
+def fix_section(fixes: Mapping[str, Any] | None) -> list[str]:
+    """Return the paragraphs on the fixes of a bundle.
+
+    fixes : as in metrics.json; None if they were not measured with this bundle.
+    """
+    if fixes is None or not fixes["flights"]:
+        return [
+            "Not measured with this bundle, so it is not to be flown yet: run `spn-model evaluate`, now that "
+            "it is exported."
+        ]
+    return [
+        "Measured by `spn-model evaluate` with this bundle, on the images of the evaluation flights of its "
+        "area, through the program that flies. Coarse is the network alone, search single images, track the "
+        "images one after the other. Misleading is a usable fix that is off by more than 0.5 m, 2 degrees or "
+        "its protection level; in brackets the upper bound of its share, with 95 % confidence.",
+        _table(FIX_HEADER, fix_rows(fixes["flights"])),
+        _list(*(one["text"] for one in fixes["verdict"])),
+    ]
+
+
+def _fixes_of(
+    metrics: Mapping[str, Any] | None, document: Mapping[str, Any]
+) -> Mapping[str, Any] | None:
+    """Return the fixes that were measured with the files of a bundle; None if there are none."""
+    fixes = (metrics or {}).get("fixes")
+    if not fixes or "landmarks" not in document:
+        return None
+    made = {
+        "network": document["graphs"][FLOAT32]["sha256"],
+        "landmarks": document["landmarks"]["sha256"],
+    }
+    same = all(fixes["bundle"].get(name) == digest for name, digest in made.items())
+    return fixes if same else None
 
 
 def int8_error_increase(errors: Sequence[GroupErrors], group: str) -> tuple[float, float] | None:
@@ -122,9 +185,7 @@ def _error_section(
     metrics: Mapping[str, Any] | None, run: str, unit: str, trained_on: Collection[str]
 ) -> list[str]:
     if metrics is None:
-        return [
-            "The run was not evaluated: run `spn-model evaluate`, then export it again with `--overwrite`."
-        ]
+        return ["The run was not evaluated: run `spn-model evaluate`, which completes this card."]
     rows = [
         (
             f"{group} (trained on)" if group in trained_on else group,

@@ -243,14 +243,18 @@ def fit_focal_length(seen: Sightings, pose: SolvedPose) -> tuple[float, float]:
     change : float
         Relative change of the focal length.
     sigma : float
-        Its standard deviation for the stated noise, or larger where residuals are.
+        Its standard deviation for the stated noise, or larger where residuals are. 1, as assumed before, if
+        the sightings do not determine it.
     """
     center, rotation, factor = pose.center, pose.rotation, 1.0
     sigma = _sigma_px(seen, center, rotation)
     for scale in 2.0 * np.array(_FOCAL_SCALES):
         step = _step(seen, sigma, center, rotation, scale, factor)
         step.normal[6, 6] += 1.0  # without it, points at one distance determine no focal length
-        change = -np.linalg.solve(step.normal, step.gradient)
+        try:
+            change = -np.linalg.solve(step.normal, step.gradient)
+        except np.linalg.LinAlgError:  # few landmarks, and the fit left them behind the camera
+            return 0.0, 1.0
         center = center + change[:3]
         rotation = rotations_from_vectors(change[None, 3:6])[0] @ rotation
         factor *= float(np.exp(np.clip(change[6], -0.1, 0.1)))

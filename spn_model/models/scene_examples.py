@@ -39,8 +39,8 @@ from spn_model.networks.scene_coordinates import (
     grid_size,
 )
 
-_FAR = 4.0  # in spreads from the scene's centre; points beyond are unreliable and no targets
-_LEVEL = 0.011  # largest height difference of a level triangle, in spreads
+FAR = 4.0  # in spreads from the scene's centre; points beyond are unreliable and no targets
+LEVEL = 0.011  # largest height difference of a level triangle, in spreads
 _VIEW_BYTES = 800_000_000  # memory for rendered views, which are kept: one takes 20 to 80 ms
 _MOST_VIEWS = 1_000_000  # view numbers below it are for training, those above are held out
 _IMAGES_A_VIEW = 120  # images drawn for each rendered view, which costs as much as ten of them
@@ -134,7 +134,7 @@ class SceneExamples:
     ):
         self._data, self._options, self._shrink = data, options, shrink
         self._center, self._spread = center, spread
-        level = _LEVEL * spread if data.up_is_known else 0.0
+        level = LEVEL * spread if data.up_is_known else 0.0
         self._surface_options = SurfaceOptions(level_m=level)
         self._view_options = NovelViewOptions(
             rise_m=options.views_rise * spread,
@@ -156,7 +156,7 @@ class SceneExamples:
         self._sources: SourceImages | None = None
         self._looks_down = False
         if options.views_share and options.views_fused:
-            self._sources = SourceImages(data, center, spread, _FAR * spread)
+            self._sources = SourceImages(data, center, spread, FAR * spread)
             is_below = self._sources.samples[:, 2] < np.median(data.poses.centers[:, 2])
             self._looks_down = data.up_is_known and bool(is_below.any())
 
@@ -232,7 +232,7 @@ class SceneExamples:
             )
         with np.errstate(invalid="ignore"):
             off = np.linalg.norm(targets - self._center[:, None, None], axis=0)
-            known &= off < _FAR * self._spread
+            known &= off < FAR * self._spread
         return image, np.where(known, targets, np.float32(0)), known
 
     def _source(

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from spn_data.area.names import COMPARED, GEO, MODEL, RETRIEVAL
-from spn_data.errors import InputError
+from spn_data.errors import FormatError, InputError
+from spn_data.storage.files import write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
+from spn_data.storage.json_files import load_json
 from spn_data.work.timing import Progress
 from spn_model.evaluation.comparison_files import network_facts, select_network, write_comparison
 from spn_model.evaluation.evaluate import EvaluateOptions, NetworkComparison, compare
+from spn_model.evaluation.fix_figures import stanford_diagrams
+from spn_model.evaluation.fix_files import RunFixes, Verdict, verdicts_of, write_fixes
+from spn_model.export.model_card import card_with_metrics
 from spn_model.models.checkpoint import load
+from spn_model.onboard.bundle import CARD
 from spn_model.runs.run_files import RunFiles
+from spn_model.runs.run_fixes import own_bundle
 from spn_model.training import machine
 from spn_model.training.training_figure import read_log, training_figure
 
@@ -31,11 +38,19 @@ class EvaluatedRuns:
         Errors of their networks and of the baselines.
     facts : mapping of str to mapping
         Facts of each network by name of its run, for `facts` of metrics.json.
+    fixes : mapping of str to RunFixes
+        Fixes of the bundle of each run, by its name.
     """
 
     runs: tuple[RunFiles, ...]
     comparison: NetworkComparison
     facts: Mapping[str, Mapping[str, Any]]
+    fixes: Mapping[str, RunFixes]
+
+    def verdicts(self, run: str) -> tuple[Verdict, ...]:
+        """Return what was measured of a run means for a flight."""
+        unit = "m" if self.comparison.units == "m" else "model units"
+        return verdicts_of(run, self.fixes[run], self.comparison.groups, unit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +75,7 @@ def evaluate_runs(
     progress: Progress,
     options: EvaluateOptions,
     *,
+    fixes: Mapping[str, RunFixes],
     device: str = "auto",
     threads: int = 0,
 ) -> EvaluatedRuns:
@@ -75,6 +91,8 @@ def evaluate_runs(
         Receives the network's name, frames done, and frames in total.
     options : EvaluateOptions
         What is evaluated.
+    fixes : mapping of str to RunFixes
+        Fixes of the bundle of each run, by its name.
     device : str
         Device of the networks, see `machine.choose`.
     threads : int
@@ -109,7 +127,7 @@ def evaluate_runs(
         name: {**network_facts(network), "checkpoint": content_fingerprint(checkpoints[name])}
         for name, network in networks.items()
     }
-    return EvaluatedRuns(runs=tuple(runs), comparison=comparison, facts=facts)
+    return EvaluatedRuns(runs=tuple(runs), comparison=comparison, facts=facts, fixes=fixes)
 
 
 def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
@@ -145,8 +163,19 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
             "course": None if log is None else log.facts(),
         }
     for run in evaluated.runs:
-        own = {run.name: facts[run.name]}
-        _write(run, select_network(comparison, run.name), own, figures[run.name])
+        own, fixes = {run.name: facts[run.name]}, evaluated.fixes[run.name]
+        run.metrics.unlink(missing_ok=True)  # never beside the fixes of another evaluation
+        run.fixes.unlink(missing_ok=True)
+        if fixes.flights:
+            write_fixes(run.fixes, fixes.flights)
+        drawings = {**figures[run.name], **stanford_diagrams(fixes.flights)}
+        document = fixes.to_json(evaluated.verdicts(run.name))
+        _write(run, select_network(comparison, run.name), own, drawings, document)
+        if run.bundle.exists():
+            try:
+                _complete_card(run, facts[run.name]["training"].get("trained_on", ()))
+            except (InputError, FormatError, OSError) as error:
+                notes.append(f"the model card of the bundle was not completed: {error}")
     folders = [run.folder for run in evaluated.runs]
     if len(evaluated.runs) > 1:
         folders.append(folders[0].parent / COMPARED)
@@ -154,11 +183,24 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
     return WrittenEvaluation(folders=tuple(folders), notes=tuple(notes))
 
 
+def _complete_card(run: RunFiles, trained_on: Collection[str]) -> None:
+    """Write the errors and fixes of metrics.json into the model card of the bundle."""
+    card = own_bundle(run).folder / CARD
+    text = card_with_metrics(
+        card.read_text(encoding="utf-8"),
+        load_json(run.metrics),
+        run=run.name,
+        trained_on=trained_on,
+    )
+    write_atomically(card, text)
+
+
 def _write(
     files: RunFiles,
     comparison: NetworkComparison,
     runs: Mapping[str, Any],
     figures: Mapping[str, str],
+    fixes: Mapping[str, Any] | None = None,
 ) -> None:
     files.folder.mkdir(parents=True, exist_ok=True)
     write_comparison(
@@ -168,4 +210,5 @@ def _write(
         errors=files.errors,
         drawings=files.figures,
         more_drawings=figures,
+        fixes=fixes,
     )

@@ -15,6 +15,7 @@ from spn_data.work.timing import Progress
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export, is_up_to_date
 from spn_model.export.exported import ExportedBundle
+from spn_model.export.model_card import fix_section
 from spn_model.models.checkpoint import load
 from spn_model.runs.run_files import RunFiles
 
@@ -88,7 +89,7 @@ def export_run(
     checkpoint, folder = run.require_checkpoint(), target or run.bundle
     fingerprint = content_fingerprint(checkpoint)
     metrics, notes = _read_metrics(run, fingerprint)
-    facts = {"run": run.name, "checkpoint": fingerprint, "evaluated": metrics is not None}
+    facts = {"run": run.name, "checkpoint": fingerprint}
     bundle = None
     if overwrite or not is_up_to_date(folder, facts, options):
         network = load(checkpoint)
@@ -116,6 +117,7 @@ def _read_metrics(run: RunFiles, fingerprint: str) -> tuple[dict[str, Any] | Non
     try:
         metrics = load_json(run.metrics)
         is_same = metrics["facts"]["runs"][run.name]["checkpoint"] == fingerprint
+        fix_section(metrics.get("fixes"))  # raises if they are damaged
         has_run = any(run.name in methods for methods in metrics["groups"].values())
         return (metrics if is_same and has_run else None), []
     except (*DAMAGE, FormatError) as error:

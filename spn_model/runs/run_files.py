@@ -62,6 +62,11 @@ class RunFiles:
         return self.folder / names.ERRORS
 
     @property
+    def fixes(self) -> Path:
+        """Fix of each image in the last evaluation, a CSV file."""
+        return self.folder / names.FIXES
+
+    @property
     def figures(self) -> Path:
         """Folder of the figures of the last evaluation."""
         return self.folder / names.FIGURES

@@ -34,8 +34,8 @@ def trained(
     ("runs", "command"),
     [
         ([], "spn-model train --area a"),
-        ([trained()], "spn-model evaluate --run 'first try' --area a"),
-        ([trained(evaluated=True)], "spn-model export --run 'first try' --area a"),
+        ([trained()], "spn-model export --run 'first try' --area a"),
+        ([trained(exported=True)], "spn-model evaluate --run 'first try' --area a"),
         (
             [trained(evaluated=True, bundle=True)],
             "spn-model export --run 'first try' --overwrite --area a",
@@ -49,7 +49,7 @@ def trained(
 def test_the_step_after_each_command_is_the_next_one(
     runs: list[NetworkState], command: str
 ) -> None:
-    """After the split follow training, evaluation, export and flight, also where there are reservations."""
+    """After the split follow training, export, evaluation and flight, also where there are reservations."""
     step = next_step(judged(RESERVATION), runs)
     assert command_for(step.command, Path("a")) == command
 

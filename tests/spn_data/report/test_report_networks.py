@@ -86,6 +86,38 @@ def test_networks_stand_beside_what_needs_none(root):
     assert table.count(told) == 1
 
 
+FIXES = {
+    "flights": {
+        "low": {
+            method: {
+                **{"images": 1200, "usable": 1199, "compared": 1000, "misleading": 0},
+                **{"error_m": off, "error_deg": 0.04, "largest_m": 0.1, "nees": 0.9},
+                **{"misleading_at_most": 0.003, "protected": None, "longest_outage_s": 0.4},
+            }
+            for method, off in (("coarse", 12.3), ("track", 0.0123))
+        }
+    },
+    "verdict": [
+        {"may_fly": True, "text": "Fixes can be used."},
+        {"may_fly": False, "text": "Not < 2"},
+    ],
+}
+
+
+def test_fixes_stand_beside_coarse_poses(root):
+    """Coarse poses of metres and fixes of centimetres have rows of their own, and what they mean is said."""
+    assert (
+        page(root).count("is not to be flown: its fixes were not measured") == 2
+    )  # there is no bundle
+    rewrite(root / "runs" / "first" / "metrics.json", lambda t: t.update(fixes=FIXES))
+    shown = page(root)
+    part = shown[shown.index("<h3>first: fixes of its bundle") :].split("</table>")[0]
+    assert "<td>coarse</td><td>1,199 of 1,200</td><td>12.30 m, 0.04&deg;</td>" in part
+    assert "<td>track</td><td>1,199 of 1,200</td><td>1.2 cm, 0.04&deg;</td>" in part
+    assert "<td>0 (&le; 0.3 %)</td><td>0.90</td><td>&ndash;</td><td>0.4 s</td>" in part
+    assert '<p class="note">Fixes can be used.</p><p class="note warn">Not &lt; 2</p>' in part
+
+
 def test_a_short_training_is_called_short(root):
     """A training on only forty images is marked as short."""
     shown = page(root)
@@ -139,6 +171,13 @@ DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {
     "a number for text": lambda t: t["facts"].update(dataset=7),
     "a name that leads out": lambda t: t["facts"]["runs"].update(
         {"../../x": t["facts"]["runs"]["first"]}
+    ),
+    "fixes without flights": lambda t: t.update(fixes={"verdict": []}),
+    "a count of fixes that is text": lambda t: t.update(
+        fixes={
+            **FIXES,
+            "flights": {"low": {"track": {**FIXES["flights"]["low"]["track"], "usable": "1"}}},
+        }
     ),
     "nested lists": _nested,
 }

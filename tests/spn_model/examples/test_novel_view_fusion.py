@@ -43,14 +43,16 @@ def above(pitch_deg: float = -60.0) -> Poses:
     return Poses.from_rotations([[10.0, 4.0, 8.0]], angles)
 
 
-def view(data, sources, pose, *, shrink=2, surface_of=None):
+def view(data, sources, pose, *, shrink=2, surface_of=None, size=None):
     def own(row: int) -> Surface:
         return surface(
             *(data.points(row), data.poses[row : row + 1], data.intrinsics[row]),
             *(data.size, LEVEL),
         )
 
-    return fused_view(data, sources, surface_of or own, pose, CAMERA.matrix, shrink, FILL, LEVEL)
+    return fused_view(
+        data, sources, surface_of or own, pose, CAMERA.matrix, shrink, FILL, LEVEL, size
+    )
 
 
 def unknown_surfaces(data: TrainingSet):
@@ -86,6 +88,16 @@ def test_a_fused_view_is_what_a_camera_there_would_see(data, sources, shrink):
     assert np.percentile(off, 90) < 0.1
     assert np.median(np.abs(image - expected).max(axis=2)[known]) < 5
     assert (image[~known] == FILL).all()
+
+
+def test_a_view_may_have_another_size_than_the_training_images(data, sources):
+    """The upper left part of a view, rendered as a view of its own, shows the same."""
+    whole, _ = view(data, sources, above())
+    part, seen = view(data, sources, above(), size=(200, 120))
+    assert part.shape == (60, 100, 3)
+    known = np.isfinite(seen.inverse_depth)
+    assert known.mean() > 0.7
+    assert np.median(np.abs(part.astype(int) - whole[:60, :100]).max(axis=2)[known]) < 5
 
 
 def test_ground_is_seen_where_no_triangle_is(data, sources):

@@ -11,7 +11,7 @@ from spn_data.geometry.rotations import rotation_vectors
 from spn_model.integrity.judgement import IntegrityLimits, judge
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import Hypothesis, follow, search, witness_of
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.solver import KnownVertical, fit_focal_length
 from tests.worlds.landmark_world import CAMERA, OPTIONS, pose, room, seen_from
 
 ROOM = room()
@@ -45,6 +45,16 @@ def test_poses_are_found_with_true_covariances():
         assert abs(off[2]) < verdict.vertical_m
         nees.append(off @ np.linalg.solve(verdict.covariance, off) / 6)
     assert 0.7 < np.mean(nees) < 1.4
+
+
+def test_a_focal_length_that_nothing_determines_is_not_fitted():
+    """Landmarks behind the camera give the prior instead of a singular matrix."""
+    center, rotation = pose(20.0)
+    seen = features(center, rotation)
+    found = search(ROOM, seen).best
+    turned = replace(found.pose, rotation=np.diag([-1.0, 1.0, -1.0]) @ found.pose.rotation)
+    assert fit_focal_length(found.seen, turned) == (0.0, 1.0)
+    assert abs(fit_focal_length(found.seen, found.pose)[0]) < 0.01
 
 
 def test_an_image_of_another_room_has_no_pose():
