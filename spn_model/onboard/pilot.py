@@ -56,6 +56,9 @@ class PilotOptions:
     anchor_s : float
         Time for which the landmarks of an image are followed by their patches before features are detected
         again.
+    sure_share : float
+        Share of the landmarks found near their projections that must agree with a pose that is followed. If
+        fewer do, as in an image blurred by motion, the image must give the pose without the prediction.
     radius_px : float
         Search radius around predicted projections, plus `radius_px_s` for each second since the last fix.
     radius_px_s : float
@@ -67,6 +70,7 @@ class PilotOptions:
     network: bool = True
     search_s: float = 3.0
     anchor_s: float = 1.0
+    sure_share: float = 0.65
     radius_px: float = 30.0
     radius_px_s: float = 150.0
 
@@ -208,7 +212,7 @@ class Pilot:
             with self._step("landmarks"):
                 found = follow(self.landmarks, features, guess)
             verdict = self._judged(found, features, vertical)
-            if found is not None and verdict is not None and not verdict.reason:
+            if found is not None and self._is_sure(verdict):
                 self._keep_anchor(gray, time_us, found.best, features)
                 return found.best, verdict, ""
             guess = None  # what could not be followed is not tried again
@@ -236,9 +240,17 @@ class Pilot:
                 return None, None
             found = anchor.follow(small, guess)
         verdict = self._judged(found, anchor, vertical)
-        if verdict is None or verdict.reason:
+        if not self._is_sure(verdict):
             return None, None
         return found, verdict
+
+    def _is_sure(self, verdict: Judgement | None) -> bool:
+        """Return whether a pose found with the help of a prediction needs no other evidence."""
+        return (
+            verdict is not None
+            and not verdict.reason
+            and verdict.quality >= 100 * self.options.sure_share
+        )
 
     def _keep_anchor(
         self, gray: np.ndarray, time_us: int, candidate: Candidate, features: ImageFeatures
