@@ -83,7 +83,8 @@ class Datum:
             known = self.origin.height_reference.value
             raise InputError(
                 f"the height of the world's origin is known above '{known}' only, but an autopilot needs it "
-                "above sea level: state the geoid height, or the origin's height above sea level"
+                "above sea level: give the geoid height (--geoid-height) or, where heights count from "
+                "take-off, that of the take-off point (--takeoff-height)"
             )
 
     def local_ned(self, enu: np.ndarray, origin: Geodetic, projection: Projection) -> np.ndarray:

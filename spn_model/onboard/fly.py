@@ -14,6 +14,7 @@ import numpy as np
 
 from spn_data.errors import InputError
 from spn_data.geometry.camera_file import read_camera
+from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.link import FixSink, open_link
@@ -21,7 +22,6 @@ from spn_model.autopilot.parameters import parameter_file
 from spn_model.autopilot.profiles import PROFILES, ROS2, Message
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
-from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.attitude import (
     BODY,
     CAMERA,
@@ -33,6 +33,7 @@ from spn_model.onboard.attitude import (
 from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.pre_arm import StatedPosition, pre_arm
+from spn_model.onboard.replay import FlownImage, RealTime
 from spn_model.onboard.sources import check_sources, frames
 
 _FIRST_US = 1_000_000  # time of the first image of a recording whose clock starts at zero
@@ -75,7 +76,10 @@ def fly(arguments: list[str]) -> None:
     datum = (
         None
         if view.origin is None
-        else Datum(origin=view.origin, geoid_height_m=given.geoid_height)
+        else Datum(
+            origin=above_sea(view.origin, given.takeoff_height),
+            geoid_height_m=given.geoid_height,
+        )
     )
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
     attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
@@ -85,7 +89,7 @@ def fly(arguments: list[str]) -> None:
             sys.stdout.write(line + "\n")
         sys.stdout.write("Ready.\n")
         return
-    report, count, known = FlightReport(), 0, 0
+    report, count, known, clock = FlightReport(), 0, 0, RealTime()
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
@@ -101,6 +105,7 @@ def fly(arguments: list[str]) -> None:
                 coast_s=given.coast,
             )
             sinks.append(link)
+            images = clock.paced(images)
         for sink in sinks:
             stack.callback(sink.close)
         for time_us, image, vertical in images:
@@ -110,15 +115,30 @@ def fly(arguments: list[str]) -> None:
             for sink in sinks:
                 sink.send(item)
     lines = report.lines()
+    if clock.late:
+        lines.append(
+            f"{clock.late} images were left out: the recording is replayed in real time, and they were late."
+        )
     if attitude is not None:
         lines.append(attitude.coverage(known, count))
     for line in lines:
         sys.stdout.write(line + "\n")
 
 
-def _images(
-    given: argparse.Namespace, attitude: Attitude | None
-) -> Iterator[tuple[int, np.ndarray, KnownVertical | None]]:
+def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
+    """Return the origin with its height above sea level, if that of the take-off point is given."""
+    if takeoff_height_m is None:
+        return origin
+    if origin.height_reference != HeightReference.TAKEOFF:
+        raise InputError(
+            "--takeoff-height is for a world whose heights count from take-off; those of this one are above "
+            f"'{origin.height_reference.value}'"
+        )
+    height = origin.alt_m + takeoff_height_m
+    return GeoOrigin(origin.lat_deg, origin.lon_deg, height, HeightReference.AMSL)
+
+
+def _images(given: argparse.Namespace, attitude: Attitude | None) -> Iterator[FlownImage]:
     """Yield time in microseconds, image, and up in the camera if it is known."""
     for number, time_s, image in frames(given.source):
         seconds = number / given.fps if math.isnan(time_s) else time_s
@@ -200,6 +220,11 @@ def _parser() -> argparse.ArgumentParser:
         "--at-sigma", type=float, default=3.0, metavar="M", help="of that position (default 3)"
     )
     parser.add_argument("--geoid-height", type=float, help="of the place, m above the ellipsoid")
+    parser.add_argument(
+        "--takeoff-height",
+        type=float,
+        help="of the take-off point, m above sea level, where heights count from there",
+    )
     parser.add_argument("--fps", type=float, default=10.0, help="where images state no time")
     parser.add_argument("--no-network", action="store_true", help="search by landmarks alone")
     parser.add_argument("--int8", action="store_true", help="use the 8-bit graph")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,13 @@ from spn_cli.data import main as data_main
 from spn_cli.model import main as model_main
 
 import spn_data
-from spn_data.geometry.camera_file import camera_to_json
+from spn_data.geometry.camera_file import camera_to_json, read_camera
 from spn_data.storage.json_files import write_json
-from spn_model.integrity.fix import NoFix
+from spn_model.integrity.fix import Fix, FixSource, NoFix
 from spn_model.onboard.__main__ import main
 from spn_model.onboard.bundle import read_bundle
 from spn_model.onboard.pilot import Pilot, PilotOptions
+from spn_model.onboard.sources import frames
 
 pytestmark = pytest.mark.slow
 
@@ -151,3 +153,21 @@ def test_a_bundle_without_landmarks_is_refused(flown_area, camera_file, flight1,
     (bundle / "bundle.json").write_text(json.dumps(document))
     assert main(words) == 1
     assert "has no landmarks, which a fix needs" in capsys.readouterr().err
+
+
+def test_a_followed_pose_on_which_few_landmarks_agree_is_searched_for_anew(
+    flown_area, camera_file, flight1
+):
+    """Where a followed pose needs more agreeing landmarks than there can be, each pose is searched for."""
+    bundle = flown_area / "runs" / "default" / "bundle"
+    sources = {}
+    for share in (0.0, 1.01):
+        pilot = Pilot(bundle, read_camera(camera_file), PilotOptions(sure_share=share))
+        items = [
+            pilot.fix(image, 1_000_000 + round(1e6 * time_s))
+            for _, time_s, image in islice(frames(flight1 / "flight1.mp4"), 8)
+        ]
+        sources[share] = [item.source for item in items if isinstance(item, Fix)]
+    assert sources[0.0].count(FixSource.TRACK) > 3
+    assert len(sources[1.01]) > 3
+    assert FixSource.TRACK not in sources[1.01]
