@@ -37,7 +37,6 @@ demo: $(VENV)/installed
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
 	$(BIN)/spn-onboard fly $(DEMO)/area/runs/default/bundle $(DEMO)/flights/evaluation/medium.mp4 \
 		--camera $(DEMO)/area/4-eval/medium/camera.json --to $(DEMO)/fixes.jsonl
-	$(BIN)/python benchmarks/fixes.py $(DEMO)/area $(DEMO)/area/runs/default/bundle
 	$(BIN)/python tools/run_page.py docs/python.md
 
 test: $(VENV)/readers
