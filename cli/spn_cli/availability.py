@@ -28,20 +28,7 @@ _UNKNOWN = (
     metavar="FILE.csv",
     help="Table of planned waypoints.  [default: the frames of the evaluation flights]",
 )
-@click.option(
-    "--camera",
-    "camera_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Camera (JSON) of waypoints that name none.  [default: that of most mapping frames]",
-)
-@click.option(
-    "--fov",
-    "fov_deg",
-    type=options.FieldOfView(),
-    metavar="DEG",
-    help="Horizontal field of view in degrees, instead of --camera.",
-)
+@options.waypoint_camera
 @click.option(
     "--to",
     "target",

@@ -272,6 +272,24 @@ def georegistration(command: Any) -> Any:
     return command
 
 
+def waypoint_camera(command: Any) -> Any:
+    """Add the options that state the camera of planned waypoints."""
+    command = click.option(
+        "--fov",
+        "fov_deg",
+        type=FieldOfView(),
+        metavar="DEG",
+        help="Horizontal field of view in degrees, instead of --camera.",
+    )(command)
+    return click.option(
+        "--camera",
+        "camera_file",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="Camera (JSON) of waypoints that name none.  [default: that of most mapping frames]",
+    )(command)
+
+
 def geo_options(
     *,
     gnss_sigma_m: tuple[float, float] | None,

@@ -419,7 +419,7 @@ def test_facts_of_a_run_are_documented(tmp_path):
     metrics = json.loads((tmp_path / "area" / "runs" / "first" / "metrics.json").read_text())
     facts = metrics["facts"]
     page = (Path(__file__).resolve().parents[3] / "docs" / "evaluation.md").read_text("utf-8")
-    table = page.split("### Facts")[1].split("## errors.csv")[0]
+    table = page.split("### Facts")[1].split("\n##")[0]
     assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == list(
         dict.fromkeys(["roles", "networks", "runs", "costs", "dataset", "notes", *facts])
     )
