@@ -17,7 +17,7 @@ $(VENV)/readers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[readers]'
 	touch $@
 
-# Simulated flights with exact truth, from video to fixes on board; three minutes of training are far too few
+# Simulated flights with exact truth, from video to fixes on board; two minutes of training are far too few
 # for a network to be flown (half an hour is the default), and enough to see each step.
 demo: $(VENV)/installed
 	rm -rf $(DEMO)
@@ -31,7 +31,7 @@ demo: $(VENV)/installed
 	$(BIN)/spn-data status --area $(DEMO)/area
 	$(BIN)/python benchmarks/truth.py $(DEMO)/area $(DEMO)/flights
 	$(BIN)/python benchmarks/labels.py $(DEMO)/area $(DEMO)/flights
-	$(BIN)/spn-model train --area $(DEMO)/area --minutes 3 --validations 3
+	$(BIN)/spn-model train --area $(DEMO)/area --minutes 2 --validations 2
 	$(BIN)/spn-model export --run default --area $(DEMO)/area
 	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
