@@ -37,7 +37,7 @@ def test_an_autopilot_needs_heights_above_sea_level():
     """A world with heights above take-off is refused, with the remedy."""
     DATUM.require_amsl()
     AMSL_ONLY.require_amsl()
-    with pytest.raises(InputError, match=r"above 'takeoff' only.*state the geoid height"):
+    with pytest.raises(InputError, match=r"above 'takeoff' only.*give the geoid height"):
         Datum(origin=replace(ORIGIN, height_reference=HeightReference.TAKEOFF)).require_amsl()
 
 
