@@ -176,9 +176,8 @@ class Sender:
                 return
             if isinstance(item, Fix):
                 self.report.refused += 1
-            if (
-                item.state != FixState.COAST
-            ):  # after a single image without a pose, predictions go on
+            # After a single image without a pose, predictions go on.
+            if item.state != FixState.COAST:
                 self._recent.clear()
             if item.state == FixState.LOST:
                 self._lost, self._waiting = True, None

@@ -14,9 +14,10 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_model.evaluation.fixes import MISLEADING_DEG, MISLEADING_M, fix_error
 from spn_model.examples.novel_view_fusion import fused_view
-from spn_model.examples.point_targets import Surface, SurfaceOptions, surface
+from spn_model.examples.point_targets import SurfaceOptions
 from spn_model.examples.source_images import SourceImages
 from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.training_surfaces import TrainingSurfaces
 from spn_model.integrity.fix import NoFix
 from spn_model.landmarks.matching import expected
 from spn_model.models.scene_examples import FAR, LEVEL
@@ -98,7 +99,7 @@ class PlannedViews:
         spread = float(np.median(np.linalg.norm(xyz - center, axis=1)))
         self._sources = SourceImages(data, center, spread, FAR * spread)
         self._options = SurfaceOptions(level_m=LEVEL * spread if data.up_is_known else 0.0)
-        self._surfaces: dict[int, Surface] = {}
+        self._surfaces = TrainingSurfaces(data, self._options)
         self._pilots: dict[tuple[int, int, float], Pilot] = {}
         self._bundle = bundle
 
@@ -158,7 +159,7 @@ class PlannedViews:
         image, seen = fused_view(
             self._data,
             self._sources,
-            self._surface,
+            self._surfaces.of,
             moved,
             pinhole.matrix,
             1,
@@ -179,18 +180,6 @@ class PlannedViews:
         size = (max(round(camera.width * by), 1), max(round(camera.height * by), 1))
         params = np.array([camera.focal_px[0] * by, size[0] / 2, size[1] / 2])
         return Camera("SIMPLE_PINHOLE", *size, params)
-
-    def _surface(self, row: int) -> Surface:
-        if row not in self._surfaces:
-            data = self._data
-            self._surfaces[row] = surface(
-                data.points(row),
-                data.poses[row : row + 1],
-                data.intrinsics[row],
-                data.size,
-                self._options,
-            )
-        return self._surfaces[row]
 
     def _pilot(self, pinhole: Camera) -> Pilot:
         key = (pinhole.width, pinhole.height, float(pinhole.focal_px[0]))

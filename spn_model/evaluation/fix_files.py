@@ -172,16 +172,16 @@ def _cells(one: FlightFixes, image: JudgedImage) -> tuple[str, ...]:
     errors: tuple[str, ...] = ("",) * 6
     if error is not None:
         errors = (
-            *(_cell(v) for v in (error.error_m, error.error_deg)),
-            *(_cell(v) for v in (error.horizontal_m, error.vertical_m)),
-            _cell(error.nees),
+            *(number_cell(v) for v in (error.error_m, error.error_deg)),
+            *(number_cell(v) for v in (error.horizontal_m, error.vertical_m)),
+            number_cell(error.nees),
             str(int(error.is_misleading)),
         )
     return (
-        *(one.flight, one.method, image.name, _cell(image.time_s)),
+        *(one.flight, one.method, image.name, number_cell(image.time_s)),
         *(str(int(image.is_usable)), image.state, image.source, image.reason),
         *errors[:4],
-        *(_cell(level) for level in image.protection_m),
+        *(number_cell(level) for level in image.protection_m),
         *errors[4:],
     )
 
@@ -242,5 +242,6 @@ def _text(value: float, spec: str, unit: str = "") -> str:
     return "" if math.isnan(value) else f"{value:{spec}}{unit}"
 
 
-def _cell(value: float) -> str:
+def number_cell(value: float) -> str:
+    """Return the cell of a number; empty if it is not finite."""
     return f"{value:.4f}" if math.isfinite(value) else ""

@@ -15,6 +15,7 @@ from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
 from spn_model.integrity.fix import Fix, NoFix
+from spn_model.onboard.flight_report import longest_outage
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
@@ -153,14 +154,12 @@ class FlightFixes:
             protected=math.nan
             if self.method == COARSE
             else _of(np.mean, [float(error.is_protected) for error in errors]),
-            longest_outage_s=self._longest_outage_s() if self.method == TRACK else math.nan,
+            longest_outage_s=longest_outage(
+                [image.time_s for image in self.images], [image.is_usable for image in self.images]
+            )
+            if self.method == TRACK
+            else math.nan,
         )
-
-    def _longest_outage_s(self) -> float:
-        """Return the longest time between usable fixes, begin and end of the flight included."""
-        times = [image.time_s for image in self.images]
-        marks = [*times[:1], *(i.time_s for i in self.images if i.is_usable), *times[-1:]]
-        return float(np.diff(marks).max(initial=0))
 
 
 def fix_error(fix: Fix, truth: Poses) -> FixError:
@@ -300,13 +299,10 @@ def has_times(flight: EvaluationFlight) -> bool:
 def _judged(item: Fix | NoFix, flight: EvaluationFlight, row: int) -> JudgedImage:
     labels = flight.labels
     name, time_s, state = str(labels.names[row]), float(labels.time_s[row]), item.state.value
-    if isinstance(item, NoFix):
+    if isinstance(item, NoFix) or not item.usable:
         return JudgedImage(
             name=name, time_s=time_s, is_usable=False, state=state, reason=item.reason
         )
-    if not item.usable:
-        reason = "waits for images that agree"
-        return JudgedImage(name=name, time_s=time_s, is_usable=False, state=state, reason=reason)
     return JudgedImage(
         name=name,
         time_s=time_s,

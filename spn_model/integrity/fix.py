@@ -122,6 +122,11 @@ class Fix:
         return self.state in USABLE_STATES
 
     @property
+    def reason(self) -> str:
+        """Why an autopilot may not get the pose; empty if it may."""
+        return "" if self.usable else "waits for images that agree"
+
+    @property
     def horizontal_sigma_m(self) -> float:
         """Standard deviation along the worst horizontal direction, in metres."""
         return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))

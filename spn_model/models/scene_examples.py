@@ -28,10 +28,10 @@ from spn_model.examples.point_targets import (
     SurfaceOptions,
     cell_centers,
     cell_targets,
-    surface,
 )
 from spn_model.examples.source_images import SourceImages
 from spn_model.examples.training_set import TrainingSet
+from spn_model.examples.training_surfaces import TrainingSurfaces
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
     STRIDE_PX,
@@ -142,7 +142,7 @@ class SceneExamples:
             height_m=options.views_height * spread,
             up=(0.0, 0.0, 1.0) if data.up_is_known else _mean_up(data),
         )
-        self._surfaces: dict[int, Surface] = {}
+        self._surfaces = TrainingSurfaces(data, self._surface_options)
         width, height = data.size
         step = self._surface_options.step_px
         fits = step % shrink == 0 and width % shrink == 0 and height % shrink == 0
@@ -244,7 +244,7 @@ class SceneExamples:
             if number not in self._views:
                 self._views[number] = self._view(number) or self._training_image(number)
             return self._views[number]
-        return self._image(row), self._surface(row) if self._options.surfaces else None
+        return self._image(row), self._surfaces.of(row) if self._options.surfaces else None
 
     def _image(self, row: int) -> np.ndarray:
         image, valid = self._data.image(row), self._data.valid(row)
@@ -253,18 +253,6 @@ class SceneExamples:
         return np.where(
             valid[..., None], image, np.random.default_rng(row).integers(0, 256, 3, np.uint8)
         )
-
-    def _surface(self, row: int) -> Surface:
-        if row not in self._surfaces:
-            data = self._data
-            self._surfaces[row] = surface(
-                data.points(row),
-                data.poses[row : row + 1],
-                data.intrinsics[row],
-                data.size,
-                self._surface_options,
-            )
-        return self._surfaces[row]
 
     def _views_at(self, progress: float) -> int:
         """Return how many views are drawn from; they are rendered gradually while training runs."""
@@ -298,12 +286,12 @@ class SceneExamples:
     def _training_image(self, number: int) -> tuple[np.ndarray, Surface]:
         """Return the fallback for a view that cannot be rendered."""
         row = self._row_of_view(number)
-        return self._image(row), self._surface(row)
+        return self._image(row), self._surfaces.of(row)
 
     def _view(self, number: int) -> tuple[np.ndarray, Surface] | None:
         """Render a view by its number; None if it shows too little."""
         row = self._row_of_view(number)
-        seen = self._surface(row)
+        seen = self._surfaces.of(row)
         if not np.isfinite(seen.inverse_depth).any():
             return None
         # A view depends on its number only, so that a batch depends on its arguments only.
@@ -321,7 +309,7 @@ class SceneExamples:
             image, fused = fused_view(
                 self._data,
                 self._sources,
-                self._surface,
+                self._surfaces.of,
                 place,
                 self._data.intrinsics[row],
                 self._view_shrink,

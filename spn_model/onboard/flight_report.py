@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -45,6 +45,13 @@ def kind_of_reason(reason: str) -> str:
     return " ".join("#" if any(c.isdigit() for c in word) else word for word in reason.split())
 
 
+def longest_outage(times: Sequence[float], usable: Sequence[bool]) -> float:
+    """Return the longest time between usable fixes, begin and end included; 0 without images."""
+    at = np.asarray(times)
+    marks = np.concatenate([at[:1], at[np.asarray(usable, bool)], at[-1:]])
+    return float(np.diff(marks).max(initial=0))
+
+
 class FlightReport:
     """Counts of what was published during a flight."""
 
@@ -62,12 +69,9 @@ class FlightReport:
         self._usable.append(usable)
         self._times_us.append(item.time_us)
         self._times.add(steps_s, item.processing_s)
-        if isinstance(item, Fix):
-            self._sources[item.source.value] += usable
-            if usable:
-                self._levels_m.append((item.horizontal_protection_m, item.vertical_protection_m))
-            else:
-                self._reasons[f"{item.state.value}: waits for images that agree"] += 1
+        if isinstance(item, Fix) and item.usable:
+            self._sources[item.source.value] += 1
+            self._levels_m.append((item.horizontal_protection_m, item.vertical_protection_m))
         else:
             self._reasons[f"{item.state.value}: {kind_of_reason(item.reason)}"] += 1
 
@@ -79,11 +83,7 @@ class FlightReport:
     @property
     def longest_outage_s(self) -> float:
         """Longest time between usable fixes, begin and end of the flight included."""
-        if not self._times_us:
-            return 0.0
-        times = np.array(self._times_us)
-        marks = np.concatenate([times[:1], times[np.array(self._usable)], times[-1:]])
-        return float(np.diff(marks).max(initial=0)) * 1e-6
+        return 1e-6 * longest_outage(self._times_us, self._usable)
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
@@ -97,9 +97,7 @@ class FlightReport:
         ]
         if usable:
             horizontal, vertical = np.median(self._levels_m, axis=0)
-            sources = ", ".join(
-                f"{name} {count}" for name, count in self._sources.most_common() if count
-            )
+            sources = ", ".join(f"{name} {count}" for name, count in self._sources.most_common())
             found.append(
                 f"Protection level (median): {horizontal:.2f} m horizontally, {vertical:.2f} m vertically."
             )

@@ -201,16 +201,17 @@ class Pilot:
             return None, None, lack
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         guess = self._prediction(time_us)
-        following = guess is not None and time_us - self._searched_us < self.options.search_s * 1e6
-        if following and guess is not None:
-            found, verdict = self._followed_patches(gray, time_us, guess, vertical)
+        is_due = time_us - self._searched_us >= self.options.search_s * 1e6
+        followed = None if is_due else guess
+        if followed is not None:
+            found, verdict = self._followed_patches(gray, time_us, followed, vertical)
             if found is not None:
                 return found.best, verdict, ""
         with self._step("features"):
             features = self._features(gray)
-        if following and guess is not None:
+        if followed is not None:
             with self._step("landmarks"):
-                found = follow(self.landmarks, features, guess)
+                found = follow(self.landmarks, features, followed)
             verdict = self._judged(found, features, vertical)
             if found is not None and self._is_sure(verdict):
                 self._keep_anchor(gray, time_us, found.best, features)

@@ -97,7 +97,7 @@ def pre_arm(
             yield _position(item, stated, origin)
             yield _attitude(item, vertical)
             return
-        reasons["waits for images that agree" if isinstance(item, Fix) else item.reason] += 1
+        reasons[item.reason] += 1
         if count == _IMAGES:
             break
     most = Counter({kind_of_reason(text): number for text, number in reasons.items()})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from spn_data.inputs.evaluation_flights import EvaluationFlight
 from spn_data.storage.files import read_csv, write_csv
 from spn_data.work.timing import Progress
 from spn_model.evaluation.availability import ExpectedFix, PlannedViews
-from spn_model.evaluation.fix_files import FIX_COLUMNS
+from spn_model.evaluation.fix_files import FIX_COLUMNS, number_cell
 from spn_model.evaluation.fixes import SEARCH, chosen_rows
 from spn_model.examples.training_set import TrainingSet
 from spn_model.runs.run_files import RunFiles
@@ -94,9 +93,9 @@ def write_expected(path: Path, expected: Sequence[ExpectedFix]) -> None:
             "landmarks": [str(one.landmarks) for one in expected],
             "spread": [f"{one.spread:.3f}" for one in expected],
             "shown": [f"{one.shown:.3f}" for one in expected],
-            "error": [_cell(one.error_m) for one in expected],
-            "protection_horizontal": [_cell(one.protection_m[0]) for one in expected],
-            "protection_vertical": [_cell(one.protection_m[1]) for one in expected],
+            "error": [number_cell(one.error_m) for one in expected],
+            "protection_horizontal": [number_cell(one.protection_m[0]) for one in expected],
+            "protection_vertical": [number_cell(one.protection_m[1]) for one in expected],
         },
     )
 
@@ -119,7 +118,3 @@ def measured_usable(run: RunFiles) -> dict[str, bool]:
         if row["method"] == SEARCH:
             usable[row["name"]] = row["usable"] == "1"
     return usable
-
-
-def _cell(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else ""

@@ -85,7 +85,7 @@ def test_what_a_user_sees_of_fixes_before_a_flight(area):
 
 
 def test_a_plan_is_judged(area, tmp_path):
-    """A waypoint within the flight may have a fix; one far outside has none, and the reason is told."""
+    """A waypoint within the flight may have a fix; one far outside has none, with the reason."""
     poses = (area / "4-eval" / "medium" / "poses.csv").read_text().splitlines()
     inside = next(row for row in csv.DictReader(poses) if row["status"] == "registered")
     x, y, z = (inside[axis] for axis in "xyz")

@@ -258,7 +258,7 @@ def test_a_stage_begins_with_few_views(data):
         examples = SceneExamples(data, options, CENTER, SPREAD, 2, UNKNOWN_COUNT)
         drawn: list[int] = []
         examples._view = lambda n, to=drawn, of=examples: (
-            to.append(n) or (data.image(0), of._surface(0))
+            to.append(n) or (data.image(0), of._surfaces.of(0))
         )
         rng = np.random.default_rng(0)
         for _ in range(8):
@@ -289,7 +289,7 @@ def test_a_view_that_shows_too_little_is_the_training_image(data, monkeypatch):
     assert examples._view(0) is None
     image, seen = examples._training_image(0)
     assert np.array_equal(image, data.image(0))
-    assert seen is examples._surface(0)
+    assert seen is examples._surfaces.of(0)
     assert examples.held_out_views(3) is None
 
 
