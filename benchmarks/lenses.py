@@ -25,7 +25,7 @@ from spn_data.colmap.model import Scene, read_map, write_native
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, Similarity
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_angles
-from spn_data.reconstruction.refinement import shifted_principal_points
+from spn_data.reconstruction.refinement import free_principal_points
 from spn_data.uncertainty.map_covariance import MapCovariance
 from tests.worlds.native_world import native_model
 
@@ -112,7 +112,7 @@ def draw(kind: str, seed: int, folder: Path) -> dict[str, float]:
     if not (folder / "true.npz").exists():
         make(kind, seed, folder)
     scene, covariance = _read(folder / "held")
-    freed = bool(shifted_principal_points(scene, covariance.shared.principal_points, {}))
+    freed = bool(free_principal_points(scene.cameras, covariance.shared.principal_points, {}))
     if freed:
         scene, covariance = _read(folder / "free")
     with np.load(folder / "true.npz") as arrays:

@@ -9,7 +9,6 @@ import numpy as np
 from spn_data.geometry.camera import Camera
 from spn_data.reconstruction.attempts import Attempt
 from spn_data.reconstruction.contradiction import Contradiction, FocalChange, ShapeError
-from spn_data.uncertainty.shared_errors import PrincipalPoint
 
 
 def attempt_note(attempt: Attempt, submodels: tuple[int, ...], frames: int) -> str:
@@ -37,12 +36,12 @@ def bend_note(bend_m: float) -> str:
     )
 
 
-def principal_point_note(key: str, camera: Camera, before: PrincipalPoint) -> str:
-    """Return where a principal point was found; `before` is how it was before it was estimated."""
+def principal_point_note(key: str, camera: Camera, sigma_px: np.ndarray) -> str:
+    """Return where a principal point was found, and its standard deviations (2,)."""
     x, y = camera.matrix[:2, 2] - np.array([camera.width, camera.height]) / 2
     return (
         f"camera {key}: the principal point was estimated: {x:+.1f} px across and {y:+.1f} px down "
-        f"from the centre of the image (sigma {np.max(before.sigma_px):.1f} px)"
+        f"from the centre of the image (sigma {np.max(sigma_px):.1f} px)"
     )
 
 

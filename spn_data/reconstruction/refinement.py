@@ -2,7 +2,8 @@
 
 A principal point is held at the centre of the image, unless the measurements tell where it is: its standard
 deviation, errors of the lens model included, must be far below what is usual among lenses, and the shift many
-standard deviations long.
+standard deviations long. A principal point that is held at a wrong place pulls those of the other cameras, so
+that one such shift frees all that the measurements determine.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from spn_data.colmap.mapping import refine
 from spn_data.colmap.model import MapObservations, Scene, read_map
 from spn_data.errors import GeometryError
+from spn_data.geometry.camera import Camera
 from spn_data.geometry.initial_lens import Hold
 from spn_data.labels.map_points import MapPoints
 from spn_data.reconstruction.attempts import ReconstructOptions
@@ -99,8 +101,8 @@ def refine_model(
         notes.append(bend_note(done["bend_m"]))
     refined = _read(work / "refined", lenses, stopwatch)
     if refined.covariance is not None and not options.refine_principal_point:
-        found = shifted_principal_points(
-            refined.scene, refined.covariance.shared.principal_points, held
+        found = free_principal_points(
+            refined.scene.cameras, refined.covariance.shared.principal_points, held
         )
         if found:
             others = {i: Hold.LENS for i in refined.scene.cameras if i not in found}
@@ -115,8 +117,11 @@ def refine_model(
                     True,
                 )
             refined = _read(work / "refined-principal-points", lenses, stopwatch)
+            after = found
+            if refined.covariance is not None:
+                after = refined.covariance.shared.principal_points
             notes += [
-                principal_point_note(key, refined.scene.cameras[i], found[i])
+                principal_point_note(key, refined.scene.cameras[i], after[i].sigma_px)
                 for key, i in sorted(frames.camera_ids(refined.scene).items())
                 if i in found
             ]
@@ -159,19 +164,20 @@ def _read(folder: Path, lenses: Mapping[int, LensPrior], stopwatch: Stopwatch) -
     return RefinedModel(folder, scene, observations, points, covariance, problem, ())
 
 
-def shifted_principal_points(
-    scene: Scene, points: Mapping[int, PrincipalPoint], held: Mapping[int, Hold]
+def free_principal_points(
+    cameras: Mapping[int, Camera], points: Mapping[int, PrincipalPoint], held: Mapping[int, Hold]
 ) -> dict[int, PrincipalPoint]:
-    """Return the principal points that are not where they are held, by camera id."""
-    found = {}
+    """Return the principal points to estimate, by camera id.
+
+    These are all that the measurements determine if one of them is not where it is held, else none.
+    """
+    found, shifted = {}, False
     for camera_id, point in points.items():
-        usual_px = PRINCIPAL_POINT_SIGMA * scene.cameras[camera_id].width
-        distance = point.shift_px @ np.linalg.solve(point.covariance, point.shift_px)
-        if (
-            camera_id not in held
-            and np.all(point.sigma_px <= _DETERMINED * usual_px)
-            and distance >= _SHIFTED_SIGMAS**2
-            and np.linalg.norm(point.shift_px) <= _LARGEST_SHIFT * scene.cameras[camera_id].width
-        ):
+        width = cameras[camera_id].width
+        plausible = np.linalg.norm(point.shift_px) <= _LARGEST_SHIFT * width
+        known = np.all(point.sigma_px <= _DETERMINED * PRINCIPAL_POINT_SIGMA * width)
+        if camera_id not in held and plausible and known:
             found[camera_id] = point
-    return found
+            distance = point.shift_px @ np.linalg.solve(point.covariance, point.shift_px)
+            shifted = shifted or bool(distance >= _SHIFTED_SIGMAS**2)
+    return found if shifted else {}

@@ -9,14 +9,15 @@ import numpy as np
 from spn_data.colmap import pycolmap
 from spn_data.colmap.model import scene_of, write_native
 from spn_data.geometry.camera import Camera
-from spn_data.geometry.initial_lens import GUESS_SIGMA, InitialLens
+from spn_data.geometry.initial_lens import GUESS_SIGMA, Hold, InitialLens
 from spn_data.reconstruction.attempts import ReconstructOptions
 from spn_data.reconstruction.correspondences import FramesToMap
-from spn_data.reconstruction.refinement import refine_model
+from spn_data.reconstruction.refinement import free_principal_points, refine_model
+from spn_data.uncertainty.shared_errors import PrincipalPoint
 from spn_data.work.timing import Stopwatch
 
 
-def test_a_shifted_principal_point_is_found_and_told_by_the_key_of_its_camera(
+def test_a_shifted_principal_point_is_found_and_named_by_the_key_of_its_camera(
     tmp_path: Path,
 ) -> None:
     """A principal point 12 px beside the centre of the image is found; the note names the camera's key."""
@@ -54,3 +55,16 @@ def test_a_shifted_principal_point_is_found_and_told_by_the_key_of_its_camera(
     np.testing.assert_allclose(found.matrix[:2, 2], [512, 400], atol=0.1)
     (note,) = refined.notes
     assert note.startswith("camera drone: the principal point was estimated: +12.0 px across")
+
+
+def test_one_shifted_principal_point_frees_all_that_are_determined() -> None:
+    """A shift of 6 sigma frees one of 2.6 sigma beside it, but none that is unknown."""
+    camera = Camera.from_horizontal_fov(960, 540, 72.0)
+    shifted = PrincipalPoint(np.array([4.1, -0.2]), np.diag([0.7, 0.3]) ** 2)
+    pulled = PrincipalPoint(np.array([2.8, -0.2]), np.diag([1.1, 0.8]) ** 2)
+    unknown = PrincipalPoint(np.array([2.8, -0.2]), np.diag([9.0, 0.8]) ** 2)
+    cameras = dict.fromkeys((1, 2, 3), camera)
+    points = {1: shifted, 2: pulled, 3: unknown}
+    assert set(free_principal_points(cameras, points, {})) == {1, 2}
+    assert set(free_principal_points(cameras, points, {2: Hold.LENS})) == {1}
+    assert not free_principal_points(cameras, {2: pulled, 3: unknown}, {})
