@@ -38,7 +38,7 @@ def true_flight(flights: Path, sequence: str) -> tuple[Poses, float]:
     rows = np.loadtxt(table, delimiter=",", skiprows=1, ndmin=2)
     if not np.array_equal(rows[:, 0], np.arange(len(rows))):
         raise SystemExit(f"{table}: frames are not numbered from 0")
-    camera = read_json(flights / f"{sequence}.camera.json")
+    camera = json.loads((flights / f"{sequence}.camera.json").read_text())
     return Poses(rows[:, 2:5], rows[:, 5:9]), float(camera["f"])
 
 
