@@ -56,6 +56,7 @@ _KINDS: dict[str, dict[str, Any]] = {
             "contradicts": FLAG,
             **dict.fromkeys(("offset_e_m", "offset_n_m", "scatter_h_m"), KNOWN),
             "offset_u_m": NUMBER,
+            "far?": COUNT,
         },
     },
     TRACKED: {

@@ -19,6 +19,7 @@ from spn_data.telemetry.track import Telemetry
 
 _MIN_FIXES = 5
 _DOUBTFUL_FOCAL = 0.01  # relative error of the map's focal length, from which a witness is of use
+_FAR_FIX, _FAR_SCATTER = 5.0, 10.0  # standard deviations of a fix; median distances
 _CONTRADICTION = 3.0  # standard deviations of the offset, from GNSS and georegistration
 
 
@@ -40,6 +41,11 @@ class GnssCheck:
         Median distance of the frames from these medians; `scatter_v_m` may be None.
     max_h_m : float
         Largest horizontal distance.
+    far : int
+        Number of frames farther than `far_limit_m` from the median offset, horizontally.
+    far_limit_m : float
+        Five standard deviations of a fix about the error that all fixes of a flight share, or ten of the
+        distances found.
     sigma_h_m, sigma_v_m : float
         Standard deviation of the offset, from the uncertainties of the map and of such fixes; `sigma_v_m`
         may be None.
@@ -55,6 +61,8 @@ class GnssCheck:
     scatter_h_m: float
     scatter_v_m: float | None
     max_h_m: float
+    far: int
+    far_limit_m: float
     sigma_h_m: float
     sigma_v_m: float | None
     contradicts: bool
@@ -76,6 +84,11 @@ class GnssCheck:
             f"(median; half of {self.fixes} frames within {self.scatter_h_m:.2f} m of it)"
             + vertical
         )
+        if self.far:
+            text += (
+                f". {self.far} of its frames are more than {self.far_limit_m:.0f} m off, up to "
+                f"{self.max_h_m:.0f} m: their labels show a place that looks alike, or these fixes are wrong"
+            )
         if self.contradicts:
             text += (
                 ". This exceeds the uncertainty of georegistration and GNSS "
@@ -125,6 +138,10 @@ def check_gnss(
     away = difference - middle
     horizontal = np.hypot(away[:, 0], away[:, 1])
     has_height = np.isfinite(height[known])
+    far_limit_m = max(
+        _FAR_FIX * float(np.hypot(*default_sigma_m(track.kind)[:2])),
+        _FAR_SCATTER * float(np.median(horizontal)),
+    )
     vertical = difference[has_height, 2]
     compares_height = len(vertical) >= _MIN_FIXES
     offset_u = float(np.median(vertical)) if compares_height else None
@@ -149,6 +166,8 @@ def check_gnss(
         if offset_u is None
         else round(float(np.median(np.abs(vertical - offset_u))), 4),
         max_h_m=round(float(horizontal.max()), 4),
+        far=int((horizontal > far_limit_m).sum()),
+        far_limit_m=round(far_limit_m, 4),
         sigma_h_m=round(sigma_h, 4),
         sigma_v_m=None if sigma_v is None else round(sigma_v, 4),
         contradicts=bool(too_far),

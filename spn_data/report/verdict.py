@@ -237,7 +237,16 @@ def _own_gnss(name: str, data: ReportData) -> Iterator[VerdictReason]:
     """Check the labels against the sequence's own GNSS fixes, which they do not use."""
     record = data.evaluation_records.get(name)
     gnss = record.counts.get("gnss") if record else None
-    if not gnss or not gnss["contradicts"]:
+    if not gnss:
+        return
+    if gnss.get("far"):
+        yield VerdictReason(
+            Level.CAUTION,
+            f"{gnss['far']} labels of {name} are far from their own GNSS fixes, unlike the others: they show a "
+            "place that looks alike, or these fixes are wrong.",
+            "Compare these frames with the map frames beside them",
+        )
+    if not gnss["contradicts"]:
         return
     offset = f"{math.hypot(gnss['offset_e_m'], gnss['offset_n_m']):.1f} m horizontally"
     if gnss["offset_u_m"] is not None:

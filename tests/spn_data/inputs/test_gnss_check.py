@@ -98,6 +98,17 @@ def test_an_offset_beyond_what_gnss_can_err_is_a_contradiction() -> None:
         assert "exceeds the uncertainty of georegistration and GNSS" in found.describe()
 
 
+def test_frames_at_a_place_that_looks_alike_are_counted() -> None:
+    """Five labels 37 m from their fixes are counted, and no others."""
+    geo = geo_fit(3)
+    labels = labelled()
+    assert check(labels, track(geo, (0.5, 0.0, 0.0)), geo).far == 0
+    labels.poses.centers[20:25, 0] += 37.0
+    found = check(labels, track(geo, (0.5, 0.0, 0.0)), geo)
+    assert found.far == 5
+    assert "5 of its frames are more than" in found.describe()
+
+
 def test_a_clock_that_is_behind_is_no_scatter() -> None:
     """A clock 0.6 s behind is estimated as a time offset and does not count as scatter."""
     geo = geo_fit(3)
@@ -160,6 +171,8 @@ def test_heights_of_a_flight_are_a_witness_of_the_maps_focal_length():
         scatter_h_m=0.3,
         scatter_v_m=0.3,
         max_h_m=1.0,
+        far=0,
+        far_limit_m=10.0,
         sigma_h_m=1.4,
         sigma_v_m=1.2,
         contradicts=False,

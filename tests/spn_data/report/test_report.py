@@ -173,6 +173,16 @@ RULES = {
         Level.CAUTION,
         "GNSS of medium, not used for its labels, deviates from them by 6.7 m horizontally and +0.5 m",
     ),
+    "far from own GNSS": (
+        lambda d: replace(
+            d,
+            evaluation_records={
+                "medium": record("4-eval/medium", gnss={"far": 7, "contradicts": False})
+            },
+        ),
+        Level.CAUTION,
+        "7 labels of medium are far from their own GNSS fixes, unlike the others",
+    ),
 }
 
 
