@@ -242,8 +242,8 @@ def _own_gnss(name: str, data: ReportData) -> Iterator[VerdictReason]:
     if gnss.get("far"):
         yield VerdictReason(
             Level.CAUTION,
-            f"{gnss['far']} labels of {name} are far from their own GNSS fixes, unlike the others: they show a "
-            "place that looks alike, or these fixes are wrong.",
+            f"{gnss['far']} labels of {name} are far from their own GNSS fixes, unlike the others: they show "
+            "a place that looks alike, or these fixes are wrong.",
             "Compare these frames with the map frames beside them",
         )
     if not gnss["contradicts"]:
