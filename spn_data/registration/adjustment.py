@@ -238,37 +238,85 @@ def normal_equations(
     Own points are damped like the other unknowns: one with little parallax would otherwise overshoot, however
     small the step.
     """
-    weighted_jacobian = jacobian(linearized, observations.frame, frames, weights)
-    residuals = (linearized.residuals_px * np.sqrt(weights)[:, None]).ravel()
-    of_lens = POSE * frames + np.arange(len(prior.weights))
-    priors = np.zeros(weighted_jacobian.shape[1])
-    priors[of_lens] = prior.weights
-    matrix = (weighted_jacobian.T @ weighted_jacobian + sparse.diags(priors)).tocsc()
+    lens = len(prior.weights)
+    root = np.sqrt(weights)[:, None]
+    columns = np.concatenate([linearized.by_pose, linearized.by_lens], axis=2) * root[..., None]
+    residuals = linearized.residuals_px * root
+    ends = np.searchsorted(observations.frame, np.arange(frames + 1))
+    blocks = np.zeros((frames, POSE + lens, POSE + lens))
+    pulls = np.zeros((frames, POSE + lens))
+    for k in range(frames):
+        own_rows = columns[ends[k] : ends[k + 1]].reshape(-1, POSE + lens)
+        blocks[k] = own_rows.T @ own_rows
+        pulls[k] = own_rows.T @ residuals[ends[k] : ends[k + 1]].ravel()
+    of_poses = sparse.bsr_matrix(
+        (blocks[:, :POSE, :POSE], np.arange(frames), np.arange(frames + 1)),
+        shape=(POSE * frames, POSE * frames),
+    )
+    of_both = blocks[:, :POSE, POSE:].reshape(POSE * frames, lens)
+    of_lens = blocks[:, POSE:, POSE:].sum(axis=0) + np.diag(prior.weights)
+    matrix = _bordered(of_poses, of_both, of_lens)
     if damping:
         diagonal = matrix.diagonal()
         matrix = (matrix + sparse.diags(damping * diagonal + 1e-12 * diagonal.max())).tocsc()
-    right = -(weighted_jacobian.T @ residuals)
-    right[of_lens] -= prior.weights * prior.offsets
+    right = -np.concatenate(
+        [pulls[:, :POSE].ravel(), pulls[:, POSE:].sum(axis=0) + prior.weights * prior.offsets]
+    )
     own = np.flatnonzero(observations.own >= 0)
     point_of = observations.own[own]
-    root = np.sqrt(weights[own])[:, None]
-    by_point = linearized.by_point[own] * root[..., None]
+    by_point = linearized.by_point[own] * root[own][..., None]
     v = np.zeros((own_points, 3, 3))
     np.add.at(v, point_of, by_point.transpose(0, 2, 1) @ by_point)
     v += damping * v * np.eye(3)
     v += 1e-12 * np.eye(3) * (1 + np.trace(v, axis1=1, axis2=2)[:, None, None])
     inverse = np.linalg.inv(v)
     point_right = np.zeros((own_points, 3))
-    weighted = linearized.residuals_px[own] * root
-    np.add.at(point_right, point_of, -np.einsum("mij,mi->mj", by_point, weighted))
-    of_points = rows_to_sparse(by_point, 3 * point_of[:, None] + np.arange(3), 3 * own_points)
-    rows = (2 * own[:, None] + np.arange(2)).ravel()
-    coupling = (weighted_jacobian[rows].T @ of_points).tocsr()
+    np.add.at(point_right, point_of, -np.einsum("mij,mi->mj", by_point, residuals[own]))
+    of_points = columns[own].transpose(0, 2, 1) @ by_point
+    poses_points = _by_frame_and_point(
+        of_points[:, :POSE], observations.frame[own], point_of, frames, own_points
+    )
+    lens_points = np.zeros((own_points, lens, 3))
+    np.add.at(lens_points, point_of, of_points[:, POSE:])
+    of_lens_points = lens_points.transpose(1, 0, 2).reshape(lens, 3 * own_points)
+    coupling = sparse.vstack([poses_points, sparse.csr_matrix(of_lens_points)], format="csr")
     if own_points:
-        weighted_coupling = coupling @ sparse.block_diag(list(inverse), format="csr")
-        matrix = (matrix - weighted_coupling @ coupling.T).tocsc()
-        right = right - weighted_coupling @ point_right.ravel()
+        poses_weighted = poses_points.copy()
+        poses_weighted.data = poses_weighted.data @ inverse[poses_weighted.indices]
+        lens_weighted = (lens_points @ inverse).transpose(1, 0, 2).reshape(lens, 3 * own_points)
+        matrix = (
+            matrix
+            - _bordered(
+                poses_weighted @ poses_points.T,
+                poses_weighted @ of_lens_points.T,
+                lens_weighted @ of_lens_points.T,
+            )
+        ).tocsc()
+        moved = point_right.ravel()
+        right = right - np.concatenate([poses_weighted @ moved, lens_weighted @ moved])
     return NormalEquations(matrix, right, inverse, coupling, point_right)
+
+
+def _bordered(
+    of_poses: sparse.bsr_matrix, of_both: np.ndarray, of_lens: np.ndarray
+) -> sparse.csc_matrix:
+    """Return the symmetric matrix of poses (n, n), bordered by those of both (n, L) and the lens (L, L)."""
+    if not len(of_lens):
+        return of_poses.tocsc()
+    both = sparse.csr_matrix(of_both)
+    return sparse.block_array([[of_poses, both], [both.T, of_lens]], format="csc")
+
+
+def _by_frame_and_point(
+    blocks: np.ndarray, frame: np.ndarray, point: np.ndarray, frames: int, points: int
+) -> sparse.bsr_matrix:
+    """Return the sum of blocks (M, 6, 3) at frames (M,) and points (M,), sparse (6 frames, 3 points)."""
+    shape = (POSE * frames, 3 * points)
+    key, group = np.unique(frame * max(points, 1) + point, return_inverse=True)
+    data = np.zeros((len(key), POSE, 3))
+    np.add.at(data, group, blocks)
+    row_ends = np.searchsorted(key // max(points, 1), np.arange(frames + 1))
+    return sparse.bsr_matrix((data, key % max(points, 1), row_ends), shape=shape)
 
 
 def adjust(
