@@ -130,4 +130,4 @@ def evaluate(
         console.out.print(
             f"{folder}: {METRICS}, {ERRORS}, {f'{FIXES}, ' if has_fixes else ''}{FIGURES}/."
         )
-    page.refresh_if_free(area)
+    page.complete_cards(page.refresh_if_free(area), {run.name: run.bundle for run in runs})

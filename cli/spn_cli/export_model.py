@@ -100,7 +100,9 @@ def export(
                 f"the run was not evaluated, so its model card contains neither errors nor fixes: run "
                 f"spn-model evaluate --run {name}, which completes it."
             )
-    page.refresh_if_free(area)
+    verdict = page.refresh_if_free(area)
+    if target is None:
+        page.complete_cards(verdict, {name: run.bundle})
 
 
 def _show(made: ExportedBundle) -> None:

@@ -69,6 +69,12 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path, exists=True),
     help="File or folder with the videos for --all-frames, if moved.  [default: original location]",
 )
+@click.option(
+    "--expect-low/--no-expect-low",
+    default=None,
+    help="Declare that the flight is meant to be far from the map: low coverage and few fixes on it are no "
+    "reservations. Without VIDEO, of the sequence --name.",
+)
 @options.threads
 @options.cluster
 @options.seed
@@ -92,6 +98,7 @@ def run(
     *,
     name: str | None,
     all_frames: bool,
+    expect_low: bool | None,
     video_folder: Path | None,
     threads: int | None,
     overwrite: bool,
@@ -102,10 +109,13 @@ def run(
 
     from spn_cli import page, show
     from spn_data.area.names import EVALUATION, GEO
+    from spn_data.pipeline.evaluation_stage import declare_far
     from spn_data.pipeline.tracking_stage import sequences_with_video, track_sequence
 
-    if video is None and not all_frames:
+    if video is None and not all_frames and expect_low is None:
         raise click.UsageError("give a VIDEO to register, or --all-frames")
+    if video is None and expect_low is not None and name is None:
+        raise click.UsageError("--expect-low without VIDEO needs --name")
     if chosen["fixed_lens"] and chosen["camera_file"] is None:
         raise click.UsageError("--fixed-lens needs --camera")
     workers = threads or os.cpu_count() or 1
@@ -120,6 +130,8 @@ def run(
                 )
                 live.made(record, before)
                 names = [record.stage.removeprefix(f"{EVALUATION}/")]
+            if expect_low is not None and names:
+                declare_far(area, names[0], is_far=expect_low)
             if all_frames:
                 for sequence in names or sequences_with_video(area):
                     tracked = track_sequence(

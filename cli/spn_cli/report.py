@@ -36,8 +36,7 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
 
     area = options.open_area(area_folder)
     with area.locked():
-        path, verdict, step = write_report(
+        path, verdict = write_report(
             area, ReportOptions(max_points=max_points, max_frames=max_frames)
         )
-    page.show_verdict(verdict, path)
-    page.show_next(step, area)
+    page.show_verdict(verdict, area, path)

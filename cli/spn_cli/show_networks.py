@@ -51,16 +51,13 @@ def comparison(found: NetworkComparison) -> None:
 
 
 def fixes(evaluated: EvaluatedRuns) -> None:
-    """Print the fixes of each run, and what they mean for a flight."""
+    """Print the fixes of each run; what they mean for a flight is in the verdict."""
     for name, found in evaluated.fixes.items():
-        verdicts = evaluated.verdicts(name)
-        rows = fix_rows(found.to_json(verdicts)["flights"])
+        rows = fix_rows(found.to_json()["flights"])
         if rows:
             console.table(f"{name}: fixes of its bundle on evaluation flights", rows, FIX_HEADER)
         for note in found.notes:
             console.note(note)
-        for one in verdicts:
-            (console.out.print if one.may_fly else console.note)(one.text)
 
 
 def _errors(group: EvaluatedGroup, unit: str) -> None:

@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import tomli_w
 
@@ -26,10 +27,13 @@ class Facts:
         folder.
     evaluation : mapping of str to str
         Source of each evaluation sequence, by name of the sequence.
+    expect_low : tuple of str
+        Evaluation sequences that are meant to be far from the map.
     """
 
     sources: tuple[str, ...] = ()
     evaluation: Mapping[str, str] = field(default_factory=dict)
+    expect_low: tuple[str, ...] = ()
 
 
 def read_facts(path: Path) -> Facts:
@@ -51,13 +55,15 @@ def read_facts(path: Path) -> Facts:
             raise ValueError("nested too deeply") from error
         check_version(path, table["version"])
         sources, evaluation = table["sources"], table.get("evaluation", {})
-        if not isinstance(sources, list) or not all(isinstance(s, str) for s in sources):
-            raise TypeError("sources is not a list of texts")
+        expect_low = table.get("expect_low", [])
+        for name, value in (("sources", sources), ("expect_low", expect_low)):
+            if not isinstance(value, list) or not all(isinstance(s, str) for s in value):
+                raise TypeError(f"{name} is not a list of texts")
         if not isinstance(evaluation, dict) or not all(
             isinstance(s, str) for s in evaluation.values()
         ):
             raise TypeError("evaluation is not a table of texts")
-        return Facts(sources=tuple(sources), evaluation=evaluation)
+        return Facts(sources=tuple(sources), evaluation=evaluation, expect_low=tuple(expect_low))
 
 
 def write_facts(path: Path, facts: Facts) -> None:
@@ -68,7 +74,9 @@ def write_facts(path: Path, facts: Facts) -> None:
     StageError
         If the file cannot be written.
     """
-    table = {"version": VERSION, "sources": list(facts.sources)}
+    table: dict[str, Any] = {"version": VERSION, "sources": list(facts.sources)}
+    if facts.expect_low:
+        table["expect_low"] = sorted(set(facts.expect_low))
     if facts.evaluation:
         table["evaluation"] = dict(sorted(facts.evaluation.items()))
     write_atomically(path, tomli_w.dumps(table))

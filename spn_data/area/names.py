@@ -42,6 +42,7 @@ REPORT = "report.html"
 RUNS = "runs"
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIXES, FIGURES, BUNDLE = "errors.csv", "fixes.csv", "figures", "bundle"
+BUNDLE_FACTS = "bundle.json"  # in BUNDLE
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
 RETRIEVAL = ".retrieval.json"  # in RUNS: cache of the retrieval baselines
 COMPARED = "compared"  # in RUNS: several runs evaluated together

@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.area.area import Area
-from spn_data.area.names import BUNDLE, CHECKPOINT, COMPARED, DATASET, FIGURES, METRICS, RUNS, SPLIT
+from spn_data.area.names import (
+    BUNDLE,
+    BUNDLE_FACTS,
+    CHECKPOINT,
+    COMPARED,
+    CONFIG,
+    DATASET,
+    FIGURES,
+    METRICS,
+    RUNS,
+    SPLIT,
+)
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError
 from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
@@ -23,7 +34,7 @@ _MAX_FIGURE_BYTES = 3_000_000
 _MAX_FIGURES_BYTES = 12_000_000  # in all runs
 _MAX_RUNS, _MAX_FIGURES = 50, 60
 _MAX_TEXT = 200
-_MAX_FIX_ROWS, _MAX_VERDICT = 100, 600
+_MAX_FIX_ROWS, _MAX_REASON = 100, 600
 _KINDS = ("protection", "trajectories", "histograms", "distance", "calibration")
 _SVG = re.compile(rb'<svg [^<>]*?viewBox="0 0 (\d{1,5}) \d{1,5}"')
 
@@ -68,18 +79,57 @@ def trained_runs(area: Area, runs: Sequence[RunFacts]) -> tuple[NetworkState, ..
     evaluated = {
         name for run in runs if run.is_current and not run.is_outdated for name in run.networks
     }
+    made_of = {run.name: run.fixes.made_of for run in runs}
     found = []
     for name in area.sequences(RUNS):
         folder = area.root / RUNS / name
         checkpoint, bundle = folder / CHECKPOINT, folder / BUNDLE
-        if not checkpoint.is_file():
+        if not checkpoint.is_file() or name == COMPARED:
             continue
-        made = checkpoint.stat().st_mtime
-        has_bundle = bundle.is_dir()
-        is_exported = has_bundle and bundle.stat().st_mtime >= made
-        path = f"{RUNS}/{name}/{BUNDLE}"
-        found.append((made, NetworkState(name, path, name in evaluated, has_bundle, is_exported)))
+        facts = _bundle(bundle / BUNDLE_FACTS)
+        state = NetworkState(
+            name,
+            f"{RUNS}/{name}/{BUNDLE}",
+            recipe=_recipe(folder / CONFIG),
+            is_evaluated=name in evaluated,
+            has_bundle=bundle.is_dir(),
+            is_exported=facts.get("checkpoint") == content_fingerprint(checkpoint),
+            has_landmarks="landmarks" in facts,
+            is_measured="landmarks" in facts
+            and all(
+                made_of.get(name, {}).get(part) == facts[part] for part in ("network", "landmarks")
+            ),
+        )
+        found.append((checkpoint.stat().st_mtime, state))
     return tuple(run for _, run in sorted(found, key=lambda one: (-one[0], one[1].name)))
+
+
+def _bundle(path: Path) -> dict[str, str]:
+    """Return the fingerprint of the `checkpoint` of a bundle, and SHA-256 of its `network` and `landmarks`.
+
+    Empty if there is none, or a damaged one, which every command that uses it refuses.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        document = load_json(path, max_bytes=_MAX_BYTES)
+        facts = {
+            "checkpoint": _text(document["run"]["checkpoint"]),
+            "network": _text(document["graphs"]["float32"]["sha256"]),
+        }
+        if "landmarks" in document:
+            facts["landmarks"] = _text(document["landmarks"]["sha256"])
+        return facts
+    except (*DAMAGE, FormatError):
+        return {}
+
+
+def _recipe(path: Path) -> str:
+    """Return the recipe that config.json of a run names; empty if it names none."""
+    try:
+        return _text(load_json(path, max_bytes=_MAX_BYTES)["recipe"])
+    except (*DAMAGE, OSError, FormatError):
+        return ""
 
 
 def _read(folder: Path, current: str, budget: int) -> RunFacts:
@@ -190,14 +240,16 @@ def _fixes(value: Mapping[str, Any]) -> BundleFixes:
             nees=_number(of["nees"]),
             protected=_number(of["protected"]),
             longest_outage_s=_number(of["longest_outage_s"]),
+            from_network=_count(of.get("from_network")),
         )
         for flight, methods in value["flights"].items()
         for method, of in methods.items()
     ]
-    verdicts = [
-        (one["may_fly"] is True, _text(one["text"], _MAX_VERDICT)) for one in value["verdict"]
-    ]
-    return BundleFixes(rows=tuple(rows[:_MAX_FIX_ROWS]), verdicts=tuple(verdicts[:_MAX_FIX_ROWS]))
+    return BundleFixes(
+        rows=tuple(rows[:_MAX_FIX_ROWS]),
+        reason=_text(value["reason"], _MAX_REASON),
+        made_of={_text(part): _text(digest) for part, digest in value["bundle"].items()},
+    )
 
 
 def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:

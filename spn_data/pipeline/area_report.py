@@ -36,10 +36,9 @@ from spn_data.inputs.network_runs import read_runs, trained_runs
 from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
+from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
-from spn_data.report.next_step import next_step
-from spn_data.report.verdict import AreaVerdict, VerdictReason, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
@@ -54,9 +53,7 @@ class ReportOptions:
     max_frames: int = 30_000
 
 
-def write_report(
-    area: Area, options: ReportOptions | None = None
-) -> tuple[Path, AreaVerdict, VerdictReason]:
+def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path, AreaVerdict]:
     """Write report.html in the area's folder, replacing an earlier one.
 
     Stale stages are named but otherwise left out.
@@ -71,9 +68,7 @@ def write_report(
     path : Path
         The page.
     verdict : AreaVerdict
-        Whether the area is ready for training.
-    next : VerdictReason
-        The next step.
+        On data, networks and flight, with the next step.
 
     Raises
     ------
@@ -84,19 +79,15 @@ def write_report(
     """
     options = options or ReportOptions()
     path, data = area.root / REPORT, report_data(area)
-    html = render(data, max_points=options.max_points, max_frames=options.max_frames)
+    judged = judge(data)
+    html = render(data, judged, max_points=options.max_points, max_frames=options.max_frames)
     write_atomically(path, html)
-    return path, *_judged(data)
+    return path, judged
 
 
-def judge_area(area: Area) -> tuple[AreaVerdict, VerdictReason]:
-    """Return the verdict on an area and the next step; raises the same errors as `write_report`."""
-    return _judged(report_data(area))
-
-
-def _judged(data: ReportData) -> tuple[AreaVerdict, VerdictReason]:
-    judged = verdict(data)
-    return judged, next_step(judged, data.trained)
+def judge_area(area: Area) -> AreaVerdict:
+    """Return the verdict on an area; raises the same errors as `write_report`."""
+    return judge(report_data(area))
 
 
 class _FreshStages(Area):
@@ -168,6 +159,7 @@ def report_data(area: Area) -> ReportData:
         runs=runs,
         broken_runs=broken_runs,
         trained=trained_runs(area, runs),
+        expect_low=frozenset(area.facts.expect_low),
     )
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from spn_data.area.area import Area, StageWork
-from spn_data.area.facts import Facts
 from spn_data.area.names import (
     CAMERA,
     EVALUATION,
@@ -23,7 +22,7 @@ from spn_data.area.names import (
 )
 from spn_data.capture.frames import Frames
 from spn_data.capture.sources import Source
-from spn_data.errors import StageError
+from spn_data.errors import InputError, StageError
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_from_json, camera_to_json, read_camera
 from spn_data.geometry.initial_lens import Hold, InitialLens
@@ -124,8 +123,24 @@ def register(
         return work
     record = _register(area, work, source, given, options, progress, dispatch)
     known = {**area.facts.evaluation, source.sequence: area.stored_path(video)}
-    area.write_facts(Facts(sources=area.facts.sources, evaluation=known))
+    area.write_facts(replace(area.facts, evaluation=known))
     return record
+
+
+def declare_far(area: Area, name: str, *, is_far: bool) -> None:
+    """Declare in area.toml that an evaluation sequence is meant to be far from the map, or that it is not.
+
+    Raises InputError if the area has no such sequence.
+    """
+    known = area.sequences(EVALUATION)
+    if name not in known:
+        raise InputError(
+            f"there is no evaluation sequence {name!r} whose coverage could be expected to be low; the area "
+            f"has: {', '.join(known) or 'none'}"
+        )
+    others = [other for other in area.facts.expect_low if other != name]
+    far = (*others, name) if is_far else tuple(others)
+    area.write_facts(replace(area.facts, expect_low=tuple(sorted(set(far)))))
 
 
 def _register(

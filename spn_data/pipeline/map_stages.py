@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Protocol
 
 from spn_data.area.area import Area
-from spn_data.area.facts import Facts
 from spn_data.area.names import FRAMES, GEO, GEO_FIT, MODEL, STAGES
 from spn_data.errors import GeometryError, StageError
 from spn_data.georegistration.result import GeoFit
@@ -177,7 +176,7 @@ def _stages(
     final = area if extended is None else extended
     earlier = () if extended is None else extended.facts.sources
     added = [final.stored_path(path) for path in inputs]
-    area.write_facts(Facts(sources=(*earlier, *added), evaluation=final.facts.evaluation))
+    area.write_facts(replace(final.facts, sources=(*earlier, *added)))
     report(frames, before.get(FRAMES))
     model = build_model(
         area,

@@ -307,7 +307,7 @@ class RunFacts:
     left_out : int
         Number of figures not shown.
     fixes : BundleFixes
-        Without rows and verdicts in an evaluation of several runs.
+        Without rows in an evaluation of several runs.
     """
 
     name: str
@@ -365,6 +365,8 @@ class ReportData:
         Why other runs cannot be shown.
     trained : tuple of NetworkState
         Trained networks, the newest first.
+    expect_low : frozenset of str
+        Evaluation sequences that are declared to be far from the map.
     """
 
     title: str
@@ -386,6 +388,7 @@ class ReportData:
     runs: tuple[RunFacts, ...] = ()
     broken_runs: tuple[str, ...] = ()
     trained: tuple[NetworkState, ...] = ()
+    expect_low: frozenset[str] = frozenset()
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

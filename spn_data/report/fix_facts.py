@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class FixFigures:
     misleading_at_most : float
         Upper bound of their share.
     nees, protected, longest_outage_s : float or None
+    from_network : int or None
+        Number of usable fixes that were searched for around the pose of the network, not by landmarks alone.
     """
 
     flight: str
@@ -34,6 +37,7 @@ class FixFigures:
     nees: float | None
     protected: float | None
     longest_outage_s: float | None
+    from_network: int | None = None
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,12 @@ class BundleFixes:
     Attributes
     ----------
     rows : tuple of FixFigures
-    verdicts : tuple of (bool, str)
-        Whether a sentence speaks for a flight, and the sentence.
+    reason : str
+        Why nothing was measured; empty otherwise.
+    made_of : mapping of str to str
+        SHA-256 of the `network` and the `landmarks` that they were measured with.
     """
 
     rows: tuple[FixFigures, ...] = ()
-    verdicts: tuple[tuple[bool, str], ...] = ()
+    reason: str = ""
+    made_of: Mapping[str, str] = field(default_factory=dict)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from string import Template
 
 from spn_data.report import sections
+from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import ReportData
 from spn_data.report.figures import key_figures
 from spn_data.report.networks import networks
@@ -17,13 +19,21 @@ from spn_data.report.thinning import thin_frames
 _SCRIPTS = ("data", "draw", "view", "timeline", "table", "main")
 
 
-def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_000) -> str:
+def render(
+    data: ReportData,
+    judged: AreaVerdict | None = None,
+    *,
+    max_points: int = 100_000,
+    max_frames: int = 30_000,
+) -> str:
     """Render the report as self-contained HTML in ASCII, which loads nothing from elsewhere.
 
     Parameters
     ----------
     data : ReportData
         What to show.
+    judged : AreaVerdict, optional
+        Verdict on it, if it is known already.
     max_points : int
         Maximum number of map points in the page.
     max_frames : int
@@ -38,7 +48,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
     sections_by_name = {
         "title": escape(data.title),
         "heading": sections.heading(data),
-        "verdict": sections.verdict_box(data),
+        "verdict": sections.verdict_box(judged or judge(data), Path(data.path)),
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data) + sections.control(data),

@@ -15,14 +15,23 @@ class NetworkState:
         Name of its run.
     bundle : str
         Folder of its exported bundle, relative to the area.
+    recipe : str
+        Recipe that it was trained by; empty if unknown.
     is_evaluated : bool
         Whether it was evaluated on the present data set since it was trained.
     has_bundle, is_exported : bool
-        Whether it was exported at all, and since it was trained.
+        Whether it was exported at all, and whether the bundle is of the present network.
+    has_landmarks : bool
+        Whether the bundle has landmarks, without which it gives no fixes.
+    is_measured : bool
+        Whether its fixes were measured with the present bundle.
     """
 
     name: str
     bundle: str
-    is_evaluated: bool
-    has_bundle: bool
-    is_exported: bool
+    recipe: str = ""
+    is_evaluated: bool = False
+    has_bundle: bool = False
+    is_exported: bool = False
+    has_landmarks: bool = False
+    is_measured: bool = False

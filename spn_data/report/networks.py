@@ -8,9 +8,8 @@ from html import escape
 
 from spn_data.report.data import MethodErrors, NetworkFacts, ReportData, RunFacts
 from spn_data.report.fix_facts import FixFigures
+from spn_data.report.run_verdict import SHORT_IMAGES
 
-# A training with fewer images is called short: two cores process several times as many in 30 minutes.
-SHORT_IMAGES = 30_000
 _ROLES = {"test": "test frames", "validation": "validation frames", "train": "training images"}
 _ORDER = tuple(_ROLES)
 _FIX_HEADER = (
@@ -142,9 +141,15 @@ def _group(name: str, role: str, runs: list[RunFacts]) -> str:
 
 
 def _fixes(run: RunFacts) -> str:
-    """Return the fixes of the bundle of a run, and what they mean for a flight."""
-    if not run.fixes.verdicts:
-        return ""
+    """Return the fixes of the bundle of a run; what they mean for a flight is in the verdict."""
+    if not run.fixes.rows:
+        reason = run.fixes.reason
+        return (
+            f'<p class="note warn">{escape(run.name)}: its fixes were not measured '
+            f"({escape(reason)}).</p>"
+            if reason
+            else ""
+        )
     rows = [
         (
             escape(one.flight),
@@ -160,13 +165,9 @@ def _fixes(run: RunFacts) -> str:
         )
         for one in run.fixes.rows
     ]
-    said = "".join(
-        f'<p class="note{"" if may_fly else " warn"}">{escape(text)}</p>'
-        for may_fly, text in run.fixes.verdicts
-    )
     return (
-        f"<h3>{escape(run.name)}: fixes of its bundle</h3>{said}"
-        + (_table(_FIX_HEADER, rows, "fixes") if rows else "")
+        f"<h3>{escape(run.name)}: fixes of its bundle</h3>"
+        + _table(_FIX_HEADER, rows, "fixes")
         + '<p class="note">Coarse: the network alone. Search: fixes of single images. Track: of the images '
         "one after the other. Misleading: published as usable and off by more than 0.5 m, 2&deg; or its "
         "protection level; in brackets the upper bound of its share, with 95 % confidence.</p>"

@@ -7,19 +7,30 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spn_data.report.network_state import NetworkState
-from spn_data.report.verdict import AreaVerdict, Level, VerdictReason
+from spn_data.report.run_verdict import RunVerdict
+from spn_data.report.verdict import DataVerdict, Level, VerdictReason
 
 _IN_AREA = "AREA/"  # in commands: the folder of the area
 
 
-def next_step(verdict: AreaVerdict, trained: Sequence[NetworkState]) -> VerdictReason:
+def next_step(
+    data: DataVerdict,
+    trained: Sequence[NetworkState],
+    judged: Sequence[RunVerdict],
+    *,
+    has_flights: bool = True,
+) -> VerdictReason:
     """Return the next step.
 
     Parameters
     ----------
-    verdict : AreaVerdict
+    data : DataVerdict
     trained : sequence of NetworkState
         Trained networks, the newest first.
+    judged : sequence of RunVerdict
+        Verdict on each of them.
+    has_flights : bool
+        Whether the area has an evaluation sequence, without which no fixes can be measured.
 
     Returns
     -------
@@ -27,23 +38,32 @@ def next_step(verdict: AreaVerdict, trained: Sequence[NetworkState]) -> VerdictR
         The first finding that has to be dealt with before training, otherwise the step that follows in the
         life of the newest network. Reservations stop nobody and keep their own remedies.
     """
-    for finding in verdict.findings:
+    for finding in data.findings:
         if finding.level is Level.STOP and (finding.do or finding.command):
             return finding
     if not trained:
         return VerdictReason(Level.GOOD, "", "Train a network", "spn-model train")
-    run = trained[0]
+    run, verdict = trained[0], judged[0]
     name = shlex.quote(run.name)
     if not run.is_exported:
         do = f"Export the network {run.name} with its landmarks"
         again = " --overwrite" if run.has_bundle else ""
         return VerdictReason(Level.GOOD, "", do, f"spn-model export --run {name}{again}")
-    if not run.is_evaluated:
+    if run.has_landmarks and not run.is_measured and not has_flights:
+        do = f"Register a flight of another day, on which the fixes of {run.name} can be measured"
+        return VerdictReason(Level.GOOD, "", do, "spn-data register VIDEO --name NAME")
+    if not run.is_evaluated or (run.has_landmarks and not run.is_measured):
         do = f"Evaluate the network {run.name} and its bundle on flights that it was not trained on"
         return VerdictReason(Level.GOOD, "", do, f"spn-model evaluate --run {name}")
-    bundle = f"{_IN_AREA}{run.bundle}"
+    poor = verdict.flight if run.has_landmarks else verdict.network
+    if poor.level is Level.STOP and poor.do:
+        return poor
+    bundle = shlex.quote(f"{_IN_AREA}{run.bundle}")
+    if not run.has_landmarks:
+        do = f"Estimate coarse poses of a recorded flight with the bundle of {run.name}"
+        return VerdictReason(Level.GOOD, "", do, f"spn-onboard {bundle} VIDEO --camera CAMERA.json")
     do = f"Fly a recorded flight with the bundle of {run.name}"
-    command = f"spn-onboard fly {shlex.quote(bundle)} VIDEO --camera CAMERA.json --to fixes.jsonl"
+    command = f"spn-onboard fly {bundle} VIDEO --camera CAMERA.json --to fixes.jsonl"
     return VerdictReason(Level.GOOD, "", do, command)
 
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from spn_data.report.area_verdict import DATA, AreaVerdict
 from spn_data.report.data import FAILED, STRATA, FrameTable, PlaceToFly, ReportData
 from spn_data.report.figures import format_value
-from spn_data.report.next_step import command_for, next_step
+from spn_data.report.next_step import command_for
 from spn_data.report.residual_map import residual_map
-from spn_data.report.verdict import Level, VerdictReason, verdict
+from spn_data.report.verdict import Level, VerdictReason
 from spn_data.split import audit
 from spn_data.split.groups import LEFT_OUT
 from spn_data.split.split_file import limitations
@@ -27,6 +28,7 @@ _MARKS = {
     Level.GOOD: ("&#10003;", "good"),
     Level.CAUTION: ("!", "caution"),
     Level.STOP: ("&#10005;", "stop"),
+    Level.UNKNOWN: ("?", "not measured"),
 }
 
 
@@ -40,16 +42,27 @@ def heading(data: ReportData) -> str:
     )
 
 
-def verdict_box(data: ReportData) -> str:
-    """Return the verdict, the next step, and the findings."""
-    judged, area = verdict(data), Path(data.path)
-    mark = _MARKS[judged.level][0]
-    step = next_step(judged, data.trained)
+def verdict_box(judged: AreaVerdict, area: Path) -> str:
+    """Return the verdict in its three parts, the next step, and the findings on the data."""
+    step = judged.next
+    parts = "".join(_part(name, found, area, step) for name, found in judged.parts())
     next_line = f'<p class="next"><b>Next:</b> {_what_to_do(step, area)}</p>'
-    findings = "".join(_finding(f, area, is_next=f is step) for f in judged.findings)
+    findings = "".join(_finding(f, area, is_next=f is step) for f in judged.data.findings)
     return (
-        f'<section id="verdict" class="{judged.level}"><h2><span class="mark">{mark}</span>'
-        f"{escape(judged.headline)}</h2>{next_line}<ul>{findings}</ul></section>"
+        f'<section id="verdict" class="{judged.data.level}">{parts}{next_line}'
+        f"<h3>Findings on the data</h3><ul>{findings}</ul></section>"
+    )
+
+
+def _part(name: str, found: VerdictReason, area: Path, step: VerdictReason) -> str:
+    """Return a part of the verdict: a headline for the data, a line for each network."""
+    mark, word = _MARKS[found.level]
+    do = "" if found is step else _what_to_do(found, area)
+    text = f"<b>{name}</b> {escape(found.text)}{f' <em>{do}</em>' if do else ''}"
+    kind = "h2" if name == DATA else "p"
+    return (
+        f'<{kind} class="part {found.level}"><span class="mark" title="{word}">{mark}</span>'
+        f"<span>{text}</span></{kind}>"
     )
 
 

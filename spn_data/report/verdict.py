@@ -1,4 +1,4 @@
-"""Verdict on an area: whether it is ready for training, why, and what to do next (see docs/report.md)."""
+"""Verdict on the data of an area: whether they are ready for training, and why (see docs/report.md)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from spn_data.report.data import STRATA, CoverageFacts, ReportData
 from spn_data.split import audit
 from spn_data.split.groups import OPTIMISTIC, TRAIN, VALIDATION
 
+_FAR = "It is declared to be far from the map (expect_low in area.toml)."
+
 
 class Level(StrEnum):
     """Severity of a finding."""
@@ -18,6 +20,7 @@ class Level(StrEnum):
     GOOD = "good"
     CAUTION = "caution"
     STOP = "stop"
+    UNKNOWN = "unknown"  # not measured
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,8 @@ class VerdictReason:
 
 
 @dataclass(frozen=True)
-class AreaVerdict:
-    """Verdict on an area.
+class DataVerdict:
+    """Verdict on the data of an area.
 
     Attributes
     ----------
@@ -65,8 +68,8 @@ class VerdictLimits:
     min_training_frames: int = 100
 
 
-def verdict(data: ReportData, limits: VerdictLimits | None = None) -> AreaVerdict:
-    """Judge an area by the rules of docs/report.md.
+def judge_data(data: ReportData, limits: VerdictLimits | None = None) -> DataVerdict:
+    """Judge the data of an area by the rules of docs/report.md.
 
     Parameters
     ----------
@@ -77,7 +80,7 @@ def verdict(data: ReportData, limits: VerdictLimits | None = None) -> AreaVerdic
 
     Returns
     -------
-    AreaVerdict
+    DataVerdict
         Verdict and findings, worst first.
     """
     limits = limits or VerdictLimits()
@@ -85,6 +88,7 @@ def verdict(data: ReportData, limits: VerdictLimits | None = None) -> AreaVerdic
         *_stages(data),
         *_map(data, limits),
         *_place(data, limits),
+        *_declared(data),
         *_evaluation(data, limits),
         *_coverage(data, limits),
         *_split(data, limits),
@@ -96,10 +100,10 @@ def verdict(data: ReportData, limits: VerdictLimits | None = None) -> AreaVerdic
     n = sum(finding.level == level for finding in found)
     headline = {
         Level.GOOD: "Ready to train",
-        Level.CAUTION: f"Ready to train, with {_count(n, 'reservation')}",
-        Level.STOP: f"Not ready to train: {_count(n, 'thing')} to do first",
+        Level.CAUTION: f"Ready to train, with {count_of(n, 'reservation')}",
+        Level.STOP: f"Not ready to train: {count_of(n, 'thing')} to do first",
     }[level]
-    return AreaVerdict(level, headline, tuple(found))
+    return DataVerdict(level, headline, tuple(found))
 
 
 def _stages(data: ReportData) -> Iterator[VerdictReason]:
@@ -200,6 +204,17 @@ def _place(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
         )
 
 
+def _declared(data: ReportData) -> Iterator[VerdictReason]:
+    unknown = sorted(data.expect_low - set(data.evaluation_sequences))
+    if unknown:
+        yield VerdictReason(
+            Level.CAUTION,
+            f"area.toml expects low coverage of {', '.join(unknown)}, which is no evaluation sequence of the "
+            "area: the declaration has no effect.",
+            "Correct expect_low in area.toml, or register the sequence",
+        )
+
+
 def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
     frames = data.frames
     for name in data.evaluation_sequences:
@@ -209,7 +224,12 @@ def _evaluation(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReas
             continue
         share = registered / total
         text = f"Evaluation sequence {name}: {registered:,} of {total:,} frames have a pose ({share:.0%})"
-        if registered == 0:
+        if name in data.expect_low:
+            nothing = "; nothing can be tested on it" if registered == 0 else ""
+            yield VerdictReason(
+                Level.CAUTION if nothing else Level.GOOD, f"{text}{nothing}. {_FAR}"
+            )
+        elif registered == 0:
             yield VerdictReason(
                 Level.STOP,
                 text + ". It shows another place, or the map does not cover its views.",
@@ -269,35 +289,37 @@ def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason
         )
     if data.coverage is not None:
         for name in sorted(data.coverage.strata):
-            yield from _strata(f"sequence {name}", name, data.coverage, limits)
+            is_far = name in data.expect_low
+            yield from _strata(f"sequence {name}", name, data.coverage, limits, is_far=is_far)
         yield from _stale(data.coverage, "Coverage", "spn-data coverage")
     if data.plan is not None:
         for name in sorted(data.plan.strata):
-            yield from _strata("the planned waypoints", name, data.plan, limits)
+            yield from _strata("the planned waypoints", name, data.plan, limits, is_far=False)
         command = "spn-data coverage --waypoints FILE.csv"
         yield from _stale(data.plan, "Coverage of the planned waypoints", command)
 
 
 def _strata(
-    what: str, name: str, coverage: CoverageFacts, limits: VerdictLimits
+    what: str, name: str, coverage: CoverageFacts, limits: VerdictLimits, *, is_far: bool
 ) -> Iterator[VerdictReason]:
     counts = coverage.strata[name]
     total = sum(counts.get(stratum, 0) for stratum in STRATA)
     if not total:
         return
     share = counts.get("low", 0) / total
-    if share > limits.max_low_share:
+    if share > limits.max_low_share and not is_far:
         again = len(coverage.fly_again)
         yield VerdictReason(
             Level.CAUTION,
             f"{share:.0%} of the views of {what} have no mapping frame nearby: a network has to "
             "extrapolate there.",
-            f"Fly the {_count(again, 'place')} listed below and add the flight" if again else "",
+            f"Fly the {count_of(again, 'place')} listed below and add the flight" if again else "",
             "spn-data reconstruct VIDEO --add",
         )
     else:
         parts = ", ".join(f"{counts.get(s, 0) / total:.0%} {s}" for s in STRATA)
-        yield VerdictReason(Level.GOOD, f"Coverage of {what} by mapping frames: {parts}.")
+        why = f" {_FAR}" if is_far else ""
+        yield VerdictReason(Level.GOOD, f"Coverage of {what} by mapping frames: {parts}.{why}")
 
 
 def _stale(coverage: CoverageFacts, what: str, command: str) -> Iterator[VerdictReason]:
@@ -319,7 +341,7 @@ def _split(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason]:
         return
     counts = data.split.counts()
     train = counts.get(TRAIN, 0)
-    text = f"{_count(train, 'training frame')}, {_count(counts.get(VALIDATION, 0), 'validation frame')}"
+    text = f"{count_of(train, 'training frame')}, {count_of(counts.get(VALIDATION, 0), 'validation frame')}"
     if train == 0:
         yield VerdictReason(
             Level.STOP,
@@ -366,8 +388,9 @@ def _audit(data: ReportData) -> Iterator[VerdictReason]:
         elif check.verdict is audit.AuditVerdict.NOTICE and check.text != OPTIMISTIC:
             yield VerdictReason(Level.CAUTION, f"Audit, {check.check}: {check.text}.")
     if not audit.has_failed(data.audit):
-        yield VerdictReason(Level.GOOD, f"The audit passed ({_count(len(data.audit), 'check')}).")
+        yield VerdictReason(Level.GOOD, f"The audit passed ({count_of(len(data.audit), 'check')}).")
 
 
-def _count(n: int, what: str) -> str:
+def count_of(n: int, what: str) -> str:
+    """Return a number of things in words."""
     return f"{n:,} {what}{'' if n == 1 else 's'}"

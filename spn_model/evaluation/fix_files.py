@@ -1,4 +1,4 @@
-"""Fixes of a run as `fixes` of metrics.json, fixes.csv, figures, and what they mean for a flight."""
+"""Fixes of a run as `fixes` of metrics.json, as fixes.csv, and as rows of a table."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from spn_data.dataset.hdf5_schema import Role
 from spn_data.storage.files import write_csv
 from spn_data.storage.json_files import number_or
-from spn_model.evaluation.evaluate import EvaluatedGroup
 from spn_model.evaluation.fixes import (
-    COARSE,
     CONFIDENCE,
     MISLEADING_DEG,
     MISLEADING_M,
@@ -27,23 +24,6 @@ FIX_COLUMNS = (
     *("error", "error_deg", "error_horizontal", "error_vertical"),
     *("protection_horizontal", "protection_vertical", "nees", "misleading"),
 )
-LEAST_USABLE = 0.5  # share of usable fixes below which a flight is not to be flown on them
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """What a measurement means for a flight.
-
-    Attributes
-    ----------
-    may_fly : bool
-        False for what speaks against a flight.
-    text : str
-        One sentence.
-    """
-
-    may_fly: bool
-    text: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,7 +47,7 @@ class RunFixes:
     reason: str = ""
     notes: tuple[str, ...] = ()
 
-    def to_json(self, verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for metrics.json; unknown numbers are NaN."""
         flights: dict[str, dict[str, Any]] = {}
         for one in self.flights:
@@ -82,79 +62,7 @@ class RunFixes:
                 "confidence": CONFIDENCE,
             },
             "flights": flights,
-            "verdict": [asdict(one) for one in verdicts],
         }
-
-
-def verdicts_of(
-    run: str, fixes: RunFixes, groups: Sequence[EvaluatedGroup], unit: str
-) -> tuple[Verdict, ...]:
-    """Return what the fixes and the coarse poses of a run mean for a flight.
-
-    Parameters
-    ----------
-    run : str
-        Its name, as that of its method in the groups.
-    fixes : RunFixes
-    groups : sequence of EvaluatedGroup
-    unit : str
-        Of positions.
-
-    Returns
-    -------
-    tuple of Verdict
-    """
-    found = []
-    if not fixes.flights:
-        found.append(
-            Verdict(
-                may_fly=False,
-                text=f"{run} is not to be flown: its fixes were not measured ({fixes.reason}).",
-            )
-        )
-    for one in fixes.flights:
-        if one.method != COARSE:
-            found.append(_of_fixes(run, one))
-    for group in groups:
-        worse = _worse_than_retrieval(run, group, unit)
-        if group.role is Role.TEST and worse:
-            found.append(Verdict(may_fly=False, text=worse))
-    return tuple(found)
-
-
-def _of_fixes(run: str, one: FlightFixes) -> Verdict:
-    summary, what = one.summary(), f"{one.method} on {one.flight}"
-    if summary.misleading:
-        return Verdict(
-            may_fly=False,
-            text=f"{run} is not to be flown: {summary.misleading} of {summary.compared} fixes are misleading "
-            f"({what}).",
-        )
-    if not summary.compared or summary.usable < LEAST_USABLE * summary.images:
-        return Verdict(
-            may_fly=False,
-            text=f"{run} is not to be flown where these images are: {summary.usable} of {summary.images} "
-            f"have a usable fix ({what}).",
-        )
-    return Verdict(
-        may_fly=True,
-        text=f"Fixes of {run} can be used: {summary.usable} of {summary.images} images, "
-        f"{100 * summary.error_m:.1f} cm, {summary.error_deg:.2f} deg, none misleading ({what}).",
-    )
-
-
-def _worse_than_retrieval(run: str, group: EvaluatedGroup, unit: str) -> str:
-    """Return that coarse poses of the network are worse than those of the most similar image, or nothing."""
-    by = {one.method: one.summary for one in group.evaluations}
-    own, other = by.get(run), by.get(group.retrieval or "")
-    if own is None or other is None or own.position.median <= other.position.median:
-        return ""
-    median = own.position.median
-    off = f"{median:.2f} {unit}" if math.isfinite(median) else "no pose for half of the frames"
-    return (
-        f"Coarse poses of {run} alone are not to be flown: on {group.frames.group} they are worse than "
-        f"those of the most similar image ({off} against {other.position.median:.2f} {unit}, medians)."
-    )
 
 
 def write_fixes(path: Path, flights: Sequence[FlightFixes]) -> None:

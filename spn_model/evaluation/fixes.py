@@ -14,7 +14,7 @@ from spn_data.errors import StageError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
-from spn_model.integrity.fix import Fix, NoFix
+from spn_model.integrity.fix import Fix, FixSource, NoFix
 from spn_model.onboard.flight_report import longest_outage
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.pilot import Pilot, PilotOptions
@@ -106,6 +106,8 @@ class FixSummary:
         Share with errors within the protection levels; NaN for coarse poses.
     longest_outage_s : float
         Longest time without a usable fix; NaN where images do not follow each other.
+    from_network : int
+        Usable fixes that were searched for around the pose of the network, not by landmarks alone.
     """
 
     images: int
@@ -119,6 +121,7 @@ class FixSummary:
     nees: float
     protected: float
     longest_outage_s: float
+    from_network: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,6 +162,7 @@ class FlightFixes:
             )
             if self.method == TRACK
             else math.nan,
+            from_network=sum(image.source == FixSource.NETWORK.value for image in self.images),
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spn_data.errors import InputError
@@ -16,6 +16,9 @@ from spn_model.pretrained.weights import by_name
 if TYPE_CHECKING:
     from spn_model.export.bundle_checks import GroupErrors
     from spn_model.export.exported import ExportedBundle
+
+_VERDICT = "Verdict"  # title of its section
+_NOT_JUDGED = "Not judged yet: run `spn-model evaluate`, which completes this card."
 
 
 def model_card(
@@ -68,6 +71,8 @@ def model_card(
                 for p, size in made.bytes.items()
             ),
         ),
+        f"## {_VERDICT}",
+        _NOT_JUDGED,
         "## Errors",
         *_error_section(metrics, str(facts.get("run", "")), unit, facts.get("trained_on", ())),
         "## Fixes",
@@ -100,8 +105,17 @@ def card_with_metrics(
     metrics : as in metrics.json. trained_on : groups that the network was trained on.
     """
     unit = _unit(metrics["units"])
+    card = _with_section(card, _VERDICT, [_NOT_JUDGED])
     card = _with_section(card, "Errors", _error_section(metrics, run, unit, trained_on))
     return _with_section(card, "Fixes", fix_section(metrics["fixes"]))
+
+
+def card_with_verdict(card: str, parts: Iterable[tuple[str, str]]) -> str:
+    """Return a model card with the verdict on its area: parts by name, one sentence or two each."""
+    if f"## {_VERDICT}\n\n" not in card:  # of an earlier version
+        card = card.replace("## Errors\n\n", f"## {_VERDICT}\n\n{_NOT_JUDGED}\n\n## Errors\n\n", 1)
+    lines = (f"{name}: {' '.join(text.split())}" for name, text in parts)
+    return _with_section(card, _VERDICT, [_list(*lines)])
 
 
 def _with_section(card: str, title: str, parts: Sequence[str]) -> str:
@@ -131,7 +145,6 @@ def fix_section(fixes: Mapping[str, Any] | None) -> list[str]:
         "images one after the other. Misleading is a usable fix that is off by more than 0.5 m, 2 degrees or "
         "its protection level; in brackets the upper bound of its share, with 95 % confidence.",
         _table(FIX_HEADER, fix_rows(fixes["flights"])),
-        _list(*(one["text"] for one in fixes["verdict"])),
     ]
 
 

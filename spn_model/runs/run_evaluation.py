@@ -16,7 +16,7 @@ from spn_data.work.timing import Progress
 from spn_model.evaluation.comparison_files import network_facts, select_network, write_comparison
 from spn_model.evaluation.evaluate import EvaluateOptions, NetworkComparison, compare
 from spn_model.evaluation.fix_figures import stanford_diagrams
-from spn_model.evaluation.fix_files import RunFixes, Verdict, verdicts_of, write_fixes
+from spn_model.evaluation.fix_files import RunFixes, write_fixes
 from spn_model.export.model_card import card_with_metrics
 from spn_model.models.checkpoint import load
 from spn_model.onboard.bundle import CARD
@@ -46,11 +46,6 @@ class EvaluatedRuns:
     comparison: NetworkComparison
     facts: Mapping[str, Mapping[str, Any]]
     fixes: Mapping[str, RunFixes]
-
-    def verdicts(self, run: str) -> tuple[Verdict, ...]:
-        """Return what was measured of a run means for a flight."""
-        unit = "m" if self.comparison.units == "m" else "model units"
-        return verdicts_of(run, self.fixes[run], self.comparison.groups, unit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +164,7 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
         if fixes.flights:
             write_fixes(run.fixes, fixes.flights)
         drawings = {**figures[run.name], **stanford_diagrams(fixes.flights)}
-        document = fixes.to_json(evaluated.verdicts(run.name))
+        document = fixes.to_json()
         _write(run, select_network(comparison, run.name), own, drawings, document)
         if run.bundle.exists():
             try:

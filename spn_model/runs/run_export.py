@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 from spn_data.area.names import GEO, MODEL
 from spn_data.errors import FormatError
 from spn_data.inputs.landmark_source import LandmarkSource
+from spn_data.storage.files import write_atomically
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, load_json
 from spn_data.work.timing import Progress
 from spn_model.export.bundle_checks import BundleOptions
 from spn_model.export.bundle_export import export, is_up_to_date
 from spn_model.export.exported import ExportedBundle
-from spn_model.export.model_card import fix_section
+from spn_model.export.model_card import card_with_verdict, fix_section
 from spn_model.models.checkpoint import load
+from spn_model.onboard.bundle import CARD
 from spn_model.runs.run_files import RunFiles
 
 
@@ -108,6 +111,33 @@ def export_run(
     return ExportedRun(
         folder=folder, bundle=bundle, is_evaluated=metrics is not None, notes=tuple(notes)
     )
+
+
+def write_verdict(folder: Path, parts: Iterable[tuple[str, str]]) -> None:
+    """Write the verdict on the area into the model card of a bundle.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the bundle.
+    parts : iterable of (str, str)
+        Name of each part, and what is said.
+
+    Raises
+    ------
+    FormatError
+        If the card cannot be read.
+    StageError
+        If it cannot be written.
+    """
+    card = folder / CARD
+    try:
+        text = card.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"{card}: cannot be read ({error!r:.200})") from error
+    changed = card_with_verdict(text, parts)
+    if changed != text:
+        write_atomically(card, changed)
 
 
 def _read_metrics(run: RunFiles, fingerprint: str) -> tuple[dict[str, Any] | None, list[str]]:

@@ -121,5 +121,7 @@ def test_a_bundle_of_an_earlier_network_is_refused(area, tmp_path):
     assert "the bundle is of an earlier network of this run" in refused.output
     shown = run(model_main, *words, "--no-baselines")
     assert shown.exit_code == 0, shown.output
-    assert "is not to be flown: its fixes were not measured" in shown.output
+    assert (
+        "The fixes of default are not measured: the bundle is of an earlier network" in shown.output
+    )
     assert not (other / "runs" / "default" / "fixes.csv").exists()

@@ -66,7 +66,9 @@ def test_the_page_holds_what_the_area_holds(area):
 def test_the_command_tells_the_verdict(area):
     """The verdict of the page and the next step are also printed."""
     ran = run(area)
-    assert "Not ready to train: 1 thing to do first: see" in ran.output
+    assert "Data: Not ready to train: 1 thing to do first: see" in ran.output
+    assert "Network: Not measured: no network is trained." in ran.output
+    assert "Flight: Not measured: no bundle is exported." in ran.output
     assert ran.output.endswith(f"Next: Split the frames: spn-data split --area {area}\n")
 
 

@@ -16,7 +16,7 @@ from spn_data.report.pack import pack, script_json
 from spn_data.report.residual_map import residual_map, round_down
 from spn_data.report.scene import display_of, thin_points
 from spn_data.report.thinning import thin_frames
-from spn_data.report.verdict import Level, VerdictLimits, verdict
+from spn_data.report.verdict import Level, VerdictLimits, judge_data
 from spn_data.split import audit
 from tests.worlds.report_data import area, flight, points, record, unpack
 
@@ -37,7 +37,7 @@ def with_counts(data: ReportData, **counts: object) -> ReportData:
 
 def test_an_area_with_everything_is_ready():
     """The complete synthetic area is judged ready at the top of the page, without adverse findings."""
-    found = verdict(area())
+    found = judge_data(area())
     assert [f for f in found.findings if f.level is not Level.GOOD] == []
     assert found.headline == "Ready to train"
     html = render(area())
@@ -190,19 +190,46 @@ RULES = {
 def test_each_rule_of_the_verdict(name):
     """Each single defect gives one finding of its weight, which decides the verdict and comes first."""
     change, level, text = RULES[name]
-    found = verdict(change(area()))
+    found = judge_data(change(area()))
     bad = [f for f in found.findings if f.level is not Level.GOOD]
     assert len(bad) == 1
     assert found.findings[0].level is found.level is level
     assert text in found.findings[0].text
 
 
+def test_a_flight_declared_far_from_the_map_is_no_reservation():
+    """Few poses and low coverage of a declared flight are said with the declaration, and reserve nothing."""
+    poor = replace(area(), frames=of_evaluation(21), coverage=LOW)
+    assert judge_data(poor).headline == "Ready to train, with 2 reservations"
+    found = judge_data(replace(poor, expect_low=frozenset({"medium"})))
+    assert found.headline == "Ready to train"
+    said = [f.text for f in found.findings if "declared to be far" in f.text]
+    assert len(said) == 2
+    assert "19 of 40 frames have a pose" in said[0]
+    assert "38% low" in said[1]
+
+
+@pytest.mark.parametrize(
+    ("failed", "declared", "words"),
+    [
+        (40, "medium", "0 of 40 frames have a pose (0%); nothing can be tested on it"),
+        (2, "lo", "low coverage of lo, which is no evaluation sequence"),
+    ],
+)
+def test_a_declaration_that_hides_everything_or_nothing_is_a_reservation(failed, declared, words):
+    """A declared flight without a pose tests nothing, and a declared name without a flight does nothing."""
+    data = replace(area(), frames=of_evaluation(failed), expect_low=frozenset({declared}))
+    found = judge_data(data)
+    assert found.headline == "Ready to train, with 1 reservation"
+    assert words in found.findings[0].text
+
+
 def test_few_training_frames_are_a_reservation():
     """93 training frames are fewer than 100 and give a reservation; 143 give none."""
-    found = verdict(area(cameras=100))
+    found = judge_data(area(cameras=100))
     assert found.headline == "Ready to train, with 1 reservation"
     assert "93 training frames" in found.findings[0].text
-    assert verdict(area(cameras=150)).level is Level.GOOD
+    assert judge_data(area(cameras=150)).level is Level.GOOD
 
 
 def test_limits_of_the_verdict_are_documented():

@@ -9,12 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spn_data.dataset.hdf5_schema import Role
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rotations import rotations_from_angles
-from spn_model.evaluation.evaluate import EvaluatedGroup
 from spn_model.evaluation.fix_figures import stanford_diagrams
-from spn_model.evaluation.fix_files import RunFixes, fix_rows, verdicts_of, write_fixes
+from spn_model.evaluation.fix_files import RunFixes, fix_rows, write_fixes
 from spn_model.evaluation.fixes import (
     COARSE,
     SEARCH,
@@ -24,9 +22,7 @@ from spn_model.evaluation.fixes import (
     fix_error,
     largest_share,
 )
-from spn_model.evaluation.metrics import Estimates as MethodEstimates
-from spn_model.evaluation.metrics import evaluate, evaluation_frames
-from spn_model.export.model_card import card_with_metrics
+from spn_model.export.model_card import card_with_metrics, card_with_verdict
 from spn_model.integrity.fix import Fix, FixSource, FixState
 
 SIGMA = np.array([0.01, 0.01, 0.02, 1e-3, 1e-3, 1e-3])
@@ -129,56 +125,7 @@ def test_a_flight_is_summarized():
     assert math.isnan(empty.error_m)
 
 
-def group(network_m: float, retrieval_m: float) -> EvaluatedGroup:
-    """Return a test group of which a network and retrieval are off by so much."""
-    truth = Poses.concatenate([TRUTH] * 3)
-    frames = evaluation_frames("low", np.array(["a", "b", "c"]), np.array([""] * 3), truth, truth)
-    estimates = tuple(
-        MethodEstimates(name, truth.moved_by([off, 0, 0]))
-        for name, off in (("first", network_m), ("retrieval", retrieval_m))
-    )
-    judged = tuple(evaluate(one, frames) for one in estimates)
-    return EvaluatedGroup(Role.TEST, frames, estimates, judged, "retrieval")
-
-
 GOOD = FlightFixes(flight="low", method=SEARCH, images=images(fix(off_m=(0.02, 0, 0)), None, fix()))
-
-
-@pytest.mark.parametrize(
-    ("fixes", "network_m", "may_fly", "words"),
-    [
-        (
-            RunFixes(flights=(GOOD,)),
-            1.0,
-            [True],
-            "Fixes of first can be used: 2 of 3 images, 1.0 cm",
-        ),
-        (
-            RunFixes(flights=(GOOD,)),
-            9.0,
-            [True, False],
-            "alone are not to be flown: on low they are",
-        ),
-        (RunFixes(reason="no bundle"), 1.0, [False], "its fixes were not measured (no bundle)"),
-        (
-            RunFixes(flights=(replace(GOOD, images=images(fix(), None, None)),)),
-            1.0,
-            [False],
-            "1 of 3 have a usable fix (search on low)",
-        ),
-        (
-            RunFixes(flights=(replace(GOOD, images=images(fix(turn_deg=3), fix())),)),
-            1.0,
-            [False],
-            "is not to be flown: 1 of 2 fixes are misleading (search on low)",
-        ),
-    ],
-)
-def test_what_speaks_against_a_flight_is_said(fixes, network_m, may_fly, words):
-    """Missing, misleading and few fixes, and coarse poses worse than retrieval, are named."""
-    found = verdicts_of("first", fixes, [group(network_m, 5.0)], "m")
-    assert [one.may_fly for one in found] == may_fly
-    assert words in " ".join(one.text for one in found)
 
 
 def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
@@ -201,7 +148,7 @@ def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
 def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     """Sections on errors and fixes are replaced, the others stay; a card without sections is unchanged."""
     fixes = RunFixes(flights=(GOOD,))
-    document = fixes.to_json(verdicts_of("first", fixes, [group(9.0, 5.0)], "m"))
+    document = fixes.to_json()
     metrics = {"units": "m", "groups": {}, "fixes": document}
     card = "# first\n\n## Errors\n\nold\n\n## Fixes\n\nold\n\n## Limits\n\nnone\n"
     made = card_with_metrics(card, metrics, run="first", trained_on=())
@@ -209,6 +156,18 @@ def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     assert made.startswith("# first\n\n## Errors\n\nMeasured by")
     assert made.endswith("\n\n## Limits\n\nnone\n")
     assert "| low | search | 2 of 3 | 1.0 cm, 0.00 deg | 0 (<= 77.6 %) |" in made
-    assert "- Coarse poses of first alone are not to be flown" in made
     assert len(fix_rows(document["flights"])) == 1
     assert card_with_metrics("# other\n", metrics, run="first", trained_on=()) == "# other\n"
+
+
+def test_the_card_of_a_bundle_gets_the_verdict_until_the_next_evaluation():
+    """The verdict is a section of its own, also in an older card; new errors make it unknown again."""
+    card = "# first\n\n## Errors\n\nold\n\n## Fixes\n\nold\n\n## Limits\n\nnone\n"
+    made = card_with_verdict(card, [("Data", "Ready to train."), ("Flight", "Do not\n\n## fly.")])
+    verdict = (
+        "## Verdict\n\n- Data: Ready to train.\n- Flight: Do not ## fly.\n\n## Errors\n\nold\n\n"
+    )
+    assert f"# first\n\n{verdict}## Fixes" in made
+    metrics = {"units": "m", "groups": {}, "fixes": RunFixes(flights=(GOOD,)).to_json()}
+    later = card_with_metrics(made, metrics, run="first", trained_on=())
+    assert "## Verdict\n\nNot judged yet: run `spn-model evaluate`" in later
