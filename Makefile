@@ -24,7 +24,7 @@ demo: $(VENV)/installed
 	$(BIN)/spn-data simulate $(DEMO)/flights --preset demo --seed 1
 	$(BIN)/spn-data reconstruct $(DEMO)/flights/mapping --area $(DEMO)/area --fov 72
 	$(BIN)/spn-data register $(DEMO)/flights/evaluation/medium.mp4 --name medium --all-frames --area $(DEMO)/area
-	$(BIN)/spn-data register $(DEMO)/flights/evaluation/low.mp4 --name low --all-frames --area $(DEMO)/area
+	$(BIN)/spn-data register $(DEMO)/flights/evaluation/low.mp4 --name low --expect-low --all-frames --area $(DEMO)/area
 	$(BIN)/spn-data register --all-frames --area $(DEMO)/area
 	$(BIN)/spn-data coverage --area $(DEMO)/area
 	$(BIN)/spn-data split --area $(DEMO)/area

@@ -9,7 +9,10 @@ from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
+import click
 import pytest
+from spn_cli.data import main as data_main
+from spn_cli.model import main as model_main
 
 from spn_data import errors
 from spn_data.area.names import STAGES
@@ -274,3 +277,54 @@ def test_options_of_the_choice_of_frames_are_documented_with_their_defaults():
             assert default == (None if value == "none" else float(value.strip(" m"))), name
     blur = f"below {SelectionOptions().blur_ratio:g} of their median, a frame is blurred"
     assert blur in " ".join(text.split())
+
+
+def options_of(command: click.Command) -> set[str]:
+    """Return the options of a command, those of its subcommands included."""
+    found = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+    return found.union(*(options_of(each) for each in getattr(command, "commands", {}).values()))
+
+
+def test_options_in_the_docs_exist():
+    """Every `--option` in the docs is one of our programs, unless its line is about another program."""
+    known = {"--help", "--version"} | options_of(data_main) | options_of(model_main)
+    for folder in (
+        "spn_model/onboard",
+        "spn_model/autopilot",
+        "benchmarks",
+        "tools",
+        "faults",
+        "fuzz",
+    ):
+        for path in (ROOT / folder).glob("*.py"):
+            known |= set(re.findall(r'"(--[a-z0-9-]+)"', path.read_text(encoding="utf-8")))
+    others = re.compile(r"\b(dask|pyproj|torchrun|pip|pytest|git|ruff|docker)\b")
+    unknown = [
+        f"{path.name}:{number}: {option}"
+        for path in PAGES
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if not others.search(line)
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", line)
+        if option not in known
+    ]
+    assert unknown == []
+
+
+def test_options_of_commands_in_the_docs_are_theirs():
+    """In an example of `spn-data X` or `spn-model X`, each option is one of that command."""
+    wrong, seen = [], 0
+    for path in PAGES:
+        text = re.sub(r"\\\n\s*", " ", path.read_text(encoding="utf-8"))
+        for program, name, rest in re.findall(
+            r"\b(spn-data|spn-model) ([a-z-]+)([^`\n|&;#]*)", text
+        ):
+            group = data_main if program == "spn-data" else model_main
+            if name not in group.commands:
+                wrong.append(f"{path.name}: {program} {name}")
+                continue
+            for option in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", rest):
+                seen += 1
+                if option not in {"--help", *options_of(group.commands[name])}:
+                    wrong.append(f"{path.name}: {program} {name} {option}")
+    assert seen > 50
+    assert wrong == []

@@ -58,6 +58,14 @@ _SHOWN_STOPS = 20
     show_default=True,
     help="Share of the limits used for planning; the rest is a margin for inexact flying.",
 )
+@click.option(
+    "--floor",
+    "floor_m",
+    type=options.Finite(0, 1000),
+    default=2.0,
+    show_default=True,
+    help="Least height of these places above the ground, in metres.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace the file of --fly-again if it exists.")
 def coverage(
     area_folder: Path,
@@ -86,7 +94,9 @@ def coverage(
         raise click.UsageError("give either --camera or --fov")
     wanted = CoverageStageOptions(
         coverage=_strata(chosen["high"], chosen["medium"]),
-        refly=ReflyOptions(wanted=Stratum(chosen["wanted"]), margin=chosen["margin"]),
+        refly=ReflyOptions(
+            wanted=Stratum(chosen["wanted"]), margin=chosen["margin"], floor_m=chosen["floor_m"]
+        ),
         camera=None if camera_file is None else read_camera(camera_file),
         fov_deg=fov_deg,
     )

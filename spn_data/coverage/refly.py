@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from spn_data.coverage.nearest_frame import CoverageOptions, Stratum, distances_and_angles
 from spn_data.geometry.pose import Poses
@@ -16,6 +17,10 @@ from spn_data.geometry.rotations import (
 
 _ALIKE = 0.25  # share of the limits within which a query is represented by another candidate
 _MAX_PASSES = 20  # of 2-opt
+_AROUND_M = (3.0, 10.0)  # horizontally, in which points show the ground
+_ENOUGH, _LOW_PERCENT = 20, 5
+_OBSTACLE = 3  # map points within the clearance; single ones may be wrong
+_MAX_RAISED = 10  # steps
 _MAX_SHORTENED = 400  # stops; longer paths keep the nearest-neighbour order without 2-opt
 
 
@@ -29,10 +34,16 @@ class ReflyOptions:
         Stratum each query should reach, HIGH or MEDIUM.
     margin : float
         Share of the stratum's limits used for planning; the rest allows for the error of flying there.
+    floor_m : float
+        Least height of a stop above the map points below it.
+    clearance_m : float
+        Least distance of a stop to map points.
     """
 
     wanted: Stratum = Stratum.HIGH
     margin: float = 0.7
+    floor_m: float = 2.0
+    clearance_m: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +59,16 @@ class ReflightPlan:
     serves : ndarray of int, shape (K,)
         Number of queries for which each stop is the nearest.
     query_stop : ndarray of int, shape (N,)
-        Stop that serves each query; -1 for queries that need none.
+        Stop that serves each query; -1 for queries that need none, or that no stop can serve.
+    out_of_reach : int
+        Number of queries that need a stop where none may be: too low, or too near to map points.
     """
 
     poses: Poses
     angles_deg: np.ndarray
     serves: np.ndarray
     query_stop: np.ndarray
+    out_of_reach: int = 0
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -65,6 +79,8 @@ def plan_reflight(
     strata: np.ndarray,
     options: CoverageOptions | None = None,
     refly: ReflyOptions | None = None,
+    *,
+    map_xyz: np.ndarray | None = None,
 ) -> ReflightPlan:
     """Plan poses at which mapping frames bring every query to the wanted stratum.
 
@@ -77,17 +93,20 @@ def plan_reflight(
     options : CoverageOptions, optional
         Limits of the strata and the metric.
     refly : ReflyOptions, optional
-        Target coverage.
+        Target coverage, and where stops may be.
+    map_xyz : ndarray, shape (P, 3), optional
+        Map points: the ground and the obstacles. Without them, stops may be anywhere.
 
     Returns
     -------
     ReflightPlan
-        Stops and their assignment to the queries; no stops if all queries are covered.
+        Stops and their assignment to the queries; no stops if all queries are covered, or out of reach.
 
     Notes
     -----
     Candidates are poses of the queries, with the roll removed unless it exceeds a small part of the limit.
-    They are chosen by greedy set cover (Chvatal 1979), after which redundant stops are removed.
+    Those below the floor or too near to map points are raised, as far as they then still serve a query. They
+    are chosen by greedy set cover (Chvatal 1979), after which redundant stops are removed.
     """
     options, refly = options or CoverageOptions(), refly or ReflyOptions()
     limit, limit_deg = (refly.margin * value for value in options.limits(refly.wanted))
@@ -97,19 +116,61 @@ def plan_reflight(
     uncovered = np.flatnonzero(~np.isin(strata, list(enough)))
     left = queries[uncovered]
     candidates = _level(left[_thin_out(left, _ALIKE * limit, _ALIKE * limit_deg)], limit_deg)
-    chosen = candidates[_set_cover(_within(candidates, left, limit, limit_deg))]
+    if map_xyz is not None and len(map_xyz):
+        candidates = _free(candidates, map_xyz, refly, limit)
+    covers = _within(candidates, left, limit, limit_deg)
+    served = covers.any(axis=0)
+    chosen = candidates[_set_cover(covers[:, served])]
     chosen = chosen[_path(chosen, options.deg_per_m)]
     stop = np.full(len(queries), -1, dtype=np.int64)
     if len(chosen):
         within = _within(chosen, left, limit, limit_deg)
         cost = np.where(within, _costs(chosen, left, options.deg_per_m), np.inf)
-        stop[uncovered] = cost.argmin(axis=0)
+        stop[uncovered[served]] = cost[:, served].argmin(axis=0)
     return ReflightPlan(
         poses=chosen,
         angles_deg=angles_from_rotations(chosen.rotations),
-        serves=np.bincount(stop[uncovered], minlength=len(chosen)),
+        serves=np.bincount(stop[uncovered[served]], minlength=len(chosen)),
         query_stop=stop,
+        out_of_reach=int((~served).sum()),
     )
+
+
+def reach_notes(plan: ReflightPlan, refly: ReflyOptions) -> tuple[str, ...]:
+    """Return a sentence on the queries that no stop can serve, if there are any."""
+    if not plan.out_of_reach:
+        return ()
+    return (
+        f"{plan.out_of_reach} frames would need a place to fly again that is less than {refly.floor_m:g} m "
+        f"above the ground or {refly.clearance_m:g} m from map points: none is proposed for them (--floor).",
+    )
+
+
+def _free(poses: Poses, map_xyz: np.ndarray, refly: ReflyOptions, limit: float) -> Poses:
+    """Raise poses to the floor and out of the way of map points; leave out those that this moves too far."""
+    tree, plan = cKDTree(map_xyz), cKDTree(map_xyz[:, :2])
+    centers = poses.centers.copy()
+    lowest = np.array([_ground(centre, plan, map_xyz[:, 2]) for centre in centers]) + refly.floor_m
+    centers[:, 2] = np.maximum(centers[:, 2], lowest.reshape(-1))
+    top = poses.centers[:, 2] + limit
+    for _ in range(_MAX_RAISED):
+        near = tree.query_ball_point(centers, refly.clearance_m, return_length=True)
+        blocked = (near >= _OBSTACLE) & (centers[:, 2] <= top)
+        if not blocked.any():
+            break
+        centers[blocked, 2] += limit / _MAX_RAISED
+    near = tree.query_ball_point(centers, refly.clearance_m, return_length=True)
+    kept = (near < _OBSTACLE) & (centers[:, 2] <= top)
+    return Poses(centers, poses.quats_wxyz)[np.flatnonzero(kept)]
+
+
+def _ground(center: np.ndarray, plan: cKDTree, heights: np.ndarray) -> float:
+    """Return the height of the ground below a place: that of low points around it."""
+    for radius in _AROUND_M:
+        rows = plan.query_ball_point(center[:2], radius)
+        if len(rows) >= _ENOUGH:
+            return float(np.percentile(heights[rows], _LOW_PERCENT))
+    return float(np.percentile(heights, _LOW_PERCENT))
 
 
 def _thin_out(poses: Poses, limit: float, limit_deg: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from spn_data.area.area import Area
 from spn_data.area.names import COVERAGE, EVALUATION, GEO, MODEL, PLANNED_COVERAGE, TRACKED
 from spn_data.coverage.nearest_frame import CoverageOptions
-from spn_data.coverage.refly import ReflightPlan, ReflyOptions, plan_reflight
+from spn_data.coverage.refly import ReflightPlan, ReflyOptions, plan_reflight, reach_notes
 from spn_data.coverage.sequence_table import (
     Coverage,
     MappingFrames,
@@ -249,13 +249,14 @@ def _assess(
     fly_again, stops = None, {}
     if frame is not None and chosen is not None:
         poses, strata = _known_poses(by_name)
-        fly_again = plan_reflight(poses, strata, chosen, options.refly)
+        fly_again = plan_reflight(poses, strata, chosen, options.refly, map_xyz=labelled.points.xyz)
         stops = waypoint_columns(fly_again.poses.centers, fly_again.angles_deg, frame)
         numbers = {"stop": [str(k + 1) for k in range(len(fly_again))]}
         stops = {**numbers, **stops, "serves": [str(n) for n in fly_again.serves]}
     notes = tuple(
         sentence for name, each in by_name.items() for sentence in coverage_notes(name, each)
     )
+    notes += () if fly_again is None else reach_notes(fly_again, options.refly)
     if not is_metric:
         notes = (
             "The map is not georegistered: lengths are in units of the model and up is unknown"

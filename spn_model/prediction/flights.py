@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -53,7 +54,8 @@ class Flight:
     """A source with its cameras, before any pixel is decoded.
 
     cameras : one per part (video) or photo, None where unknown; camera_source : "given" or "photo metadata";
-    time_s : (N,) times of photos; headers : of photos; expected : number of frames, estimated for a video.
+    time_s : (N,) times of photos; headers : of photos; expected : number of frames, estimated for a video;
+    duration_s : of a video, NaN where unknown.
     """
 
     source: Source
@@ -62,6 +64,16 @@ class Flight:
     expected: int
     time_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     headers: PhotoHeaders | None = None
+    duration_s: float = math.nan
+
+    def expected_of(self, choice: FrameFilter) -> int:
+        """Return how many frames a choice is expected to leave, for the display of progress."""
+        if self.source.kind is not SourceKind.VIDEO:
+            return self.expected
+        count = math.ceil(self.expected / choice.every)
+        if choice.fps is not None and math.isfinite(self.duration_s):
+            count = min(count, math.ceil(self.duration_s * choice.fps))
+        return count
 
     @property
     def is_readable(self) -> bool:
@@ -145,7 +157,8 @@ def _open_flight(source: Source, given: Camera | None) -> tuple[Flight, list[str
         cameras = tuple(camera_at_size(given, i.width, i.height, i.path) for i in infos)
         expected = sum(info.frame_count for info in infos)
         notes = [f"{i.path.name}: {note}" for i in infos for note in i.notes]
-        return Flight(source, cameras, "given", expected), notes
+        seconds = sum(info.duration_s for info in infos)
+        return Flight(source, cameras, "given", expected, duration_s=seconds), notes
     headers = read_headers(source.parts)
     known = [m for m in headers.metadata if m is not None]
     if not known:

@@ -218,7 +218,7 @@ def _estimate_batches(
 ) -> Iterator[tuple[PoseRows, float]]:
     """Yield the rows of one batch after the other, and the seconds that the network took."""
     for flight in flights:
-        done, expected = 0, max(1, flight.expected // options.choice.every)
+        done, expected = 0, max(1, flight.expected_of(options.choice))
         for batch in _batches(frames(flight, views, options.choice), options.batch):
             rows, seconds = _estimate_batch(network, batch)
             done += len(batch)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from spn_data.area.names import RUNS
 from spn_data.dataset.hdf5_reader import Dataset
-from spn_data.errors import FormatError, InputError, StageError
+from spn_data.errors import FormatError, InputError, SpnError, StageError
 from spn_data.storage.files import LOCK, locked
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, finite, kind_of, read_json, write_json
@@ -126,13 +126,19 @@ def train_run(
             if is_main:  # left by a run that was killed in between
                 run.state.unlink(missing_ok=True)
             return TrainedRun(facts=config["facts"], unit=unit, is_new=False) if is_main else None
+        begins = config is None
         if config is None:
             config = _config(request, record)
             if is_main:
                 write_json(run.config, finite(config))
         with watch.training(unit, resumes=run.state.exists()):
             files = Files(run.checkpoint, run.last, run.state, run.log)
-            facts = train(request.recipe, files, request.data, request.options, watch)
+            try:
+                facts = train(request.recipe, files, request.data, request.options, watch)
+            except SpnError:
+                if is_main and begins and not _has_work(run):
+                    _remove_files(run)  # a run in which nothing was learnt is none
+                raise
         if not is_main:
             return None
         write_json(run.config, finite({**config, "facts": facts}))
@@ -221,6 +227,11 @@ def _existing_config(
         if is_main:
             _remove_files(run)
     return None
+
+
+def _has_work(run: RunFiles) -> bool:
+    """Return whether the folder has a network, or a state to resume from."""
+    return any(path.exists() for path in (run.checkpoint, run.last, run.state))
 
 
 def _remove_files(run: RunFiles) -> None:

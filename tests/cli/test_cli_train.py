@@ -266,6 +266,9 @@ def test_what_nothing_can_be_trained_with_leaves_no_run(place):
         if told is not None:
             assert told in ran.output
             assert len(ran.output.strip().splitlines()) == 1
+    assert [path.name for path in (place / "area" / "runs").iterdir()] == [
+        "tiny"
+    ]  # of the pretraining
     mended = trained(place, "--recipe", str(place / "bad.toml"), "--seed", "9")
     assert "has no option 'frosen'" in mended.output  # a failed run must not count as existing
 

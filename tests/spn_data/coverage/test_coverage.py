@@ -14,7 +14,7 @@ from spn_data.coverage.nearest_frame import (
     height_outside_range,
     nearest_frames,
 )
-from spn_data.coverage.refly import ReflyOptions, _costs, plan_reflight
+from spn_data.coverage.refly import ReflyOptions, _costs, plan_reflight, reach_notes
 from spn_data.coverage.sequence_table import (
     COLUMNS,
     MappingFrames,
@@ -347,6 +347,27 @@ class TestReflightPlan:
         found = plan_reflight(queries, np.array(["low", "low"]))
         assert sorted(np.round(found.angles_deg[:, 2], 6).tolist()) == [0.0, 90.0]
         assert set(coverage_strata(queries, found.poses).tolist()) == {"high"}
+
+    def test_no_place_is_near_the_ground_or_an_obstacle(self):
+        """Stops are raised to the floor and out of a hedge; a frame under a roof has none, which is said."""
+        rng = np.random.default_rng(0)
+        ground = np.column_stack([rng.uniform(-9, 60, (6000, 2)), np.zeros(6000)])
+        hedge = rng.uniform((18, -1, 0), (22, 1, 2.2), (900, 3))
+        roof = rng.uniform((38, -2, 3.0), (42, 2, 3.1), (900, 3))
+        queries, strata = looking((0, 0, 1.1), (20, 0, 2.0), (40, 0, 1.1)), np.full(3, "low")
+        points = np.vstack([ground, hedge, roof])
+        found = plan_reflight(queries, strata, map_xyz=points)
+        assert found.query_stop.tolist()[2] == -1
+        assert found.out_of_reach == 1
+        heights = found.poses.centers[found.query_stop[:2], 2]
+        assert heights[0] == pytest.approx(2.0)
+        assert 3.0 < heights[1] <= 2.0 + 0.7 * 2
+        free = plan_reflight(queries, strata)
+        assert sorted(free.poses.centers[:, 2]) == [1.1, 1.1, 2.0]
+        (said,) = reach_notes(found, ReflyOptions())
+        assert said.startswith(
+            "1 frames would need a place to fly again that is less than 2 m above"
+        )
 
     def test_the_order_is_a_short_path(self):
         """Stops along a shuffled line are ordered from one end to the other."""

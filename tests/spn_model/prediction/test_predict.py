@@ -177,6 +177,19 @@ def test_frames_of_a_video_have_its_own_times(network, video, tmp_path):
         assert {row["source"] for row in rows} == {"over the field.mp4"}
 
 
+def test_progress_counts_the_frames_that_are_used(video, photos):
+    """The expected number of frames is that of the frames that a choice leaves; photos are all used."""
+    (flight, images), _ = find_flights([video, photos], CAMERA)
+    choices = (
+        FrameFilter(),
+        FrameFilter(every=3),
+        FrameFilter(fps=2),
+        FrameFilter(every=2, fps=100),
+    )
+    assert [flight.expected_of(choice) for choice in choices] == [10, 4, 4, 5]
+    assert {images.expected_of(choice) for choice in choices} == {7}
+
+
 def test_without_a_camera_there_is_no_pose(network, video, photos, tmp_path):
     """A video or photos without a known camera are rejected, and the message names the remedy."""
     for source in (video, photos):
