@@ -316,7 +316,7 @@ def test_options_of_commands_in_the_docs_are_theirs():
     for path in PAGES:
         text = re.sub(r"\\\n\s*", " ", path.read_text(encoding="utf-8"))
         for program, name, rest in re.findall(
-            r"\b(spn-data|spn-model) ([a-z-]+)([^`\n|&;#]*)", text
+            r"\b(spn-data|spn-model) ([a-z][a-z-]*)([^`\n|&;#]*)", text
         ):
             group = data_main if program == "spn-data" else model_main
             if name not in group.commands:

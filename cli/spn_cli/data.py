@@ -112,14 +112,16 @@ def georegister(area_folder: Path, overwrite: bool, **chosen: Any) -> None:
     Example:
         spn-data georegister --area fields/north --gnss-sigma 0.03 0.05 --overwrite
     """
-    from spn_cli import page, show
+    from spn_cli import page, remembered, show
     from spn_data.pipeline.geo_stage import georegister as stage
 
     area = options.open_area(area_folder)
     with area.locked():
+        filled = remembered.fill(area, chosen)
         with show.Live() as live:
-            wanted = options.geo_options(**chosen)
+            wanted = options.geo_options(**filled)
             live.stage(stage(area, wanted, live.progress, overwrite=overwrite))
+        remembered.keep(area, chosen)
         page.refresh(area)
 
 

@@ -265,6 +265,22 @@ _GEOREGISTRATION = (
 )
 
 
+# What the area remembers: it is stated about flights, and a later command that needs it takes it.
+REMEMBERED = (
+    *(
+        "--fov",
+        "--gnss-sigma",
+        "--gnss-bias",
+        "--gcp",
+        "--check-points",
+        "--gcp-sigma",
+        "--mark-sigma",
+    ),
+    *("--time-offset", "--heights", "--height-reference", "--takeoff-alt", "--correlation-time"),
+    "--ignore-gimbal",
+)
+
+
 def georegistration(command: Any) -> Any:
     """Add the options of georegistration to a command, in the order of the list above."""
     for option in reversed(_GEOREGISTRATION):

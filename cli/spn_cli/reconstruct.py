@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from spn_cli import options, page, show
+from spn_cli import options, page, remembered, show
 from spn_data.capture.selection import SelectionOptions
 from spn_data.matching.features import FeatureOptions
 from spn_data.pipeline.frames_stage import FramesOptions
@@ -17,11 +17,24 @@ from spn_data.reconstruction.attempts import ReconstructOptions
 
 
 def run(
-    inputs: tuple[Path, ...],
-    area_folder: Path,
+    inputs: tuple[Path, ...], area_folder: Path, *, add: bool, overwrite: bool, **chosen: Any
+) -> None:
+    """Make or extend the map of the area, and show each stage when it is done."""
+    area = options.open_area(area_folder)
+    with area.locked():
+        wanted = _map_options(**remembered.fill(area, chosen))
+        with show.Live() as live:
+            if add:
+                extend(area, list(inputs), wanted, live, overwrite=overwrite)
+            else:
+                reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
+        remembered.keep(area, chosen, add=add)
+        show.verdict(area)
+        page.refresh(area)
+
+
+def _map_options(
     *,
-    add: bool,
-    overwrite: bool,
     fov_deg: tuple[tuple[str, float], ...],
     camera_files: tuple[tuple[str, str], ...],
     fixed_lens: bool,
@@ -36,10 +49,10 @@ def run(
     cluster: str,
     seed: int,
     **geo: Any,
-) -> None:
-    """Make or extend the map of the area, and show each stage when it is done."""
+) -> MapOptions:
+    """Return the options of the mapping stages as given on the command line."""
     given = options.geo_options(**geo)
-    wanted = MapOptions(
+    return MapOptions(
         frames=FramesOptions(
             selection=SelectionOptions(target_count=target_count, motion_share=motion_share),
             fov_deg=dict(fov_deg),
@@ -57,12 +70,3 @@ def run(
         ),
         geo=None if given == GeoStageOptions() else given,
     )
-    area = options.open_area(area_folder)
-    with area.locked():
-        with show.Live() as live:
-            if add:
-                extend(area, list(inputs), wanted, live, overwrite=overwrite)
-            else:
-                reconstruct(area, list(inputs), wanted, live, overwrite=overwrite)
-        show.verdict(area)
-        page.refresh(area)

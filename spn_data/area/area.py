@@ -107,13 +107,14 @@ class Area:
     root : Path
         The area's folder, which need not exist.
     facts : Facts
-        What the user stated about it.
+        What the user stated about it, in the file `facts_path`.
     """
 
     def __init__(self, root: Path):
         self.root = root
         self._complete_renames()
-        self.facts = read_facts(self.root / _FACTS)
+        self.facts_path = self.root / _FACTS
+        self.facts = read_facts(self.facts_path)
 
     def folder(self, stage: str) -> Path:
         """Return the folder of a stage, which need not exist."""
@@ -346,9 +347,8 @@ class Area:
 
     def write_facts(self, facts: Facts) -> None:
         """Write area.toml if its content changes."""
-        if facts == self.facts and (self.root / _FACTS).exists():
-            return
-        write_facts(self.root / _FACTS, facts)
+        if facts != self.facts or not self.facts_path.exists():
+            write_facts(self.facts_path, facts)
         self.facts = facts
 
     def next_area(self) -> Area:
@@ -367,7 +367,7 @@ class Area:
         """Replace the stages of the map by those of the next version, all or none."""
         (self.root / _NEXT / _READY).touch()
         self._replace_by_next()
-        self.facts = read_facts(self.root / _FACTS)
+        self.facts = read_facts(self.facts_path)
 
     def _replace_by_next(self) -> None:
         following = self.root / _NEXT

@@ -29,11 +29,14 @@ class Facts:
         Source of each evaluation sequence, by name of the sequence.
     expect_low : tuple of str
         Evaluation sequences that are meant to be far from the map.
+    options : mapping of str to tuple of str
+        Options of the mapping that were given, as words of the command line, by name without dashes.
     """
 
     sources: tuple[str, ...] = ()
     evaluation: Mapping[str, str] = field(default_factory=dict)
     expect_low: tuple[str, ...] = ()
+    options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def read_facts(path: Path) -> Facts:
@@ -55,15 +58,23 @@ def read_facts(path: Path) -> Facts:
             raise ValueError("nested too deeply") from error
         check_version(path, table["version"])
         sources, evaluation = table["sources"], table.get("evaluation", {})
-        expect_low = table.get("expect_low", [])
-        for name, value in (("sources", sources), ("expect_low", expect_low)):
+        expect_low, options = table.get("expect_low", []), table.get("options", {})
+        if not isinstance(options, dict):
+            raise TypeError("options is not a table")
+        lists = [("sources", sources), ("expect_low", expect_low), *options.items()]
+        for name, value in lists:
             if not isinstance(value, list) or not all(isinstance(s, str) for s in value):
-                raise TypeError(f"{name} is not a list of texts")
+                raise TypeError(f"{name:.60} is not a list of texts")
         if not isinstance(evaluation, dict) or not all(
             isinstance(s, str) for s in evaluation.values()
         ):
             raise TypeError("evaluation is not a table of texts")
-        return Facts(sources=tuple(sources), evaluation=evaluation, expect_low=tuple(expect_low))
+        return Facts(
+            sources=tuple(sources),
+            evaluation=evaluation,
+            expect_low=tuple(expect_low),
+            options={name: tuple(words) for name, words in options.items()},
+        )
 
 
 def write_facts(path: Path, facts: Facts) -> None:
@@ -79,4 +90,6 @@ def write_facts(path: Path, facts: Facts) -> None:
         table["expect_low"] = sorted(set(facts.expect_low))
     if facts.evaluation:
         table["evaluation"] = dict(sorted(facts.evaluation.items()))
+    if facts.options:
+        table["options"] = {name: list(words) for name, words in sorted(facts.options.items())}
     write_atomically(path, tomli_w.dumps(table))

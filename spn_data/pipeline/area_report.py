@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -13,6 +14,7 @@ import numpy as np
 from spn_data.area.area import Area, command_of
 from spn_data.area.names import (
     AUDIT,
+    CAMERA,
     COVERAGE,
     EVALUATION,
     FRAMES,
@@ -39,6 +41,7 @@ from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
+from spn_data.report.network_state import RecordedFlight
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
@@ -115,7 +118,7 @@ def report_data(area: Area) -> ReportData:
     if not area.has(FRAMES):
         raise StageError(f"{area.root} contains no frames; run {command_of(FRAMES)} first")
     stages = tuple(
-        StageFacts(area.record(stage), area.stale_because(stage), command_of(stage))
+        StageFacts(area.record(stage), area.stale_because(stage), _command_of(area, stage))
         for stage in area.stages()
     )
     fresh = _FreshStages(area)
@@ -160,7 +163,40 @@ def report_data(area: Area) -> ReportData:
         broken_runs=broken_runs,
         trained=trained_runs(area, runs),
         expect_low=frozenset(area.facts.expect_low),
+        recorded=_recorded_flight(area),
     )
+
+
+def _command_of(area: Area, stage: str) -> str:
+    """Return the command that makes a stage, with the sources that are where they were."""
+    command, name = command_of(stage), stage.partition("/")[2]
+    if command.startswith("spn-data register VIDEO"):
+        video = _found(area, area.facts.evaluation.get(name, ""))
+        return command.replace("VIDEO", shlex.quote(video)) if video else command
+    if command == "spn-data reconstruct":
+        sources = [_found(area, source) for source in area.facts.sources]
+        words = sources if sources and all(sources) else ["VIDEO"]
+        return f"{command} {shlex.join(words)}"
+    return command
+
+
+def _found(area: Area, stored: str) -> str:
+    """Return the path of a source as stored in area.toml; empty if it is not there."""
+    path = (area.root.resolve() / stored).resolve()
+    return str(path) if stored and path.exists() else ""
+
+
+def _recorded_flight(area: Area) -> RecordedFlight | None:
+    """Return an evaluation flight whose video is where it was, rather one that is not far from the map."""
+    names = sorted(
+        area.sequences(EVALUATION), key=lambda name: (name in area.facts.expect_low, name)
+    )
+    for name in names:
+        video = _found(area, area.facts.evaluation.get(name, ""))
+        camera = area.folder(f"{EVALUATION}/{name}") / CAMERA
+        if video and Path(video).is_file() and camera.is_file():
+            return RecordedFlight(video, camera.relative_to(area.root).as_posix())
+    return None
 
 
 def frame_table(

@@ -58,5 +58,5 @@ def judge(data: ReportData) -> AreaVerdict:
     of_data = judge_data(data)
     runs = tuple(judge_run(state, data.runs, data.expect_low) for state in data.trained)
     has_flights = bool(data.evaluation_sequences)
-    step = next_step(of_data, data.trained, runs, has_flights=has_flights)
+    step = next_step(of_data, data.trained, runs, has_flights=has_flights, recorded=data.recorded)
     return AreaVerdict(of_data, runs, step)

@@ -16,7 +16,7 @@ from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.fix_facts import BundleFixes
-from spn_data.report.network_state import NetworkState
+from spn_data.report.network_state import NetworkState, RecordedFlight
 from spn_data.split import audit
 from spn_data.split.groups import Split
 from spn_data.storage.stage_record import StageRecord
@@ -367,6 +367,8 @@ class ReportData:
         Trained networks, the newest first.
     expect_low : frozenset of str
         Evaluation sequences that are declared to be far from the map.
+    recorded : RecordedFlight or None
+        An evaluation flight whose video is known.
     """
 
     title: str
@@ -389,6 +391,7 @@ class ReportData:
     broken_runs: tuple[str, ...] = ()
     trained: tuple[NetworkState, ...] = ()
     expect_low: frozenset[str] = frozenset()
+    recorded: RecordedFlight | None = None
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

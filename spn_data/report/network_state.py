@@ -1,4 +1,4 @@
-"""State of a trained network: what was done with it since."""
+"""State of a trained network: what was done with it since, and a flight that its bundle can be tried on."""
 
 from __future__ import annotations
 
@@ -35,3 +35,11 @@ class NetworkState:
     is_exported: bool = False
     has_landmarks: bool = False
     is_measured: bool = False
+
+
+@dataclass(frozen=True)
+class RecordedFlight:
+    """A recorded flight. video : absolute path; camera : path of its camera, relative to the area."""
+
+    video: str
+    camera: str

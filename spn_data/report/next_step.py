@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from spn_data.report.network_state import NetworkState
+from spn_data.report.network_state import NetworkState, RecordedFlight
 from spn_data.report.run_verdict import RunVerdict
 from spn_data.report.verdict import DataVerdict, Level, VerdictReason
 
@@ -19,6 +19,7 @@ def next_step(
     judged: Sequence[RunVerdict],
     *,
     has_flights: bool = True,
+    recorded: RecordedFlight | None = None,
 ) -> VerdictReason:
     """Return the next step.
 
@@ -31,6 +32,8 @@ def next_step(
         Verdict on each of them.
     has_flights : bool
         Whether the area has an evaluation sequence, without which no fixes can be measured.
+    recorded : RecordedFlight, optional
+        A flight to try the bundle on.
 
     Returns
     -------
@@ -58,13 +61,15 @@ def next_step(
     poor = verdict.flight if run.has_landmarks else verdict.network
     if poor.level is Level.STOP and poor.do:
         return poor
-    bundle = shlex.quote(f"{_IN_AREA}{run.bundle}")
+    flight = ["VIDEO", "--camera", "CAMERA.json"]
+    if recorded is not None:
+        flight = [recorded.video, "--camera", f"{_IN_AREA}{recorded.camera}"]
+    words = shlex.join([f"{_IN_AREA}{run.bundle}", *flight])
     if not run.has_landmarks:
         do = f"Estimate coarse poses of a recorded flight with the bundle of {run.name}"
-        return VerdictReason(Level.GOOD, "", do, f"spn-onboard {bundle} VIDEO --camera CAMERA.json")
+        return VerdictReason(Level.GOOD, "", do, f"spn-onboard {words}")
     do = f"Fly a recorded flight with the bundle of {run.name}"
-    command = f"spn-onboard fly {bundle} VIDEO --camera CAMERA.json --to fixes.jsonl"
-    return VerdictReason(Level.GOOD, "", do, command)
+    return VerdictReason(Level.GOOD, "", do, f"spn-onboard fly {words} --to fixes.jsonl")
 
 
 def command_for(command: str, area: Path) -> str:

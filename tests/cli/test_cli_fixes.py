@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -12,6 +14,8 @@ import torch
 from click.testing import CliRunner
 from spn_cli.data import main as data_main
 from spn_cli.model import main as model_main
+
+from spn_model.onboard.__main__ import main as onboard_main
 
 pytestmark = pytest.mark.slow
 
@@ -22,6 +26,21 @@ def run(command, *words: object):
     return CliRunner().invoke(command, [str(word) for word in words], env={"COLUMNS": "250"})
 
 
+def paste(output: str, begins: str, *less: str) -> str:
+    """Run the command of the last line, which begins so, with further options; return what it printed."""
+    last = output.rstrip().splitlines()[-1]
+    command = re.fullmatch(r"Next: [^:]*: (spn-.*)", last)
+    assert command is not None, last
+    assert command[1].startswith(begins), last
+    program, *words = shlex.split(command[1])
+    if program == "spn-onboard":
+        assert onboard_main([*words, *less]) == 0
+        return ""
+    result = run({"spn-data": data_main, "spn-model": model_main}[program], *words, *less)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
 @pytest.fixture(scope="module")
 def area(finished_area: Path, flight2: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The area with the second flight registered, a network of a few steps, and its bundle."""
@@ -29,14 +48,15 @@ def area(finished_area: Path, flight2: Path, tmp_path_factory: pytest.TempPathFa
     shutil.copytree(finished_area, area)
     before = torch.get_num_threads()
     options = ("--name", "medium", "--rate", 1, "--all-frames", "--any-telemetry", "--threads", 1)
-    for command, words in (
-        (data_main, ["register", flight2 / "flight2.mp4", *options]),
-        (data_main, ["split"]),
-        (model_main, ["train", *TRAIN]),
-        (model_main, ["export", "--run", "default", "--map-mb", "2", "--calibration-images", "2"]),
-    ):
-        result = run(command, *words, "--area", area)
-        assert result.exit_code == 0, result.output
+    result = run(
+        data_main, "register", flight2 / "flight2.mp4", *options, "--expect-low", "--area", area
+    )
+    assert result.exit_code == 0, result.output
+    assert 'expect_low = [\n    "medium",\n]' in (area / "area.toml").read_text()
+    # From here on, what is typed is what the line before it says, with less work.
+    following = paste(result.output, "spn-data split")
+    following = paste(following, "spn-model train", *TRAIN)
+    paste(following, "spn-model export", "--map-mb", "2", "--calibration-images", "2")
     torch.set_num_threads(before)
     return area
 
@@ -46,6 +66,9 @@ def test_what_a_user_sees_of_fixes_before_a_flight(area):
     folder = area / "runs" / "default"
     card = folder / "bundle" / "MODEL_CARD.md"
     assert "not to be flown yet" in card.read_text()
+    assert (
+        "- Flight: The fixes of default are not measured: it was not evaluated" in card.read_text()
+    )
     early = run(model_main, "availability", "--run", "default", "--area", area)
     assert early.exit_code == 1
     assert "fixes.csv: does not exist; run spn-model evaluate --run default first" in early.output
@@ -69,6 +92,15 @@ def test_what_a_user_sees_of_fixes_before_a_flight(area):
     assert (folder / "figures" / "medium-protection.svg").is_file()
     assert "| medium | search |" in card.read_text()
     assert "default: fixes of its bundle" in (area / "report.html").read_text()
+    verdict = [
+        line for line in shown.output.splitlines() if line.startswith(("Network: ", "Flight: "))
+    ]
+    assert verdict[0].startswith(
+        "Network: default is not measured: there is no evaluation flight near"
+    )
+    assert "have a usable fix (track), 0 of" in verdict[1]
+    assert "They come from landmarks; the pose of the network led to" in verdict[1]
+    assert f"- {verdict[1]}" in card.read_text()
     table = area.parent / "expected.csv"
     again = run(model_main, "availability", "--run", "default", "--area", area, "--to", table)
     assert again.exit_code == 0, again.output
@@ -125,3 +157,15 @@ def test_a_bundle_of_an_earlier_network_is_refused(area, tmp_path):
         "The fixes of default are not measured: the bundle is of an earlier network" in shown.output
     )
     assert not (other / "runs" / "default" / "fixes.csv").exists()
+
+
+def test_the_next_lines_lead_from_a_registered_flight_to_a_replayed_one(
+    area, tmp_path, monkeypatch
+):
+    """The lines of `status` are pasted where the user is: evaluation, then a flight with the bundle."""
+    monkeypatch.chdir(tmp_path)
+    (area / "runs" / "default" / "metrics.json").unlink(missing_ok=True)
+    shown = run(data_main, "status", "--area", area)
+    less = ("--threads", "1", "--training-images", "4", "--no-baselines")
+    paste(paste(shown.output, "spn-model evaluate", *less), "spn-onboard fly")
+    assert len((tmp_path / "fixes.jsonl").read_text().splitlines()) > 10

@@ -64,6 +64,51 @@ def test_reconstruct_keeps_a_georegistration_that_was_made_with_other_options(
     assert recorded_options(Area(area).record(GEO)).fit.gnss_sigma_m == (0.5, 1.0)
 
 
+def test_the_area_remembers_the_options_that_it_was_georegistered_with(area: Path) -> None:
+    """Later commands take them and say so; another value needs --overwrite, and is remembered."""
+    options = ("--takeoff-alt", "100", "--height-reference", "amsl", "--gnss-bias", "2")
+    assert run("georegister", "--area", area, *options, "--overwrite").exit_code == 0
+    again = run("georegister", "--area", area)
+    assert again.exit_code == 0, again.output
+    said = " ".join(again.output.split())
+    assert (
+        "--gnss-bias 2.0,5.0, --height-reference amsl, --takeoff-alt 100.0. Give an option" in said
+    )
+    remembered = Area(area).facts.options
+    refused = run("georegister", "--area", area, "--takeoff-alt", "120")
+    assert refused.exit_code == 1
+    assert "--overwrite" in refused.stderr
+    assert Area(area).facts.options == remembered
+    changed = run("georegister", "--area", area, "--takeoff-alt", "120", "--overwrite")
+    assert changed.exit_code == 0, changed.output
+    assert "--takeoff-alt 120.0 replaces 100.0" in " ".join(changed.output.split())
+    fit = recorded_options(Area(area).record(GEO)).fit
+    assert (fit.takeoff_alt_m, fit.gnss_bias_m) == (120.0, (2.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            'fovv = ["72"]',
+            "options has 'fovv', which is not remembered; it may have fov, gnss-sigma",
+        ),
+        ('takeoff-alt = ["high"]', "options: --takeoff-alt: 'high' is not a valid float"),
+        ('gnss-sigma = ["1"]', "options: --gnss-sigma: "),
+        ('heights = ["relative", "absolute"]', "options: --heights is not one text"),
+    ],
+)
+def test_a_wrong_option_in_the_file_of_the_area_is_one_line(
+    tmp_path: Path, options: str, words: str
+) -> None:
+    """An unknown name and a value that the option would refuse are errors that name the file."""
+    (tmp_path / "area.toml").write_text(f"version = 1\nsources = []\n[options]\n{options}\n")
+    result = run("georegister", "--area", tmp_path)
+    assert result.exit_code == 1
+    assert f"area.toml: {words}" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
 def test_a_take_off_height_without_its_reference_is_a_usage_error(area: Path) -> None:
     """--takeoff-alt requires --height-reference."""
     result = run("georegister", "--area", area, "--takeoff-alt", "100")

@@ -191,8 +191,14 @@ def test_a_stage_of_a_newer_version_is_refused(tmp_path: Path) -> None:
 
 def test_facts_come_back_as_they_were_written(tmp_path: Path) -> None:
     """Facts with quotes and backslashes survive a round trip through area.toml."""
-    Area(tmp_path).write_facts(Facts(sources=('a "quoted" folder', "b\\c")))
-    assert Area(tmp_path).facts.sources == ('a "quoted" folder', "b\\c")
+    facts = Facts(
+        sources=('a "quoted" folder', "b\\c"),
+        evaluation={"low": "d.mp4"},
+        expect_low=("low",),
+        options={"fov": ("72", "f=94")},
+    )
+    Area(tmp_path).write_facts(facts)
+    assert Area(tmp_path).facts == facts
 
 
 def test_two_processes_do_not_change_one_area(tmp_path: Path) -> None:

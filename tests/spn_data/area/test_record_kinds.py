@@ -236,9 +236,10 @@ def test_every_value_of_registration_json_has_its_kind(tmp_path):
 
 
 def test_every_value_of_area_toml_has_its_kind(tmp_path):
-    """No value of another kind is taken for a source."""
+    """No value of another kind is taken for a source, a sequence or an option."""
     path = tmp_path / "area.toml"
     document = {"version": 1, "sources": ["a.mp4"], "evaluation": {"north": "b.mp4"}}
+    document |= {"expect_low": ["north"], "options": {"fov": ["72"], "sources": ["x"]}}
 
     def write(document: Any) -> None:
         try:

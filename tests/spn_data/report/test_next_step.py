@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from spn_data.report.network_state import NetworkState
+from spn_data.report.network_state import NetworkState, RecordedFlight
 from spn_data.report.next_step import command_for, next_step
 from spn_data.report.run_verdict import RunVerdict
 from spn_data.report.verdict import DataVerdict, Level, VerdictReason
@@ -91,6 +91,18 @@ def test_nobody_is_sent_to_fly_on_what_is_not_to_be_flown() -> None:
     assert "spn-onboard fly" in following([RESERVATION], [trained(**DONE)], network=POOR).command
     coarse = trained(has_bundle=True, is_exported=True, is_evaluated=True)
     assert following([RESERVATION], [coarse], network=POOR) is POOR
+
+
+def test_the_bundle_is_tried_on_a_flight_that_the_area_knows() -> None:
+    """The command names the video and the camera of an evaluation flight, so that it can be pasted."""
+    flight = RecordedFlight("/data/my flight.mp4", "4-eval/medium/camera.json")
+    run = trained(**DONE)
+    verdicts = [RunVerdict(run.name, FINE, FINE)]
+    step = next_step(judged(RESERVATION), [run], verdicts, recorded=flight)
+    assert command_for(step.command, Path("a")) == (
+        "spn-onboard fly 'a/runs/first try/bundle' '/data/my flight.mp4' --camera "
+        "a/4-eval/medium/camera.json --to fixes.jsonl"
+    )
 
 
 def test_without_an_evaluation_flight_one_has_to_be_registered() -> None:
