@@ -39,7 +39,7 @@ def read_submodels(folder: Path) -> list[Path] | None:
 
 def write_settled(folder: Path, work: Path, model: Path, notes: Sequence[str]) -> None:
     """Record the model, below `work`, with which the second chances begin, and what the user should know."""
-    value = {"model": model.relative_to(work).as_posix(), "told": list(notes)}
+    value = {"model": model.relative_to(work).as_posix(), "notes": list(notes)}
     write_atomically(folder / _SETTLED, json.dumps(value))
 
 
@@ -56,7 +56,7 @@ def read_settled(folder: Path, work: Path) -> tuple[Path, list[str]] | None:
         return None
     found = load_json(path, max_bytes=_MAX_BYTES)
     with reporting_damage(path, "a record of a model"):
-        notes = found["told"]
+        notes = found.get("notes", found.get("told"))  # the latter by earlier versions
         if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
             raise TypeError("its notes are no list of sentences")
         return _inside(work, found["model"]), notes

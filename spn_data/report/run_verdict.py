@@ -236,7 +236,7 @@ def _counted(rows: Collection[FixFigures]) -> str:
     methods = " and ".join(sorted({row.method for row in rows}))
     return (
         f"{usable:,} of {images:,} images have a usable fix ({methods}), {misleading:,} of {compared:,} "
-        f"compared fixes are misleading (with 95 % confidence at most {_bound(rows):.1%} of a flight's)"
+        f"compared fixes are misleading (at most {_bound(rows):.1%} of a flight, with 95 % confidence)"
     )
 
 

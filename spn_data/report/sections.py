@@ -58,7 +58,7 @@ def _part(name: str, found: VerdictReason, area: Path, step: VerdictReason) -> s
     """Return a part of the verdict: a headline for the data, a line for each network."""
     mark, word = _MARKS[found.level]
     do = "" if found is step else _what_to_do(found, area)
-    text = f"<b>{name}</b> {escape(found.text)}{f' <em>{do}</em>' if do else ''}"
+    text = f"<b>{name}:</b> {escape(found.text)}{f' <em>{do}</em>' if do else ''}"
     kind = "h2" if name == DATA else "p"
     return (
         f'<{kind} class="part {found.level}"><span class="mark" title="{word}">{mark}</span>'

@@ -294,13 +294,13 @@ def _coverage(data: ReportData, limits: VerdictLimits) -> Iterator[VerdictReason
         yield from _stale(data.coverage, "Coverage", "spn-data coverage")
     if data.plan is not None:
         for name in sorted(data.plan.strata):
-            yield from _strata("the planned waypoints", name, data.plan, limits, is_far=False)
+            yield from _strata("the planned waypoints", name, data.plan, limits, is_far=None)
         command = "spn-data coverage --waypoints FILE.csv"
         yield from _stale(data.plan, "Coverage of the planned waypoints", command)
 
 
 def _strata(
-    what: str, name: str, coverage: CoverageFacts, limits: VerdictLimits, *, is_far: bool
+    what: str, name: str, coverage: CoverageFacts, limits: VerdictLimits, *, is_far: bool | None
 ) -> Iterator[VerdictReason]:
     counts = coverage.strata[name]
     total = sum(counts.get(stratum, 0) for stratum in STRATA)
@@ -309,10 +309,11 @@ def _strata(
     share = counts.get("low", 0) / total
     if share > limits.max_low_share and not is_far:
         again = len(coverage.fly_again)
+        declare = f" If it is meant to, declare it: register --name {name} --expect-low."
         yield VerdictReason(
             Level.CAUTION,
             f"{share:.0%} of the views of {what} have no mapping frame nearby: a network has to "
-            "extrapolate there.",
+            f"extrapolate there.{'' if is_far is None else declare}",
             f"Fly the {count_of(again, 'place')} listed below and add the flight" if again else "",
             "spn-data reconstruct VIDEO --add",
         )

@@ -27,8 +27,8 @@ def run(command, *words: object):
 
 
 def paste(output: str, begins: str, *less: str) -> str:
-    """Run the command of the last line, which begins so, with further options; return what it printed."""
-    last = output.rstrip().splitlines()[-1]
+    """Run the command of the line "Next", which begins so, with further options; return what it printed."""
+    last = [line for line in output.splitlines() if line.startswith("Next: ")][-1]
     command = re.fullmatch(r"Next: [^:]*: (spn-.*)", last)
     assert command is not None, last
     assert command[1].startswith(begins), last

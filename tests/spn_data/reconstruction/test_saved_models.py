@@ -46,10 +46,11 @@ def test_a_damaged_list_of_models_is_one_line(mapping, text):
 @pytest.mark.parametrize(
     "text",
     [
-        '{"model": "..", "told": []}',
-        '{"model": "mapping-first", "told": [1]}',
-        '{"model": "mapping-first", "told": "a note"}',
-        '{"told": []}',
+        '{"model": "..", "notes": []}',
+        '{"model": "mapping-first", "notes": [1]}',
+        '{"model": "mapping-first", "notes": "a note"}',
+        '{"model": "mapping-first"}',
+        '{"notes": []}',
     ],
 )
 def test_a_damaged_record_of_a_model_is_one_line(mapping, text):
@@ -57,3 +58,9 @@ def test_a_damaged_record_of_a_model_is_one_line(mapping, text):
     (mapping / "settled.json").write_text(text)
     with pytest.raises(FormatError, match=r"settled\.json: is not a record of a model"):
         read_settled(mapping, mapping.parent)
+
+
+def test_a_record_of_an_earlier_version_is_read(mapping):
+    """A reconstruction that an earlier version began goes on: its key of the notes is known."""
+    (mapping / "settled.json").write_text('{"model": "mapping-first", "told": ["a note"]}')
+    assert read_settled(mapping, mapping.parent) == (mapping.parent / "mapping-first", ["a note"])

@@ -149,7 +149,7 @@ FEW = fixes("low", usable=40, compared=40, misleading_at_most=0.03)
             (SEARCHED, fixes(), fixes(method="coarse", misleading=149)),
             Level.GOOD,
             "may be flown on: 149 of 150 images have a usable fix (track), 0 of 149 compared fixes are "
-            "misleading (with 95 % confidence at most 2.0% of a flight's). They come from landmarks; "
+            "misleading (at most 2.0% of a flight, with 95 % confidence). They come from landmarks; "
             "the pose of the network led to 3 of 58 (search).",
         ),
         ((SEARCHED,), Level.CAUTION, "so up to 6% may be misleading"),
