@@ -182,8 +182,11 @@ def _command_of(area: Area, stage: str) -> str:
 
 def _found(area: Area, stored: str) -> str:
     """Return the path of a source as stored in area.toml; empty if it is not there."""
-    path = (area.root.resolve() / stored).resolve()
-    return str(path) if stored and path.exists() else ""
+    try:
+        path = (area.root.resolve() / stored).resolve()
+        return str(path) if stored and path.exists() else ""
+    except (OSError, ValueError):  # not a path of this machine
+        return ""
 
 
 def _recorded_flight(area: Area) -> RecordedFlight | None:

@@ -95,6 +95,21 @@ def test_a_stale_stage_is_named_and_left_out(area):
     assert given(area / "report.html")["units"] == "model"
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_the_next_step_names_the_sources_that_are_where_they_were(area, tmp_path, is_there):
+    """A stale model is redone from the sources in area.toml, or from VIDEO where they are gone."""
+    path = area / "1-frames" / "stage.json"
+    record = json.loads(path.read_text())
+    record["counts"]["candidates"] += 1
+    path.write_text(json.dumps(record))
+    video = tmp_path / "my flight.mp4"
+    (area / "area.toml").write_text(f'version = 1\nsources = ["{video}"]\n')
+    if is_there:
+        video.write_bytes(b"")
+    source = f"'{video}'" if is_there else "VIDEO"
+    assert run(area).output.endswith(f"spn-data reconstruct {source} --overwrite --area {area}\n")
+
+
 def test_an_area_without_a_model_has_a_report(area):
     """An area with frames only still has a report, which names the next step."""
     shutil.rmtree(area / "3-geo")

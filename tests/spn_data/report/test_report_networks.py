@@ -17,8 +17,9 @@ from spn_cli.data import main as data_main
 from spn_cli.model import main
 
 from spn_data.area.area import Area
-from spn_data.inputs.network_runs import read_runs
+from spn_data.inputs.network_runs import read_runs, trained_runs
 from spn_data.report.html import render
+from spn_data.storage.fingerprints import content_fingerprint
 from tests.spn_data.report.test_report_browser import CHROMIUM, visit
 from tests.worlds.judged_world import write_judged, write_network
 from tests.worlds.report_data import area as made_up_area
@@ -111,6 +112,42 @@ def test_fixes_stand_beside_coarse_poses(root):
     assert "<td>coarse</td><td>1,199 of 1,200</td><td>12.30 m, 0.04&deg;</td>" in part
     assert "<td>track</td><td>1,199 of 1,200</td><td>1.2 cm, 0.04&deg;</td>" in part
     assert "<td>0 (&le; 0.3 %)</td><td>0.90</td><td>&ndash;</td><td>0.4 s</td>" in part
+
+
+def test_fixes_are_those_of_the_bundle_that_they_were_measured_with(root):
+    """Another network, other landmarks or a damaged file: what is exported was not measured."""
+    folder = root / "runs" / "first"
+    bundle = folder / "bundle"
+
+    def state() -> tuple[bool, bool, bool]:
+        runs, _ = read_runs(Area(root))
+        found = {one.name: one for one in trained_runs(Area(root), runs)}["first"]
+        assert found.is_evaluated
+        return found.has_bundle, found.is_exported, found.is_measured
+
+    assert state() == (False, False, False)
+    bundle.mkdir()
+    document = {
+        "run": {"checkpoint": content_fingerprint(folder / "checkpoint.safetensors")},
+        "graphs": {"float32": {"sha256": "n"}},
+        "landmarks": {"sha256": "l"},
+    }
+    same = {"network": "n", "landmarks": "l"}
+    for made, measured, expected in (
+        (document, same, (True, True, True)),
+        (document, {"network": "n", "landmarks": "other"}, (True, True, False)),
+        (document, {}, (True, True, False)),
+        (
+            {**document, "run": {"checkpoint": "other"}},
+            {"network": "n", "landmarks": "l"},
+            (True, False, True),
+        ),
+        ([], {"network": "n", "landmarks": "l"}, (True, False, False)),
+    ):
+        (bundle / "bundle.json").write_text(json.dumps(made))
+        fixes = {**FIXES, "bundle": measured}
+        rewrite(folder / "metrics.json", lambda t, fixes=fixes: t.update(fixes=fixes))
+        assert state() == expected
 
 
 def test_a_short_training_is_called_short(root):

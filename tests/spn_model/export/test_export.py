@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from spn_cli.model import main
 from torch import nn
 
+from spn_data.area import names
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.geometry.pose import pose_errors
@@ -27,7 +28,7 @@ from spn_model.export.exported import ExportedBundle
 from spn_model.export.graphs import _FixedAdaptivePool, deployment, reference, write_graph
 from spn_model.models import checkpoint
 from spn_model.models.registry import make
-from spn_model.onboard.bundle import INPUT, CellDecoding, read_bundle
+from spn_model.onboard.bundle import DOCUMENT, INPUT, CellDecoding, read_bundle
 from spn_model.onboard.localizer import Localizer
 from tests.worlds.box_world import write_box
 from tests.worlds.bundle_world import learnt
@@ -302,3 +303,8 @@ def test_regressors_keep_their_covariance(hall, tmp_path):
     assert found.poses.centers == pytest.approx(own.poses.centers, abs=1e-4)
     assert found.covariance == pytest.approx(own.covariance[0], rel=1e-4)
     assert np.ptp(np.log(np.diag(found.covariance)[3:])) > 1
+
+
+def test_the_name_of_the_file_of_a_bundle_is_the_same_everywhere():
+    """The report looks for the bundle's file under the name that the export gives it."""
+    assert names.BUNDLE_FACTS == DOCUMENT
