@@ -76,9 +76,11 @@ def show_judgement(area: Area) -> None:
 
 def show_verdict(verdict: AreaVerdict, area: Area, path: Path | None = None) -> None:
     """Print the verdict, the page with its reasons if it was written, and the next step."""
-    for k, (name, said) in enumerate(verdict.parts()):
+    from spn_data.report.area_verdict import DATA
+
+    for name, said in verdict.parts():
         text = _sentence(said, area)
-        if path is not None and k == 0:
+        if path is not None and name == DATA:
             text = f"{text.removesuffix('.')}: see {path}."
         console.out.print(f"{name}: {text}", soft_wrap=True)
     show_next(verdict.next, area)

@@ -214,7 +214,7 @@ def _not_measured(state: NetworkState, fixes: BundleFixes) -> str:
     if not state.has_bundle:
         return "no bundle is exported"
     if not state.is_exported:
-        return "the bundle is of an earlier network"
+        return "the bundle is damaged or of an earlier network"
     if not state.has_landmarks:
         return "the bundle has no landmarks, so it gives coarse poses only"
     if not state.is_evaluated:

@@ -154,7 +154,8 @@ def test_a_bundle_of_an_earlier_network_is_refused(area, tmp_path):
     shown = run(model_main, *words, "--no-baselines")
     assert shown.exit_code == 0, shown.output
     assert (
-        "The fixes of default are not measured: the bundle is of an earlier network" in shown.output
+        "The fixes of default are not measured: the bundle is damaged or of an earlier"
+        in shown.output
     )
     assert not (other / "runs" / "default" / "fixes.csv").exists()
 

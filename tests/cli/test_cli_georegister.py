@@ -55,12 +55,13 @@ def test_other_options_need_overwrite_and_move_only_the_third_stage(area: Path) 
 def test_reconstruct_keeps_a_georegistration_that_was_made_with_other_options(
     area: Path, flight1: Path
 ) -> None:
-    """`reconstruct` keeps a georegistration made by `georegister` with different options."""
+    """`reconstruct` keeps a georegistration made by `georegister`, and takes the first field of view."""
     made = run("georegister", "--area", area, "--gnss-sigma", "0.5", "1", "--overwrite")
     assert made.exit_code == 0, made.output
-    again = run("reconstruct", flight1, "--area", area, *FAST)
+    again = run("reconstruct", flight1, "--area", area, *FAST[:4])  # without --fov
     assert again.exit_code == 0, again.output
     assert f"{GEO}: unchanged since" in again.stdout
+    assert "--fov 72.0, --gnss-sigma 0.5 1.0. Give an option" in " ".join(again.output.split())
     assert recorded_options(Area(area).record(GEO)).fit.gnss_sigma_m == (0.5, 1.0)
 
 

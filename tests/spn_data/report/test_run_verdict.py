@@ -194,7 +194,7 @@ def test_few_fixes_far_from_the_map_are_expected_and_misleading_ones_are_not() -
     ("changes", "words"),
     [
         ({"has_bundle": False}, "no bundle is exported"),
-        ({"is_exported": False}, "the bundle is of an earlier network"),
+        ({"is_exported": False}, "the bundle is damaged or of an earlier network"),
         ({"has_landmarks": False}, "has no landmarks, so it gives coarse poses only"),
         ({"is_measured": False}, "it was evaluated with another bundle"),
     ],
