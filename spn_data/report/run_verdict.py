@@ -157,11 +157,12 @@ def _longer(state: NetworkState, facts: RunFacts) -> tuple[str, str]:
     shown = f"it has seen {network.images:,} images in {network.minutes:.1f} min"
     if network.images >= SHORT_IMAGES:
         return f"Train longer or by another recipe ({shown}), and map what the flights see", ""
+    # Under another name: this one may have a bundle whose fixes are good.
     minutes = max(_LONG_MINUTES, round(4 * network.minutes))
     recipe = f" --recipe {shlex.quote(state.recipe)}" if state.recipe else ""
     return (
         f"Train longer ({shown})",
-        f"spn-model train --run {shlex.quote(state.name)}{recipe} --minutes {minutes} --overwrite",
+        f"spn-model train --run {shlex.quote(f'{state.name}-longer')}{recipe} --minutes {minutes}",
     )
 
 

@@ -128,7 +128,7 @@ def test_a_short_training_is_to_be_continued_and_a_long_one_not() -> None:
     """The command trains the same recipe for longer; after many images no such command is proposed."""
     found = judge_run(DONE, [BAD], ()).network
     assert found.do == "Train longer (it has seen 4,779 images in 3.0 min)"
-    assert found.command == "spn-model train --run first --recipe paper --minutes 30 --overwrite"
+    assert found.command == "spn-model train --run first-longer --recipe paper --minutes 30"
     long = NetworkFacts("kind", "c", 9, 9, 90_000, 40.0, 40.0, 9.0)
     assert judge_run(DONE, [replace(BAD, networks={"first": long})], ()).network.command == ""
 
