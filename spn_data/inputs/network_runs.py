@@ -197,7 +197,12 @@ def _fixes(value: Mapping[str, Any]) -> BundleFixes:
     verdicts = [
         (one["may_fly"] is True, _text(one["text"], _MAX_VERDICT)) for one in value["verdict"]
     ]
-    return BundleFixes(rows=tuple(rows[:_MAX_FIX_ROWS]), verdicts=tuple(verdicts[:_MAX_FIX_ROWS]))
+    attitudes = [_text(one, _MAX_VERDICT) for one in value.get("attitudes", ())[:_MAX_FIX_ROWS]]
+    return BundleFixes(
+        rows=tuple(rows[:_MAX_FIX_ROWS]),
+        verdicts=tuple(verdicts[:_MAX_FIX_ROWS]),
+        attitudes=tuple(attitudes),
+    )
 
 
 def _figures(folder: Path, budget: int) -> tuple[tuple[Figure, ...], int]:

@@ -12,6 +12,7 @@ class FixFigures:
     Attributes
     ----------
     flight, method : str
+        The method says whether an attitude was known, and whether that was simulated.
     images, usable, compared : int
         Number of images, of those with a usable fix, and of those with a label too.
     error_m, error_deg : float or None
@@ -45,7 +46,10 @@ class BundleFixes:
     rows : tuple of FixFigures
     verdicts : tuple of (bool, str)
         Whether a sentence speaks for a flight, and the sentence.
+    attitudes : tuple of str
+        Where the known attitude of each flight is from.
     """
 
     rows: tuple[FixFigures, ...] = ()
     verdicts: tuple[tuple[bool, str], ...] = ()
+    attitudes: tuple[str, ...] = ()

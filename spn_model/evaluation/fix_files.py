@@ -67,11 +67,17 @@ class RunFixes:
     reason: str = ""
     notes: tuple[str, ...] = ()
 
+    @property
+    def attitudes(self) -> tuple[str, ...]:
+        """A sentence on the known attitude of each flight that has rows with one."""
+        texts = [one.attitude.text for one in self.flights if one.attitude is not None]
+        return tuple(dict.fromkeys(texts))
+
     def to_json(self, verdicts: Sequence[Verdict]) -> dict[str, Any]:
         """Return plain values for metrics.json; unknown numbers are NaN."""
         flights: dict[str, dict[str, Any]] = {}
         for one in self.flights:
-            flights.setdefault(one.flight, {})[one.method] = asdict(one.summary())
+            flights.setdefault(one.flight, {})[one.row] = asdict(one.summary())
         return {
             "reason": self.reason,
             "notes": list(self.notes),
@@ -82,6 +88,7 @@ class RunFixes:
                 "confidence": CONFIDENCE,
             },
             "flights": flights,
+            "attitudes": list(self.attitudes),
             "verdict": [asdict(one) for one in verdicts],
         }
 
@@ -114,7 +121,9 @@ def verdicts_of(
         )
     for one in fixes.flights:
         if one.method != COARSE:
-            found.append(_of_fixes(run, one))
+            verdict = _of_fixes(run, one)
+            # An aid may speak against a flight; what speaks for one are fixes without it.
+            found += [verdict] if one.attitude is None or not verdict.may_fly else []
     for group in groups:
         worse = _worse_than_retrieval(run, group, unit)
         if group.role is Role.TEST and worse:
@@ -123,7 +132,7 @@ def verdicts_of(
 
 
 def _of_fixes(run: str, one: FlightFixes) -> Verdict:
-    summary, what = one.summary(), f"{one.method} on {one.flight}"
+    summary, what = one.summary(), f"{one.row} on {one.flight}"
     if summary.misleading:
         return Verdict(
             may_fly=False,
@@ -178,7 +187,7 @@ def _cells(one: FlightFixes, image: JudgedImage) -> tuple[str, ...]:
             str(int(error.is_misleading)),
         )
     return (
-        *(one.flight, one.method, image.name, number_cell(image.time_s)),
+        *(one.flight, one.row, image.name, number_cell(image.time_s)),
         *(str(int(image.is_usable)), image.state, image.source, image.reason),
         *errors[:4],
         *(number_cell(level) for level in image.protection_m),

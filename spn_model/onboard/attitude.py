@@ -21,6 +21,7 @@ from spn_model.onboard.view import View
 GIMBAL, CAMERA, BODY = "gimbal", "camera", "body"  # whose angles a file states
 MAX_TURN_DEG = 10.0  # of a mounting
 MAX_GAP_S = 1.0  # between records that are interpolated
+_SAME_S = 1e-3  # from a record, such as that of a photo, which needs no neighbour
 MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 45.0
 _TIME, _PITCH, _ROLL, _SIGMA = "time_s", "pitch_deg", "roll_deg", "sigma_deg"
 _MAX_BYTES, _MAX_ROWS = 50_000_000, 500_000
@@ -105,7 +106,8 @@ class Attitude:
         after = int(np.searchsorted(self.time_s, time_s))
         k = [max(after - 1, 0), min(after, len(self.time_s) - 1)]
         first_s, last_s = self.time_s[k]
-        if not first_s <= time_s <= last_s or last_s - first_s > MAX_GAP_S:
+        is_between = first_s <= time_s <= last_s and last_s - first_s <= MAX_GAP_S
+        if not is_between and not np.abs(self.time_s[k] - time_s).min() <= _SAME_S:
             return None
         share = (time_s - first_s) / (last_s - first_s) if last_s > first_s else 0.0
         up = (1 - share) * self.up[k[0]] + share * self.up[k[1]]

@@ -24,6 +24,7 @@ from spn_model.evaluation.fixes import (
     fix_error,
     largest_share,
 )
+from spn_model.evaluation.flight_attitude import FlightAttitude
 from spn_model.evaluation.metrics import Estimates as MethodEstimates
 from spn_model.evaluation.metrics import evaluate, evaluation_frames
 from spn_model.export.model_card import card_with_metrics
@@ -181,6 +182,31 @@ def test_what_speaks_against_a_flight_is_said(fixes, network_m, may_fly, words):
     assert words in " ".join(one.text for one in found)
 
 
+def attitude(*, is_simulated: bool) -> FlightAttitude:
+    """Return an attitude whose sentence says what kind it is."""
+    text = "Simulated." if is_simulated else "Recorded."
+    return FlightAttitude(verticals=(None,) * 3, is_simulated=is_simulated, text=text)
+
+
+def test_an_attitude_speaks_only_against_a_flight():
+    """Rows with one are apart in metrics.json; good ones give no sentence, misleading ones do."""
+    aided = replace(GOOD, attitude=attitude(is_simulated=False))
+    bad = replace(
+        aided, attitude=attitude(is_simulated=True), images=images(fix(turn_deg=3), fix())
+    )
+    fixes = RunFixes(flights=(GOOD, aided, bad))
+    found = verdicts_of("first", fixes, [], "m")
+    assert [one.may_fly for one in found] == [True, False]
+    assert "(search, simulated attitude on low)" in found[1].text
+    document = fixes.to_json(found)
+    rows = ["search", "search, attitude", "search, simulated attitude"]
+    assert list(document["flights"]["low"]) == rows
+    assert [row[1] for row in fix_rows(document["flights"])] == rows
+    assert document["attitudes"] == ["Recorded.", "Simulated."]
+    assert "3 images" in stanford_diagrams([GOOD, aided])["low-protection"]
+    assert stanford_diagrams([GOOD, aided]) == stanford_diagrams([GOOD])
+
+
 def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
     """fixes.csv has the reason of an image without a fix; the diagram shows fixes, not coarse poses."""
     coarse = replace(GOOD, method=COARSE)
@@ -200,7 +226,7 @@ def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
 
 def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     """Sections on errors and fixes are replaced, the others stay; a card without sections is unchanged."""
-    fixes = RunFixes(flights=(GOOD,))
+    fixes = RunFixes(flights=(GOOD, replace(GOOD, attitude=attitude(is_simulated=True))))
     document = fixes.to_json(verdicts_of("first", fixes, [group(9.0, 5.0)], "m"))
     metrics = {"units": "m", "groups": {}, "fixes": document}
     card = "# first\n\n## Errors\n\nold\n\n## Fixes\n\nold\n\n## Limits\n\nnone\n"
@@ -209,6 +235,8 @@ def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     assert made.startswith("# first\n\n## Errors\n\nMeasured by")
     assert made.endswith("\n\n## Limits\n\nnone\n")
     assert "| low | search | 2 of 3 | 1.0 cm, 0.00 deg | 0 (<= 77.6 %) |" in made
+    assert "| low | search, simulated attitude | 2 of 3 |" in made
+    assert "\n\nSimulated.\n\n" in made
     assert "- Coarse poses of first alone are not to be flown" in made
-    assert len(fix_rows(document["flights"])) == 1
+    assert len(fix_rows(document["flights"])) == 2
     assert card_with_metrics("# other\n", metrics, run="first", trained_on=()) == "# other\n"
