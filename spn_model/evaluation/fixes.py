@@ -273,7 +273,7 @@ def coarse_each(
 
 def measure_flight(
     bundle: Path, flight: EvaluationFlight, done: Callable[[], None], *, attitude: bool = True
-) -> tuple[tuple[FlightFixes, ...], tuple[str, ...]]:
+) -> tuple[tuple[FlightFixes, ...], str]:
     """Localize the images of a flight with a bundle in each way: coarse, search, track.
 
     Parameters
@@ -290,8 +290,8 @@ def measure_flight(
     -------
     fixes : tuple of FlightFixes
         Without `TRACK` if the images have no increasing times, or the video is not found.
-    notes : tuple of str
-        What is missing, and why.
+    note : str
+        Why `TRACK` is missing; empty otherwise.
 
     Raises
     ------
@@ -299,24 +299,22 @@ def measure_flight(
         If bundle or images cannot be used.
     """
     pilot = Pilot(bundle, flight.camera, PilotOptions(sequence=False))
-    known = pilot.localizer.bundle
-    given = [None]
-    if attitude:
-        given.append(attitude_of_flight(flight, known.gimbal))
-    found, notes = [], []
+    gimbal = pilot.localizer.bundle.gimbal
+    given = [None, *([attitude_of_flight(flight, gimbal)] if attitude else [])]
+    found: list[FlightFixes] = []
+    note = "its images have no increasing times"
     for one in given:
         found += [
             coarse_each(pilot.localizer, flight, done, one),
             search_each(pilot, flight, done, one),
         ]
-    if not has_times(flight):
-        notes.append(f"{flight.name} was not tracked: its images have no increasing times")
-        return tuple(found), tuple(notes)
-    try:
-        found += [track_all(Pilot(bundle, flight.camera), flight, done, one) for one in given]
-    except StageError as error:  # the video of tracked frames
-        notes.append(f"{flight.name} was not tracked: {error}")
-    return tuple(found), tuple(notes)
+        if has_times(flight):
+            try:
+                found.append(track_all(Pilot(bundle, flight.camera), flight, done, one))
+                note = ""
+            except StageError as error:  # the video of tracked frames
+                note = str(error)
+    return tuple(found), note and f"{flight.name} was not tracked: {note}"
 
 
 def steps_of(flight: EvaluationFlight, *, attitude: bool = True) -> int:

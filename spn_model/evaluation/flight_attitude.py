@@ -1,4 +1,4 @@
-"""Known attitude of the images of an evaluation flight: recorded by its gimbal, or simulated from its labels."""
+"""Known attitude of the images of an evaluation flight: recorded by its gimbal, or simulated from labels."""
 
 from __future__ import annotations
 

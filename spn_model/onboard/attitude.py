@@ -251,12 +251,7 @@ def attitude_of(
     """Return the attitude that the options of a command line name, or None; see `read_attitude`."""
     if given.attitude is None:
         return None
-    if not view.up_is_known:
-        raise InputError(
-            "the world of the bundle does not know up, so an attitude says nothing in it; georeference the "
-            "area, or leave out --attitude",
-            path=given.bundle,
-        )
+    check_up(view, given.bundle)
     return read_attitude(
         given.attitude,
         of=given.attitude_of,
@@ -265,6 +260,16 @@ def attitude_of(
         sigma_deg=given.attitude_sigma,
         offset_s=given.attitude_offset,
     )
+
+
+def check_up(view: View, path: Path) -> None:
+    """Raise InputError, naming the network's file, if its world does not know up."""
+    if not view.up_is_known:
+        raise InputError(
+            "its world does not know up, so an attitude says nothing in it; georeference the area, or leave "
+            "out --attitude",
+            path=path,
+        )
 
 
 def add_options(parser: argparse.ArgumentParser, kinds: tuple[str, ...]) -> None:

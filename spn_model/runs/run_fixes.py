@@ -145,9 +145,9 @@ def measure_fixes(
             done += 1
             progress(name, done, total)
 
-        fixes, missing = measure_flight(bundle.folder, flight, count, attitude=attitude)
+        fixes, note = measure_flight(bundle.folder, flight, count, attitude=attitude)
         measured += fixes
-        notes += missing
+        notes += [note] if note else []
     assert bundle.landmarks is not None  # flown_bundle
     return RunFixes(
         flights=tuple(measured),
