@@ -34,7 +34,7 @@ from spn_model.networks.pose_loss import (
 )
 from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
-from spn_model.onboard.decoding import with_vertical
+from spn_model.onboard.decoding import with_aids
 from spn_model.pretrained import weights
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 
@@ -349,7 +349,7 @@ def _levelled(found: PoseEstimates, verticals: Sequence[KnownVertical | None]) -
         if vertical is None or not np.isfinite(covariance[k]).all():
             continue
         try:
-            pose, covariance[k] = with_vertical(found.poses[k : k + 1], covariance[k], vertical)
+            pose, covariance[k] = with_aids(found.poses[k : k + 1], covariance[k], vertical)
             centers[k], quats[k] = pose.centers[0], pose.quats_wxyz[0]
         except GeometryError as error:
             centers[k], quats[k], covariance[k] = np.nan, np.nan, np.nan

@@ -22,6 +22,7 @@ from spn_model.autopilot.parameters import parameter_file
 from spn_model.autopilot.profiles import PROFILES, ROS2, Message
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
+from spn_model.integrity.height import HeightErrors
 from spn_model.onboard.attitude import (
     BODY,
     CAMERA,
@@ -31,6 +32,7 @@ from spn_model.onboard.attitude import (
     attitude_of,
 )
 from spn_model.onboard.flight_report import FlightReport
+from spn_model.onboard.height import Heights, add_height_options, heights_of
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.pre_arm import StatedPosition, pre_arm
 from spn_model.onboard.replay import FlownImage, RealTime
@@ -63,7 +65,10 @@ def fly(arguments: list[str]) -> None:
     pilot = Pilot(
         given.bundle,
         read_camera(given.camera),
-        PilotOptions(network=not given.no_network),
+        PilotOptions(
+            network=not given.no_network,
+            height=HeightErrors(sigma_m=given.height_sigma, zero_m=given.height_zero_sigma),
+        ),
         int8=given.int8,
         threads=given.threads,
     )
@@ -83,13 +88,14 @@ def fly(arguments: list[str]) -> None:
     )
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
     attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
-    images = _images(given, attitude)
+    heights = heights_of(given, view)
+    images = _images(given, attitude, heights)
     if given.pre_arm:
         for line in pre_arm(pilot, images, stated):
             sys.stdout.write(line + "\n")
         sys.stdout.write("Ready.\n")
         return
-    report, count, known, clock = FlightReport(), 0, 0, RealTime()
+    report, count, known, with_height, clock = FlightReport(), 0, 0, 0, RealTime()
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
@@ -108,9 +114,10 @@ def fly(arguments: list[str]) -> None:
             images = clock.paced(images)
         for sink in sinks:
             stack.callback(sink.close)
-        for time_us, image, vertical in images:
+        for time_us, image, vertical, height_m in images:
             count, known = count + 1, known + (vertical is not None)
-            item: Fix | NoFix = pilot.fix(image, time_us, vertical)
+            with_height += height_m is not None
+            item: Fix | NoFix = pilot.fix(image, time_us, vertical, height_m)
             report.add(item, pilot.steps_s)
             for sink in sinks:
                 sink.send(item)
@@ -121,6 +128,12 @@ def fly(arguments: list[str]) -> None:
         )
     if attitude is not None:
         lines.append(attitude.coverage(known, count))
+    if heights is not None:
+        zero = pilot.height
+        lines.append(
+            f"Height: known for {with_height} of {count} images; its zero is {zero.zero_m:+.2f} m from the "
+            f"stated one, known to {math.sqrt(zero.variance):.2f} m."
+        )
     for line in lines:
         sys.stdout.write(line + "\n")
 
@@ -138,12 +151,15 @@ def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
     return GeoOrigin(origin.lat_deg, origin.lon_deg, height, HeightReference.AMSL)
 
 
-def _images(given: argparse.Namespace, attitude: Attitude | None) -> Iterator[FlownImage]:
-    """Yield time in microseconds, image, and up in the camera if it is known."""
+def _images(
+    given: argparse.Namespace, attitude: Attitude | None, heights: Heights | None
+) -> Iterator[FlownImage]:
+    """Yield the images with what is known at their times."""
     for number, time_s, image in frames(given.source):
         seconds = number / given.fps if math.isnan(time_s) else time_s
         vertical = None if attitude is None else attitude.at(seconds)
-        yield _FIRST_US + round(1e6 * seconds), image, vertical
+        height_m = None if heights is None else heights.at(seconds)
+        yield _FIRST_US + round(1e6 * seconds), image, vertical, height_m
 
 
 def _write_parameters(
@@ -204,6 +220,7 @@ def _parser() -> argparse.ArgumentParser:
         help="of the camera from the body's centre, m",
     )
     add_options(parser, (GIMBAL, CAMERA, BODY))
+    add_height_options(parser)
     parser.add_argument(
         "--pre-arm",
         action="store_true",
