@@ -197,7 +197,8 @@ def open_link(
         the connection cannot be opened.
     """
     if profile == ROS2:
-        return Ros2Writer(Path(url), mounting=mounting, datum=datum)
+        coast_s = options.get("coast_s", SenderOptions.coast_s)
+        return Ros2Writer(Path(url), mounting=mounting, datum=datum, coast_s=coast_s)
     chosen = profile_of(profile)
     if datum is None:
         raise InputError(

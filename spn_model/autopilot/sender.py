@@ -15,7 +15,7 @@ from spn_model.autopilot.datum import Datum, Geodetic
 from spn_model.autopilot.frames import NED_FROM_ENU, BodyPose, Mounting, body_pose
 from spn_model.autopilot.profiles import LOCAL_MESSAGES, MAX_LOCAL_M, STALE_S, Message, Profile
 from spn_model.autopilot.timesync import Timesync
-from spn_model.integrity.coasting import RecentFixes
+from spn_model.integrity.coasting import RecentFixes, check_coast
 from spn_model.integrity.fix import Fix, FixState, NoFix
 
 _STALE_US = round(STALE_S * 1e6)
@@ -74,8 +74,7 @@ class SenderOptions:
         for name, value in (("sensor", self.sensor), ("system", self.system)):
             if not 1 <= value <= 255:
                 raise InputError(f"the {name} is {value}, not a number of 1 to 255")
-        if not 0 <= self.coast_s <= 1:
-            raise InputError(f"predictions go out for {self.coast_s!r} s, not 0 to 1")
+        check_coast(self.coast_s)
         if LOCAL_MESSAGES & set(self.messages):
             self.datum.require_amsl()
 
@@ -169,16 +168,13 @@ class Sender:
     def offer(self, item: Fix | NoFix) -> None:
         """Take the result of an image; a fix waits for the next slot."""
         with self._lock:
+            self._recent.follow(item)
             if isinstance(item, Fix) and item.usable:
                 self.report.replaced += self._waiting is not None
                 self._waiting = item
-                self._recent.add(item)
                 return
             if isinstance(item, Fix):
                 self.report.refused += 1
-            # After a single image without a pose, predictions go on.
-            if item.state != FixState.COAST:
-                self._recent.clear()
             if item.state == FixState.LOST:
                 self._lost, self._waiting = True, None
             self._failed_us = item.time_us

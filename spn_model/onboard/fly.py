@@ -99,7 +99,7 @@ def fly(arguments: list[str]) -> None:
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
-            sinks.append(open_writer(given.to, datum=datum, mounting=mounting))
+            sinks.append(open_writer(given.to, datum=datum, mounting=mounting, coast_s=given.coast))
         if given.mavlink is not None:
             link = open_link(
                 given.profile,
