@@ -14,6 +14,8 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.json_values import bounded, numbers
 from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
+from spn_model.autopilot.frames import Mounting
+from spn_model.autopilot.received_attitude import ReceivedAttitude
 from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.telemetry_file import MAX_TIME_S, between, read_columns
 from spn_model.onboard.view import View
@@ -145,10 +147,7 @@ def read_attitude(
     InputError
         If the file cannot be read, a value is none, or the standard deviation is not known.
     """
-    if sigma_deg is not None and not MIN_SIGMA_DEG <= sigma_deg <= MAX_SIGMA_DEG:
-        raise InputError(
-            f"--attitude-sigma {sigma_deg:g}: must be {MIN_SIGMA_DEG:g} to {MAX_SIGMA_DEG:g} degrees"
-        )
+    _check_sigma(sigma_deg)
     if not abs(offset_s) <= MAX_TIME_S:
         raise InputError(f"--attitude-offset {offset_s:g}: must be a number of seconds")
     rows = read_columns(
@@ -179,12 +178,84 @@ def read_attitude(
     )
 
 
+def _check_sigma(sigma_deg: float | None) -> None:
+    if sigma_deg is not None and not MIN_SIGMA_DEG <= sigma_deg <= MAX_SIGMA_DEG:
+        raise InputError(
+            f"--attitude-sigma {sigma_deg:g}: must be {MIN_SIGMA_DEG:g} to {MAX_SIGMA_DEG:g} degrees"
+        )
+
+
 def _up_in_body(pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
     """Return up (N, 3) in body axes (forward, right, down)."""
     pitch, roll = np.deg2rad(pitch_deg), np.deg2rad(roll_deg)
     return np.stack(
         [np.sin(pitch), -np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll)], axis=1
     )
+
+
+class LiveAttitude:
+    """Up in the camera while flying, from what an autopilot or its gimbal sends.
+
+    Parameters
+    ----------
+    received : ReceivedAttitude
+        Of the link to the autopilot.
+    of : str
+        "gimbal", "camera" or "body": whose angles they are.
+    mounting : GimbalMounting or None
+        Applied to the attitude of a gimbal; None if it is not known.
+    body_from_camera : ndarray, shape (3, 3)
+        Rotation from camera to body axes, for the attitude of the body.
+    sigma_deg : float, optional
+        Standard deviation of each angle, instead of that of the mounting.
+
+    Raises
+    ------
+    InputError
+        If the standard deviation is not known.
+    """
+
+    def __init__(
+        self,
+        received: ReceivedAttitude,
+        *,
+        of: str,
+        mounting: GimbalMounting | None,
+        body_from_camera: np.ndarray,
+        sigma_deg: float | None = None,
+    ):
+        _check_sigma(sigma_deg)
+        own = mounting if of == GIMBAL else None
+        if sigma_deg is None:
+            if own is None:
+                raise InputError(
+                    "the bundle knows no standard deviation for the angles of --live-attitude; give "
+                    "--attitude-sigma"
+                )
+            sigma_deg = own.sigma_deg
+        self._received = received
+        self._sigma_deg = sigma_deg
+        self._camera_from_sender = (
+            body_from_camera.T if of == BODY else Mounting().body_from_camera.T
+        )
+        if own is not None:
+            self._camera_from_sender = own.rotation @ self._camera_from_sender
+
+    def at(self, time_us: int) -> KnownVertical | None:
+        """Return up in the camera at a time on the clock of the link; None if no message is near."""
+        found = self._received.at(time_us)
+        if found is None:
+            return None
+        x, y, z = (self._camera_from_sender @ found[0]).tolist()
+        return KnownVertical(up=(x, y, z), sigma_deg=math.hypot(self._sigma_deg, found[1]))
+
+    def coverage(self, known: int, images: int) -> str:
+        """Return a sentence on how many images the attitude is known for."""
+        got = self._received
+        text = f"Attitude: received for {known} of {images} images, {got.taken} messages."
+        if got.refused:
+            text += f" {got.refused} messages were refused, the last one because {got.reason}."
+        return text
 
 
 def attitude_of(

@@ -17,7 +17,7 @@ from spn_data.geometry.camera_file import read_camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
-from spn_model.autopilot.link import FixSink, open_link
+from spn_model.autopilot.link import FixSink, Link, open_link
 from spn_model.autopilot.parameters import parameter_file
 from spn_model.autopilot.profiles import PROFILES, ROS2, Message
 from spn_model.autopilot.writers import open_writer
@@ -28,8 +28,11 @@ from spn_model.onboard.attitude import (
     CAMERA,
     GIMBAL,
     Attitude,
+    GimbalMounting,
+    LiveAttitude,
     add_options,
     attitude_of,
+    check_up,
 )
 from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.height import Heights, add_height_options, heights_of
@@ -55,6 +58,11 @@ def fly(arguments: list[str]) -> None:
         raise InputError(
             "--mavlink goes to an autopilot: give --profile px4 or ardupilot; --to writes a ROS 2 bag"
         )
+    is_live = given.live_attitude
+    if is_live and (given.mavlink is None or given.attitude is not None or given.pre_arm):
+        raise InputError(
+            "--live-attitude comes over --mavlink, takes the place of --attitude, and is not for --pre-arm"
+        )
     if given.parameters is not None:
         _write_parameters(given.parameters, given.profile, messages, use_height=given.use_height)
     cv2.setNumThreads(given.threads)
@@ -62,32 +70,15 @@ def fly(arguments: list[str]) -> None:
     stated = None
     if given.at is not None:
         stated = StatedPosition(lat_deg=given.at[0], lon_deg=given.at[1], sigma_m=given.at_sigma)
-    pilot = Pilot(
-        given.bundle,
-        read_camera(given.camera),
-        PilotOptions(
-            network=not given.no_network,
-            height=HeightErrors(sigma_m=given.height_sigma, zero_m=given.height_zero_sigma),
-        ),
-        int8=given.int8,
-        threads=given.threads,
-    )
-    view = pilot.localizer.bundle.view
-    if view.units != "m":
-        raise InputError(
-            "its world has no metres, so a fix in it means nothing outside; georegister the area",
-            path=given.bundle,
-        )
-    datum = (
-        None
-        if view.origin is None
-        else Datum(
-            origin=above_sea(view.origin, given.takeoff_height),
-            geoid_height_m=given.geoid_height,
-        )
-    )
+    pilot = _pilot(given)
+    view, gimbal = pilot.localizer.bundle.view, pilot.localizer.bundle.gimbal
+    datum = _datum(given, view.origin)
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
-    attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
+    attitude: Attitude | LiveAttitude | None = attitude_of(
+        given, gimbal, view, mounting.body_from_camera
+    )
+    if is_live:
+        check_up(view, given.bundle)
     heights = heights_of(given, view)
     images = _images(given, attitude, heights)
     if given.pre_arm:
@@ -100,6 +91,7 @@ def fly(arguments: list[str]) -> None:
         sinks: list[FixSink] = []
         if given.to is not None:
             sinks.append(open_writer(given.to, datum=datum, mounting=mounting, coast_s=given.coast))
+            stack.callback(sinks[-1].close)
         if given.mavlink is not None:
             link = open_link(
                 given.profile,
@@ -109,12 +101,16 @@ def fly(arguments: list[str]) -> None:
                 messages=messages,
                 use_height=given.use_height,
                 coast_s=given.coast,
+                attitude_of="" if not is_live else BODY if given.attitude_of == BODY else GIMBAL,
             )
             sinks.append(link)
+            stack.callback(link.close)
+            if is_live:
+                attitude = _live_attitude(given, link, gimbal, mounting)
             images = clock.paced(images)
-        for sink in sinks:
-            stack.callback(sink.close)
         for time_us, image, vertical, height_m in images:
+            if isinstance(attitude, LiveAttitude):
+                vertical = attitude.at(time_us)
             count, known = count + 1, known + (vertical is not None)
             with_height += height_m is not None
             item: Fix | NoFix = pilot.fix(image, time_us, vertical, height_m)
@@ -138,6 +134,46 @@ def fly(arguments: list[str]) -> None:
         sys.stdout.write(line + "\n")
 
 
+def _pilot(given: argparse.Namespace) -> Pilot:
+    """Return the pilot of a bundle; raise InputError if its world has no metres."""
+    pilot = Pilot(
+        given.bundle,
+        read_camera(given.camera),
+        PilotOptions(
+            network=not given.no_network,
+            height=HeightErrors(sigma_m=given.height_sigma, zero_m=given.height_zero_sigma),
+        ),
+        int8=given.int8,
+        threads=given.threads,
+    )
+    if pilot.localizer.bundle.view.units != "m":
+        raise InputError(
+            "its world has no metres, so a fix in it means nothing outside; georegister the area",
+            path=given.bundle,
+        )
+    return pilot
+
+
+def _datum(given: argparse.Namespace, origin: GeoOrigin | None) -> Datum | None:
+    if origin is None:
+        return None
+    return Datum(origin=above_sea(origin, given.takeoff_height), geoid_height_m=given.geoid_height)
+
+
+def _live_attitude(
+    given: argparse.Namespace, link: FixSink, gimbal: GimbalMounting | None, mounting: Mounting
+) -> LiveAttitude:
+    assert isinstance(link, Link)
+    assert link.attitude is not None
+    return LiveAttitude(
+        link.attitude,
+        of=given.attitude_of,
+        mounting=gimbal,
+        body_from_camera=mounting.body_from_camera,
+        sigma_deg=given.attitude_sigma,
+    )
+
+
 def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
     """Return the origin with its height above sea level, if that of the take-off point is given."""
     if takeoff_height_m is None:
@@ -152,12 +188,12 @@ def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
 
 
 def _images(
-    given: argparse.Namespace, attitude: Attitude | None, heights: Heights | None
+    given: argparse.Namespace, attitude: Attitude | LiveAttitude | None, heights: Heights | None
 ) -> Iterator[FlownImage]:
     """Yield the images with what is known at their times."""
     for number, time_s, image in frames(given.source):
         seconds = number / given.fps if math.isnan(time_s) else time_s
-        vertical = None if attitude is None else attitude.at(seconds)
+        vertical = attitude.at(seconds) if isinstance(attitude, Attitude) else None
         height_m = None if heights is None else heights.at(seconds)
         yield _FIRST_US + round(1e6 * seconds), image, vertical, height_m
 
@@ -220,6 +256,11 @@ def _parser() -> argparse.ArgumentParser:
         help="of the camera from the body's centre, m",
     )
     add_options(parser, (GIMBAL, CAMERA, BODY))
+    parser.add_argument(
+        "--live-attitude",
+        action="store_true",
+        help="take the attitude from what the autopilot (of the body) or its gimbal sends over --mavlink",
+    )
     add_height_options(parser)
     parser.add_argument(
         "--pre-arm",
