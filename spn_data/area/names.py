@@ -43,5 +43,7 @@ RUNS = "runs"
 CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIXES, FIGURES, BUNDLE = "errors.csv", "fixes.csv", "figures", "bundle"
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
+BUNDLE_FILE = "bundle.json"  # in a bundle
+EXPECTED = "expected.json"  # what is expected of planned waypoints with the bundle
 RETRIEVAL = ".retrieval.json"  # in RUNS: cache of the retrieval baselines
 COMPARED = "compared"  # in RUNS: several runs evaluated together

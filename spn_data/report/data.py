@@ -15,6 +15,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
+from spn_data.report.expected import ExpectedPlan
 from spn_data.report.fix_facts import BundleFixes
 from spn_data.report.network_state import NetworkState
 from spn_data.split import audit
@@ -365,6 +366,8 @@ class ReportData:
         Why other runs cannot be shown.
     trained : tuple of NetworkState
         Trained networks, the newest first.
+    plans, broken_plans : tuple of ExpectedPlan, tuple of str
+        What is expected of planned waypoints, and why others cannot be shown.
     """
 
     title: str
@@ -386,6 +389,8 @@ class ReportData:
     runs: tuple[RunFacts, ...] = ()
     broken_runs: tuple[str, ...] = ()
     trained: tuple[NetworkState, ...] = ()
+    plans: tuple[ExpectedPlan, ...] = ()
+    broken_plans: tuple[str, ...] = ()
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

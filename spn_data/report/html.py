@@ -8,6 +8,7 @@ from string import Template
 
 from spn_data.report import sections
 from spn_data.report.data import ReportData
+from spn_data.report.expected import expected_plans
 from spn_data.report.figures import key_figures
 from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
@@ -45,7 +46,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),
-        "networks": networks(data),
+        "networks": networks(data) + expected_plans(data.plans, data.broken_plans),
         "table": sections.table(frames),
         "stages": sections.stages(data),
         "style": _asset("style.css"),

@@ -35,7 +35,7 @@ from spn_model.onboard.attitude import (
     check_up,
 )
 from spn_model.onboard.flight_report import FlightReport
-from spn_model.onboard.height import Heights, add_height_options, heights_of
+from spn_model.onboard.height import BarometerHeights, add_height_options, heights_of
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.pre_arm import StatedPosition, pre_arm
 from spn_model.onboard.replay import FlownImage, RealTime
@@ -188,7 +188,9 @@ def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
 
 
 def _images(
-    given: argparse.Namespace, attitude: Attitude | LiveAttitude | None, heights: Heights | None
+    given: argparse.Namespace,
+    attitude: Attitude | LiveAttitude | None,
+    heights: BarometerHeights | None,
 ) -> Iterator[FlownImage]:
     """Yield the images with what is known at their times."""
     for number, time_s, image in frames(given.source):

@@ -19,7 +19,7 @@ _MAX_M = 20_000.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Heights:
+class BarometerHeights:
     """Readings of a barometer at N times.
 
     Attributes
@@ -44,7 +44,7 @@ class Heights:
 
 def read_heights(
     path: Path, origin: GeoOrigin, *, zero_m: float | None = None, offset_s: float = 0.0
-) -> Heights:
+) -> BarometerHeights:
     """Read heights above take-off from a CSV file.
 
     Parameters
@@ -61,7 +61,7 @@ def read_heights(
 
     Returns
     -------
-    Heights
+    BarometerHeights
 
     Raises
     ------
@@ -87,10 +87,10 @@ def read_heights(
             f"--height-zero {zero_m:g} or --height-offset {offset_s:g} is out of range"
         )
     rows = read_columns(path, {_READING: (-_MAX_M, _MAX_M)})
-    return Heights(time_s=rows[:, 0] + offset_s, up_m=rows[:, 1] + zero_m - origin.alt_m)
+    return BarometerHeights(time_s=rows[:, 0] + offset_s, up_m=rows[:, 1] + zero_m - origin.alt_m)
 
 
-def heights_of(given: argparse.Namespace, view: View) -> Heights | None:
+def heights_of(given: argparse.Namespace, view: View) -> BarometerHeights | None:
     """Return the heights that the options of a command line name, or None; see `read_heights`."""
     if given.height is None:
         return None
