@@ -62,8 +62,8 @@ def _plan(one: ExpectedPlan) -> str:
     more = one.perhaps + one.no - len(one.lacking)
     return (
         f"<h3>{escape(one.plan)}, bundle of {escape(one.run)}</h3>{old}"
-        f"<p>A fix is to be expected at {one.yes:,} of {total:,} waypoints, perhaps at {one.perhaps:,} "
-        f"more.</p>{table}"
+        f"<p>A fix is to be expected at {one.yes:,} of {total:,} waypoints"
+        f"{f', perhaps at {one.perhaps:,} more' if one.perhaps else ''}.</p>{table}"
         + (f'<p class="note">{more:,} more are not shown.</p>' if more > 0 else "")
         + '<p class="note">Views were rendered there from the training images and searched by the bundle. '
         "Perhaps: none in the rendered view, but many landmarks. Not known: light, seasons, what moved or "

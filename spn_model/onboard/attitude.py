@@ -147,9 +147,7 @@ def read_attitude(
     InputError
         If the file cannot be read, a value is none, or the standard deviation is not known.
     """
-    _check_sigma(sigma_deg)
-    if not abs(offset_s) <= MAX_TIME_S:
-        raise InputError(f"--attitude-offset {offset_s:g}: must be a number of seconds")
+    _check_stated(sigma_deg, offset_s)
     rows = read_columns(
         path,
         {_PITCH: (-180, 180), _ROLL: (-180, 180)},
@@ -178,11 +176,13 @@ def read_attitude(
     )
 
 
-def _check_sigma(sigma_deg: float | None) -> None:
+def _check_stated(sigma_deg: float | None, offset_s: float) -> None:
     if sigma_deg is not None and not MIN_SIGMA_DEG <= sigma_deg <= MAX_SIGMA_DEG:
         raise InputError(
             f"--attitude-sigma {sigma_deg:g}: must be {MIN_SIGMA_DEG:g} to {MAX_SIGMA_DEG:g} degrees"
         )
+    if not abs(offset_s) <= MAX_TIME_S:
+        raise InputError(f"--attitude-offset {offset_s:g}: must be a number of seconds")
 
 
 def _up_in_body(pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
@@ -208,11 +208,13 @@ class LiveAttitude:
         Rotation from camera to body axes, for the attitude of the body.
     sigma_deg : float, optional
         Standard deviation of each angle, instead of that of the mounting.
+    offset_s : float
+        Added to the times of the messages, to give times of the images.
 
     Raises
     ------
     InputError
-        If the standard deviation is not known.
+        If the standard deviation is not known, or a value is out of range.
     """
 
     def __init__(
@@ -223,8 +225,9 @@ class LiveAttitude:
         mounting: GimbalMounting | None,
         body_from_camera: np.ndarray,
         sigma_deg: float | None = None,
+        offset_s: float = 0.0,
     ):
-        _check_sigma(sigma_deg)
+        _check_stated(sigma_deg, offset_s)
         own = mounting if of == GIMBAL else None
         if sigma_deg is None:
             if own is None:
@@ -233,7 +236,7 @@ class LiveAttitude:
                     "--attitude-sigma"
                 )
             sigma_deg = own.sigma_deg
-        self._received = received
+        self._received, self._offset_us = received, round(1e6 * offset_s)
         self._sigma_deg = sigma_deg
         self._camera_from_sender = (
             body_from_camera.T if of == BODY else Mounting().body_from_camera.T
@@ -243,7 +246,7 @@ class LiveAttitude:
 
     def at(self, time_us: int) -> KnownVertical | None:
         """Return up in the camera at a time on the clock of the link; None if no message is near."""
-        found = self._received.at(time_us)
+        found = self._received.at(time_us - self._offset_us)
         if found is None:
             return None
         x, y, z = (self._camera_from_sender @ found[0]).tolist()

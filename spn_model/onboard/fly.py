@@ -171,6 +171,7 @@ def _live_attitude(
         mounting=gimbal,
         body_from_camera=mounting.body_from_camera,
         sigma_deg=given.attitude_sigma,
+        offset_s=given.attitude_offset,
     )
 
 

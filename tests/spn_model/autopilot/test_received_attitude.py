@@ -152,3 +152,6 @@ def test_live_and_recorded_angles_give_the_same_up(tmp_path, of):
     expected = read_attitude(path, **given).at(0.0)
     assert found.up == pytest.approx(expected.up, abs=1e-5)
     assert found.sigma_deg == pytest.approx(expected.sigma_deg)
+    later = LiveAttitude(received, **given, offset_s=0.3)
+    assert later.at(NOW) is None
+    assert later.at(NOW + 300_000) == found
