@@ -27,12 +27,11 @@ import spn_data
 from spn_data.area.area import Area
 from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import pose_errors
-from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.inputs.frame_images import image_path
 from spn_data.labels.labels import Labels
 from spn_model.evaluation.fixes import fix_error
+from spn_model.evaluation.flight_attitude import noisy_vertical
 from spn_model.integrity.fix import Fix
-from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.flight_report import StepTimes
 from spn_model.onboard.pilot import Pilot, PilotOptions
 
@@ -65,15 +64,6 @@ def errors(fix: Fix, labels: Labels, row: int) -> tuple[float, float, float, boo
     """Return position and rotation error, NEES / 6, and whether the fix is misleading."""
     found = fix_error(fix, labels.poses[row : row + 1])
     return found.error_m, found.error_deg, found.nees, found.is_misleading
-
-
-def noisy_vertical(
-    rotation: np.ndarray, sigma_deg: float, rng: np.random.Generator
-) -> KnownVertical:
-    """Return up in a camera of known rotation, with normal noise along each of two axes."""
-    noise = np.deg2rad(sigma_deg) * np.append(rng.normal(size=2), 0.0)
-    x, y, z = (rotation @ rotations_from_vectors(noise[None])[0][:, 2]).tolist()
-    return KnownVertical(up=(x, y, z), sigma_deg=sigma_deg)
 
 
 def coarse(

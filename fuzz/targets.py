@@ -32,6 +32,7 @@ from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_data.ground_control.control_file import read_control_file
 from spn_data.ground_control.coordinates import surveyed_positions
 from spn_data.inputs.area_labels import read_written_world
+from spn_data.inputs.expected_plans import read_expected_plans
 from spn_data.inputs.network_runs import read_runs
 from spn_data.labels.labels import read_label_observations, read_labels
 from spn_data.pipeline.area_audit import read_audit
@@ -54,6 +55,7 @@ from spn_model.evaluation.results import read_run
 from spn_model.models.checkpoint import load
 from spn_model.onboard.attitude import Attitude, read_attitude
 from spn_model.onboard.bundle import GRAPHS, read_bundle, sha256_of
+from spn_model.onboard.height import BarometerHeights, read_heights
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.sources import frames as onboard_frames
 from spn_model.pretrained.tensors import read_tensors
@@ -110,6 +112,11 @@ def _video(path: Path) -> None:
     probe(path)
     for _, _frame in zip(range(_FRAMES), decode_gray(path, threads=1), strict=False):
         pass
+
+
+def _heights(path: Path) -> BarometerHeights:
+    """Read a telemetry file as heights in a world whose heights count from take-off."""
+    return read_heights(path, GeoOrigin(49.0, 8.4, 2.0, HeightReference.TAKEOFF))
 
 
 def _attitude(path: Path) -> Attitude:
@@ -182,6 +189,7 @@ def _area(path: Path) -> None:
         reader.labels(sequence)
         reader.observations(sequence)
     read_runs(area)
+    read_expected_plans(area)
     read_coverage(area)
     write_report(area)
 
@@ -273,6 +281,7 @@ TARGETS = (
     Target("frames.csv", "area/1-frames/frames.csv area/4-eval/*/frames.csv", read_frames),
     Target("telemetry.csv", "area/1-frames/telemetry/*.csv", read_track),
     Target("attitude", "area/1-frames/telemetry/*.csv", _attitude),
+    Target("heights", "area/1-frames/telemetry/*.csv", _heights),
     Target("coverage.csv", "area/coverage/*.csv", read_strata),
     Target("registration.csv", "area/2-model/registration.csv", _reasons, 1),
     Target("COLMAP model", "area/3-geo/*.bin", _model, 1),

@@ -51,12 +51,13 @@ def availability(
 
     At each waypoint, a view is rendered from the training images, and the bundle of the run searches for it.
     Without waypoints, this is done for the frames of the evaluation flights and compared with the fixes that
-    they had.
+    they had. What is expected of the last plan is kept in the folder of the run, and report.html shows it.
 
     \b
     Example:
         spn-model availability --area fields/north --run first --waypoints plan.csv --fov 84
     """
+    from spn_cli import page
     from spn_data.geometry.camera_file import read_camera
     from spn_data.inputs.area_labels import map_folder, read_labelled_area
     from spn_data.inputs.evaluation_flights import read_evaluation_flights
@@ -68,6 +69,7 @@ def availability(
     )
     from spn_model.runs.run_availability import (
         expect_fixes,
+        keep_plan,
         measured_usable,
         searched_frames,
         write_expected,
@@ -102,9 +104,13 @@ def availability(
     else:
         _show_comparison(found, measured)
     console.note(_UNKNOWN)
+    if waypoints is not None:
+        keep_plan(run, waypoints.name, parts[0])
     if target is not None:
         write_expected(target, [one for part in parts for one in part])
         console.out.print(f"{target}: {sum(map(len, parts))} rows.")
+    if waypoints is not None:
+        page.refresh_if_free(area)
 
 
 def _show_plan(found: dict[str, list[ExpectedFix]]) -> None:

@@ -33,6 +33,12 @@ from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
     "[default: where the run has one with landmarks]",
 )
 @click.option(
+    "--attitude/--no-attitude",
+    default=True,
+    show_default=True,
+    help="Measure fixes a second time, with pitch and roll from the telemetry of the flight.",
+)
+@click.option(
     "--video",
     "video_folder",
     type=click.Path(path_type=Path),
@@ -67,6 +73,7 @@ def evaluate(
     names: tuple[str, ...],
     baselines: bool,
     fixes: bool | None,
+    attitude: bool,
     video_folder: Path | None,
     dropout_samples: int | None,
     training_images: int,
@@ -115,6 +122,7 @@ def evaluate(
                 lambda: read_evaluation_flights(area, video_folder=video_folder),
                 progress,
                 required=bool(fixes),
+                attitude=attitude,
             )
         )
         evaluated = evaluate_runs(

@@ -63,6 +63,31 @@ _VIEW_SEEN = 0.98  # share of the network's view below which a note is shown
     show_default=True,
     help="Batch size.",
 )
+@click.option(
+    "--attitude",
+    "attitude_file",
+    type=click.Path(path_type=Path),
+    help="CSV file with pitch and roll of the one source, from spn-data telemetry.",
+)
+@click.option(
+    "--attitude-of",
+    type=click.Choice(["gimbal", "camera"]),
+    default="gimbal",
+    show_default=True,
+    help="Whose angles: of a gimbal, corrected by its mounting in the bundle of the run, or of the camera.",
+)
+@click.option(
+    "--attitude-sigma",
+    type=options.Finite(0.001, 45),
+    help="Standard deviation of each angle, degrees.  [default: of the file, or of the mounting]",
+)
+@click.option(
+    "--attitude-offset",
+    type=options.Finite(-1e9, 1e9),
+    default=0.0,
+    show_default=True,
+    help="Seconds to add to the times of that file.",
+)
 @options.device
 @options.threads
 @click.option("--overwrite", is_flag=True, help="Replace predicted poses in that folder.")
@@ -80,6 +105,10 @@ def predict(
     every: int,
     fps: float | None,
     batch: int,
+    attitude_file: Path | None,
+    attitude_of: str,
+    attitude_sigma: float | None,
+    attitude_offset: float,
     device: str,
     threads: int | None,
     overwrite: bool,
@@ -97,7 +126,7 @@ def predict(
     from spn_model.prediction.flights import FrameFilter
     from spn_model.prediction.predict import WGS84, PredictionStopped, PredictOptions
     from spn_model.runs.run_files import RunFiles
-    from spn_model.runs.run_prediction import prepare_prediction
+    from spn_model.runs.run_prediction import AttitudeFile, prepare_prediction
 
     run = RunFiles(options.open_area(area_folder).run_folder(name))
     prediction = prepare_prediction(
@@ -105,6 +134,14 @@ def predict(
         device=device,
         threads=threads or 0,
         overwrite=overwrite,
+        attitude=None
+        if attitude_file is None
+        else AttitudeFile(
+            path=attitude_file,
+            of=attitude_of,
+            sigma_deg=attitude_sigma,
+            offset_s=attitude_offset,
+        ),
     )
     for note in prediction.notes:
         console.note(note)
@@ -121,6 +158,10 @@ def predict(
         click.echo("Stopped: the poses so far are written; the rest is missing.", err=True)
         context.exit(130)
     _show(found)
+    if prediction.attitude is not None:
+        console.out.print(
+            prediction.attitude.coverage(found.with_attitude, sum(found.counts.values()))
+        )
     view = prediction.network.view
     if "wgs84" in formats and view.origin is not None:
         console.out.print(f"Heights in {WGS84} are above: {view.origin.height_reference.value}.")

@@ -56,6 +56,8 @@ def fixes(evaluated: EvaluatedRuns) -> None:
         rows = fix_rows(found.to_json()["flights"])
         if rows:
             console.table(f"{name}: fixes of its bundle on evaluation flights", rows, FIX_HEADER)
+        for text in found.attitudes:
+            console.out.print(text)
         for note in found.notes:
             console.note(note)
 

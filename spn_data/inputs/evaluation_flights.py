@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spn_data.area.area import Area
+from spn_data.area.names import EVALUATION, TRACK
 from spn_data.errors import InputError
 from spn_data.geometry.camera import Camera
 from spn_data.inputs.area_labels import map_folder, read_labelled_area
@@ -38,6 +39,11 @@ class EvaluationFlight:
     labels: Labels
     area: Area = field(repr=False)
     video_folder: Path | None = None
+
+    @property
+    def telemetry(self) -> Path:
+        """Its telemetry on the clock of the images, a CSV table; it may not exist."""
+        return self.area.folder(f"{EVALUATION}/{self.name}") / TRACK
 
     def images(self, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Iterate over the full-size images of frames, in the order of `rows`, which have to be ascending.

@@ -245,10 +245,12 @@ def _fixes(value: Mapping[str, Any]) -> BundleFixes:
         for flight, methods in value["flights"].items()
         for method, of in methods.items()
     ]
+    attitudes = [_text(one, _MAX_REASON) for one in value.get("attitudes", ())[:_MAX_FIX_ROWS]]
     return BundleFixes(
         rows=tuple(rows[:_MAX_FIX_ROWS]),
         reason=_text(value["reason"], _MAX_REASON),
         made_of={_text(part): _text(digest) for part, digest in value["bundle"].items()},
+        attitudes=tuple(attitudes),
     )
 
 

@@ -34,6 +34,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
+from spn_data.inputs.expected_plans import read_expected_plans
 from spn_data.inputs.network_runs import read_runs, trained_runs
 from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
@@ -139,6 +140,7 @@ def report_data(area: Area) -> ReportData:
     candidates = read_frames(area.folder(FRAMES) / FRAMES_TABLE)
     frames = frame_table(candidates, labelled, residuals, _strata(area), groups)
     runs, broken_runs = read_runs(area)
+    plans, broken_plans = read_expected_plans(area)
     return ReportData(
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
@@ -161,6 +163,8 @@ def report_data(area: Area) -> ReportData:
         },
         runs=runs,
         broken_runs=broken_runs,
+        plans=plans,
+        broken_plans=broken_plans,
         trained=trained_runs(area, runs),
         expect_low=frozenset(area.facts.expect_low),
         recorded=_recorded_flight(area),

@@ -15,6 +15,7 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
+from spn_data.report.expected import ExpectedPlan
 from spn_data.report.fix_facts import BundleFixes
 from spn_data.report.network_state import NetworkState, RecordedFlight
 from spn_data.split import audit
@@ -369,6 +370,8 @@ class ReportData:
         Evaluation sequences that are declared to be far from the map.
     recorded : RecordedFlight or None
         An evaluation flight whose video is known.
+    plans, broken_plans : tuple of ExpectedPlan, tuple of str
+        What is expected of planned waypoints, and why others cannot be shown.
     """
 
     title: str
@@ -392,6 +395,8 @@ class ReportData:
     trained: tuple[NetworkState, ...] = ()
     expect_low: frozenset[str] = frozenset()
     recorded: RecordedFlight | None = None
+    plans: tuple[ExpectedPlan, ...] = ()
+    broken_plans: tuple[str, ...] = ()
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

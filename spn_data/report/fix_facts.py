@@ -13,6 +13,7 @@ class FixFigures:
     Attributes
     ----------
     flight, method : str
+        The method says whether an attitude was known, and whether that was simulated.
     images, usable, compared : int
         Number of images, of those with a usable fix, and of those with a label too.
     error_m, error_deg : float or None
@@ -51,8 +52,11 @@ class BundleFixes:
         Why nothing was measured; empty otherwise.
     made_of : mapping of str to str
         SHA-256 of the `network` and the `landmarks` that they were measured with.
+    attitudes : tuple of str
+        Where the known attitude of each flight is from.
     """
 
     rows: tuple[FixFigures, ...] = ()
     reason: str = ""
     made_of: Mapping[str, str] = field(default_factory=dict)
+    attitudes: tuple[str, ...] = ()

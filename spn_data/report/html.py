@@ -10,6 +10,7 @@ from string import Template
 from spn_data.report import sections
 from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import ReportData
+from spn_data.report.expected import expected_plans
 from spn_data.report.figures import key_figures
 from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
@@ -55,7 +56,7 @@ def render(
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),
-        "networks": networks(data),
+        "networks": networks(data) + expected_plans(data.plans, data.broken_plans),
         "table": sections.table(frames),
         "stages": sections.stages(data),
         "style": _asset("style.css"),

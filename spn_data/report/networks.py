@@ -170,7 +170,9 @@ def _fixes(run: RunFacts) -> str:
         + _table(_FIX_HEADER, rows, "fixes")
         + '<p class="note">Coarse: the network alone. Search: fixes of single images. Track: of the images '
         "one after the other. Misleading: published as usable and off by more than 0.5 m, 2&deg; or its "
-        "protection level; in brackets the upper bound of its share, with 95 % confidence.</p>"
+        "protection level; in brackets the upper bound of its share, with 95 % confidence."
+        + "".join(f" {escape(text)}" for text in run.fixes.attitudes)
+        + "</p>"
     )
 
 

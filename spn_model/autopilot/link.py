@@ -14,6 +14,7 @@ from spn_model.autopilot import mavlink
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.profiles import ROS2, Message, Profile, profile_of
+from spn_model.autopilot.received_attitude import ReceivedAttitude
 from spn_model.autopilot.ros2 import Ros2Writer
 from spn_model.autopilot.sender import Sender, SenderOptions, SenderReport
 from spn_model.autopilot.transport import Transport, open_transport
@@ -84,6 +85,11 @@ class Link:
         if self._crash is not None:
             raise SpnError(f"the link to the autopilot has ended: {self._crash!r}")
         self._sender.offer(item)
+
+    @property
+    def attitude(self) -> ReceivedAttitude | None:
+        """What the autopilot sent of an attitude, if the options ask for it."""
+        return self._sender.attitude
 
     def report(self) -> SenderReport:
         """Return a copy of the counts so far."""
@@ -197,7 +203,8 @@ def open_link(
         the connection cannot be opened.
     """
     if profile == ROS2:
-        return Ros2Writer(Path(url), mounting=mounting, datum=datum)
+        coast_s = options.get("coast_s", SenderOptions.coast_s)
+        return Ros2Writer(Path(url), mounting=mounting, datum=datum, coast_s=coast_s)
     chosen = profile_of(profile)
     if datum is None:
         raise InputError(

@@ -21,7 +21,7 @@ ESTIMATOR_VISION = 2  # MAV_ESTIMATOR_TYPE
 QUALITY_FAILED = -1
 COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _TYPE_ONBOARD, _NO_AUTOPILOT, _ACTIVE = 18, 8, 4  # MAV_TYPE_ONBOARD_CONTROLLER and so on
-_REQUEST_MESSAGE, _GPS_GLOBAL_ORIGIN = 512, 49
+_REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL, _GPS_GLOBAL_ORIGIN = 512, 511, 49
 _UPPER = np.triu_indices(6)
 _NAN = math.nan
 _IGNORE_CRC = "MAV_IGNORE_CRC"  # pymavlink would accept damaged messages
@@ -191,6 +191,13 @@ def request_origin(link: Any, target: int) -> Any:
     """Return the command that asks an autopilot for GPS_GLOBAL_ORIGIN."""
     return link.command_long_encode(
         target, 0, _REQUEST_MESSAGE, 0, _GPS_GLOBAL_ORIGIN, 0, 0, 0, 0, 0, 0
+    )
+
+
+def request_interval(link: Any, target: int, message_id: int, interval_us: int) -> Any:
+    """Return the command that asks an autopilot for a message again and again."""
+    return link.command_long_encode(
+        target, 0, _SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
     )
 
 

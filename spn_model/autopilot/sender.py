@@ -14,14 +14,17 @@ from spn_model.autopilot import mavlink
 from spn_model.autopilot.datum import Datum, Geodetic
 from spn_model.autopilot.frames import NED_FROM_ENU, BodyPose, Mounting, body_pose
 from spn_model.autopilot.profiles import LOCAL_MESSAGES, MAX_LOCAL_M, STALE_S, Message, Profile
+from spn_model.autopilot.received_attitude import MESSAGES as ATTITUDE_MESSAGES
+from spn_model.autopilot.received_attitude import ReceivedAttitude
 from spn_model.autopilot.timesync import Timesync
-from spn_model.integrity.coasting import RecentFixes
+from spn_model.integrity.coasting import RecentFixes, check_coast
 from spn_model.integrity.fix import Fix, FixState, NoFix
 
 _STALE_US = round(STALE_S * 1e6)
 _FUTURE_US = 50_000  # a stamp ahead of the clock by more comes from another clock
 _SECOND_US = 1_000_000
 _STEP_US = 1000  # a fix that comes after a prediction is moved on to this much later
+_ATTITUDE_US = 50_000  # between two messages of an attitude that are asked for
 _ASKED_FIRST = 3  # times that an autopilot is asked for its origin before it is given one
 
 
@@ -49,6 +52,8 @@ class SenderOptions:
     coast_s : float
         Age of the last fix up to which poses predicted from it go out between images, 0 to 1 s; 0: none.
         They have the state `coast` and the quality 49, below that of every fix.
+    attitude_of : str
+        Whose attitude is received: `body` or `gimbal`; empty: none.
     flag_unhealthy : bool
         Send GLOBAL_POSITION_SENSOR with the flag for an unhealthy sensor while there is no fix, instead of
         none. Off by default: it could not be verified that PX4 heeds the flag, but it does stop after 5 s
@@ -64,6 +69,7 @@ class SenderOptions:
     reset_on_reacquisition: bool = False
     coast_s: float = 0.5
     flag_unhealthy: bool = False
+    attitude_of: str = ""
 
     def __post_init__(self) -> None:
         known = set(Message)
@@ -74,8 +80,9 @@ class SenderOptions:
         for name, value in (("sensor", self.sensor), ("system", self.system)):
             if not 1 <= value <= 255:
                 raise InputError(f"the {name} is {value}, not a number of 1 to 255")
-        if not 0 <= self.coast_s <= 1:
-            raise InputError(f"predictions go out for {self.coast_s!r} s, not 0 to 1")
+        check_coast(self.coast_s)
+        if self.attitude_of and self.attitude_of not in ATTITUDE_MESSAGES:
+            raise InputError(f"there is no attitude of the {self.attitude_of}")
         if LOCAL_MESSAGES & set(self.messages):
             self.datum.require_amsl()
 
@@ -147,12 +154,15 @@ class Sender:
         pymavlink's MAVLink object.
     report : SenderReport
         Counts so far.
+    attitude : ReceivedAttitude or None
+        What was received of it, if the options ask for it.
     """
 
     profile: Profile
     options: SenderOptions
     link: Any
     report: SenderReport = field(default_factory=SenderReport)
+    attitude: ReceivedAttitude | None = None
     _waiting: Fix | None = None
     _last_us: int = 0  # stamp of the last pose sent
     _measured_us: int = 0  # exposure of the last fix sent
@@ -166,19 +176,20 @@ class Sender:
     _timesync: Timesync = field(default_factory=Timesync)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
+    def __post_init__(self) -> None:
+        if self.options.attitude_of:
+            self.attitude = ReceivedAttitude(self.options.attitude_of)
+
     def offer(self, item: Fix | NoFix) -> None:
         """Take the result of an image; a fix waits for the next slot."""
         with self._lock:
+            self._recent.follow(item)
             if isinstance(item, Fix) and item.usable:
                 self.report.replaced += self._waiting is not None
                 self._waiting = item
-                self._recent.add(item)
                 return
             if isinstance(item, Fix):
                 self.report.refused += 1
-            # After a single image without a pose, predictions go on.
-            if item.state != FixState.COAST:
-                self._recent.clear()
             if item.state == FixState.LOST:
                 self._lost, self._waiting = True, None
             self._failed_us = item.time_us
@@ -220,6 +231,8 @@ class Sender:
                 self.report.autopilot = message.autopilot
             elif kind == "GPS_GLOBAL_ORIGIN":
                 self._take_origin(mavlink.stated_origin(message))
+            elif self.attitude is not None:
+                self.attitude.take(message, now_us, self._timesync.offset_us)
         return []
 
     def _take_origin(self, origin: Geodetic) -> None:
@@ -234,6 +247,12 @@ class Sender:
             return []
         self._second_us = now_us
         messages = [mavlink.heartbeat(self.link), self._timesync.request(self.link, now_us)]
+        if self.attitude is not None and self.attitude.is_silent(now_us):
+            ids = ATTITUDE_MESSAGES[self.attitude.of].values()
+            messages += [
+                mavlink.request_interval(self.link, self.options.system, one, _ATTITUDE_US)
+                for one in ids
+            ]
         if LOCAL_MESSAGES & set(self.options.messages) and self.report.origin is None:
             # One that is set already, perhaps in flight, must not be moved.
             if self._asked < _ASKED_FIRST:

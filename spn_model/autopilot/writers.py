@@ -124,7 +124,7 @@ class CsvWriter(_TextWriter):
 
 
 def open_writer(
-    path: Path, *, datum: Datum | None, mounting: Mounting
+    path: Path, *, datum: Datum | None, mounting: Mounting, coast_s: float = 0.5
 ) -> JsonLinesWriter | CsvWriter | Ros2Writer:
     """Open a file of fixes by its suffix: `.jsonl`, `.csv`, or none for the folder of a ROS 2 bag.
 
@@ -136,6 +136,8 @@ def open_writer(
         Where the world is on the Earth; None if unknown.
     mounting : Mounting
         Of the camera in the body; used by a bag.
+    coast_s : float
+        Age of the last fix up to which a bag gets predictions.
 
     Returns
     -------
@@ -152,7 +154,7 @@ def open_writer(
     if path.suffix == ".csv":
         return CsvWriter(path, datum)
     if path.suffix == "":
-        return Ros2Writer(path, mounting=mounting, datum=datum)
+        return Ros2Writer(path, mounting=mounting, datum=datum, coast_s=coast_s)
     raise InputError(
         "no file of fixes: name it .jsonl, .csv, or a folder for a ROS 2 bag", path=path
     )

@@ -28,9 +28,9 @@ def stanford(fixes: Sequence[FlightFixes]) -> str:
     """Draw the protection level of each usable fix of a flight against its error.
 
     Fixes below the diagonal are not protected. Smaller errors than 0.1 mm and larger ones than 100 m are
-    drawn at the edges.
+    drawn at the edges. Fixes with a known attitude nearly coincide with those without, and are left out.
     """
-    shown = [one for one in fixes if one.method != COARSE]
+    shown = [one for one in fixes if one.method != COARSE and one.attitude is None]
     heading = f"{fixes[0].flight}: protection level against error"
     parts = [svg.text(20, 22, heading, bold=True)]
     low, high = np.log10(_LIMITS_M)

@@ -47,11 +47,17 @@ class RunFixes:
     reason: str = ""
     notes: tuple[str, ...] = ()
 
+    @property
+    def attitudes(self) -> tuple[str, ...]:
+        """A sentence on the known attitude of each flight that has rows with one."""
+        texts = [one.attitude.text for one in self.flights if one.attitude is not None]
+        return tuple(dict.fromkeys(texts))
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values for metrics.json; unknown numbers are NaN."""
         flights: dict[str, dict[str, Any]] = {}
         for one in self.flights:
-            flights.setdefault(one.flight, {})[one.method] = asdict(one.summary())
+            flights.setdefault(one.flight, {})[one.row] = asdict(one.summary())
         return {
             "reason": self.reason,
             "notes": list(self.notes),
@@ -62,6 +68,7 @@ class RunFixes:
                 "confidence": CONFIDENCE,
             },
             "flights": flights,
+            "attitudes": list(self.attitudes),
         }
 
 
@@ -86,7 +93,7 @@ def _cells(one: FlightFixes, image: JudgedImage) -> tuple[str, ...]:
             str(int(error.is_misleading)),
         )
     return (
-        *(one.flight, one.method, image.name, number_cell(image.time_s)),
+        *(one.flight, one.row, image.name, number_cell(image.time_s)),
         *(str(int(image.is_usable)), image.state, image.source, image.reason),
         *errors[:4],
         *(number_cell(level) for level in image.protection_m),

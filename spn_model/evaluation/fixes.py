@@ -14,7 +14,9 @@ from spn_data.errors import StageError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
+from spn_model.evaluation.flight_attitude import FlightAttitude, attitude_of_flight
 from spn_model.integrity.fix import Fix, FixSource, NoFix
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.onboard.flight_report import longest_outage
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.pilot import Pilot, PilotOptions
@@ -134,11 +136,21 @@ class FlightFixes:
     method : str
         `COARSE`, `SEARCH` or `TRACK`.
     images : tuple of JudgedImage
+    attitude : FlightAttitude or None
+        That the images were localized with; None without one.
     """
 
     flight: str
     method: str
     images: tuple[JudgedImage, ...]
+    attitude: FlightAttitude | None = None
+
+    @property
+    def row(self) -> str:
+        """Name of the row in tables: the method, and whether an attitude helped."""
+        if self.attitude is None:
+            return self.method
+        return f"{self.method}, {'simulated ' if self.attitude.is_simulated else ''}attitude"
 
     def summary(self) -> FixSummary:
         """Return the figures."""
@@ -178,7 +190,12 @@ def largest_share(events: int, of: int, confidence: float = CONFIDENCE) -> float
     return 1.0 if events >= of else float(beta.ppf(confidence, events + 1, of - events))
 
 
-def search_each(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) -> FlightFixes:
+def search_each(
+    pilot: Pilot,
+    flight: EvaluationFlight,
+    done: Callable[[], None],
+    attitude: FlightAttitude | None = None,
+) -> FlightFixes:
     """Search for each chosen frame of a flight that has a label, alone.
 
     Parameters
@@ -188,6 +205,7 @@ def search_each(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]
     flight : EvaluationFlight
     done : callable
         Called after each image.
+    attitude : FlightAttitude, optional
 
     Returns
     -------
@@ -195,12 +213,17 @@ def search_each(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]
     """
     judged = []
     for row, image in flight.images(chosen_rows(flight)):
-        judged.append(_judged(pilot.fix(image, _FIRST_US), flight, row))
+        judged.append(_judged(pilot.fix(image, _FIRST_US, _up(attitude, row)), flight, row))
         done()
-    return FlightFixes(flight=flight.name, method=SEARCH, images=tuple(judged))
+    return FlightFixes(flight=flight.name, method=SEARCH, images=tuple(judged), attitude=attitude)
 
 
-def track_all(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) -> FlightFixes:
+def track_all(
+    pilot: Pilot,
+    flight: EvaluationFlight,
+    done: Callable[[], None],
+    attitude: FlightAttitude | None = None,
+) -> FlightFixes:
     """Localize all frames of a flight, one after the other, as in flight.
 
     Parameters
@@ -211,6 +234,7 @@ def track_all(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) 
         With increasing times, see `has_times`.
     done : callable
         Called after each image.
+    attitude : FlightAttitude, optional
 
     Returns
     -------
@@ -218,19 +242,23 @@ def track_all(pilot: Pilot, flight: EvaluationFlight, done: Callable[[], None]) 
     """
     judged = []
     for row, image in flight.images(np.arange(len(flight.labels))):
-        item = pilot.fix(image, _FIRST_US + round(1e6 * float(flight.labels.time_s[row])))
+        time_us = _FIRST_US + round(1e6 * float(flight.labels.time_s[row]))
+        item = pilot.fix(image, time_us, _up(attitude, row))
         judged.append(_judged(item, flight, row))
         done()
-    return FlightFixes(flight=flight.name, method=TRACK, images=tuple(judged))
+    return FlightFixes(flight=flight.name, method=TRACK, images=tuple(judged), attitude=attitude)
 
 
 def coarse_each(
-    localizer: Localizer, flight: EvaluationFlight, done: Callable[[], None]
+    localizer: Localizer,
+    flight: EvaluationFlight,
+    done: Callable[[], None],
+    attitude: FlightAttitude | None = None,
 ) -> FlightFixes:
     """Let the network of a bundle alone estimate the pose of each chosen frame that has a label."""
     judged = []
     for row, image in flight.images(chosen_rows(flight)):
-        found = localizer.localize(image, flight.camera)
+        found = localizer.localize(image, flight.camera, vertical=_up(attitude, row))
         truth = flight.labels.poses[row : row + 1]
         judged.append(
             JudgedImage(
@@ -244,11 +272,11 @@ def coarse_each(
             )
         )
         done()
-    return FlightFixes(flight=flight.name, method=COARSE, images=tuple(judged))
+    return FlightFixes(flight=flight.name, method=COARSE, images=tuple(judged), attitude=attitude)
 
 
 def measure_flight(
-    bundle: Path, flight: EvaluationFlight, done: Callable[[], None]
+    bundle: Path, flight: EvaluationFlight, done: Callable[[], None], *, attitude: bool = True
 ) -> tuple[tuple[FlightFixes, ...], str]:
     """Localize the images of a flight with a bundle in each way: coarse, search, track.
 
@@ -259,6 +287,8 @@ def measure_flight(
     flight : EvaluationFlight
     done : callable
         Called after each image, `steps_of` times.
+    attitude : bool
+        Whether to localize them a second time in each way, with a known attitude.
 
     Returns
     -------
@@ -273,20 +303,28 @@ def measure_flight(
         If bundle or images cannot be used.
     """
     pilot = Pilot(bundle, flight.camera, PilotOptions(sequence=False))
-    found = [coarse_each(pilot.localizer, flight, done), search_each(pilot, flight, done)]
+    gimbal = pilot.localizer.bundle.gimbal
+    given = [None, *([attitude_of_flight(flight, gimbal)] if attitude else [])]
+    found: list[FlightFixes] = []
     note = "its images have no increasing times"
-    if has_times(flight):
-        try:
-            found.append(track_all(Pilot(bundle, flight.camera), flight, done))
-            note = ""
-        except StageError as error:  # the video of tracked frames
-            note = str(error)
+    for one in given:
+        found += [
+            coarse_each(pilot.localizer, flight, done, one),
+            search_each(pilot, flight, done, one),
+        ]
+        if has_times(flight):
+            try:
+                found.append(track_all(Pilot(bundle, flight.camera), flight, done, one))
+                note = ""
+            except StageError as error:  # the video of tracked frames
+                note = str(error)
     return tuple(found), note and f"{flight.name} was not tracked: {note}"
 
 
-def steps_of(flight: EvaluationFlight) -> int:
+def steps_of(flight: EvaluationFlight, *, attitude: bool = True) -> int:
     """Return how many images `measure_flight` localizes."""
-    return 2 * len(chosen_rows(flight)) + len(flight.labels) * has_times(flight)
+    once = 2 * len(chosen_rows(flight)) + len(flight.labels) * has_times(flight)
+    return once * (2 if attitude else 1)
 
 
 def chosen_rows(flight: EvaluationFlight) -> np.ndarray:
@@ -298,6 +336,10 @@ def has_times(flight: EvaluationFlight) -> bool:
     """Return whether the images of a flight follow each other in time."""
     times = np.round(1e6 * flight.labels.time_s)
     return bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
+
+
+def _up(attitude: FlightAttitude | None, row: int) -> KnownVertical | None:
+    return None if attitude is None else attitude.verticals[row]
 
 
 def _judged(item: Fix | NoFix, flight: EvaluationFlight, row: int) -> JudgedImage:

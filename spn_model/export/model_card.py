@@ -145,6 +145,7 @@ def fix_section(fixes: Mapping[str, Any] | None) -> list[str]:
         "images one after the other. Misleading is a usable fix that is off by more than 0.5 m, 2 degrees or "
         "its protection level; in brackets the upper bound of its share, with 95 % confidence.",
         _table(FIX_HEADER, fix_rows(fixes["flights"])),
+        *fixes.get("attitudes", ()),
     ]
 
 

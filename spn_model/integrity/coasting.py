@@ -13,13 +13,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, interpolate_pose
-from spn_model.integrity.fix import Fix, FixSource, FixState
+from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 
 MAX_QUALITY = 49  # of a prediction; a fix has at least 50, the share of landmarks that must agree
 ACCELERATION_M_S2, ACCELERATION_RAD_S2 = 3.0, 3.0  # standard deviations, along each axis
 BASELINE_US = 500_000  # of the fixes that a motion is taken from
 _SIGMAS = 4.0  # of protection levels, as for fixes
+
+
+def check_coast(coast_s: float) -> None:
+    """Raise InputError if predictions cannot go out for so many seconds after a fix."""
+    if not 0 <= coast_s <= 1:
+        raise InputError(f"predictions go out for {coast_s!r} s, not 0 to 1")
 
 
 def coasted(first: Fix, last: Fix, time_us: int, *, shared_by: int = 1) -> Fix:
@@ -84,6 +91,13 @@ class RecentFixes:
     def clear(self) -> None:
         """Forget the fixes, since the motion may have changed."""
         self._fixes.clear()
+
+    def follow(self, item: Fix | NoFix) -> None:
+        """Take the result of an image; after a single one without a pose (state COAST), predictions go on."""
+        if isinstance(item, Fix) and item.usable:
+            self.add(item)
+        elif item.state != FixState.COAST:
+            self.clear()
 
     def predicted(self, time_us: int, *, shared_by: int = 1) -> Fix | None:
         """Return the pose at a time after the last fix; None if it is not, or the motion is not known."""

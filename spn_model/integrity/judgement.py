@@ -36,6 +36,8 @@ class IntegrityLimits:
         Standard deviation of the orientation.
     max_tilt_sigmas : float
         Difference from a known vertical, in standard deviations.
+    max_height_sigmas : float
+        Difference from a known height, in standard deviations.
     focal_sigma : float
         Standard deviation of the stated focal length, relative.
     max_focal_sigmas : float
@@ -53,6 +55,7 @@ class IntegrityLimits:
     alarm_m: float = 0.75
     max_sigma_deg: float = 0.5
     max_tilt_sigmas: float = 5.0
+    max_height_sigmas: float = 5.0
     focal_sigma: float = 0.001
     max_focal_sigmas: float = 5.0
     protection_sigmas: float = 4.0
@@ -81,6 +84,8 @@ class Witness:
         Normal matrix of the solution.
     tilt_sigmas : float
         Difference from a known vertical, in its standard deviations; 0 without one.
+    height_sigmas : float
+        Difference from a known height, in its standard deviations; 0 without one.
     rival_inliers : int
         Landmarks that agree with the best pose elsewhere; 0 if there is none.
     focal_change : tuple of float
@@ -96,6 +101,7 @@ class Witness:
     inliers: np.ndarray
     information: np.ndarray
     tilt_sigmas: float = 0.0
+    height_sigmas: float = 0.0
     rival_inliers: int = 0
     focal_change: tuple[float, float] = (0.0, 1.0)
 
@@ -172,6 +178,11 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         reason = (
             f"the images contradict the stated attitude by {witness.tilt_sigmas:.1f} standard deviations; "
             "check its time, its mounting and its standard deviation"
+        )
+    elif witness.height_sigmas > limits.max_height_sigmas:
+        reason = (
+            f"the images contradict the stated height by {witness.height_sigmas:.1f} standard deviations; "
+            "check its time, its zero and its standard deviations"
         )
     elif abs(focal) > limits.max_focal_sigmas * np.hypot(focal_sigma, limits.focal_sigma):
         reason = (

@@ -20,11 +20,13 @@ from spn_model.landmarks.matching import (
     projected,
 )
 from spn_model.landmarks.solver import (
+    KnownHeight,
     KnownVertical,
     Sightings,
     SolvedPose,
     first_pose,
     fit_focal_length,
+    height_sigmas,
     solve,
     tilt_sigmas,
 )
@@ -243,11 +245,18 @@ class HasView(Protocol):
         """Tangents (2,) of half the field of view, with distortion."""
 
 
-def witness_of(found: Found, features: HasView, vertical: KnownVertical | None = None) -> Witness:
+def witness_of(
+    found: Found,
+    features: HasView,
+    vertical: KnownVertical | None = None,
+    height: KnownHeight | None = None,
+) -> Witness:
     """Return what is known about the pose of a candidate, for its judgement."""
-    best, tilt = found.best, 0.0
+    best, tilt, off = found.best, 0.0, 0.0
     if vertical is not None:
         tilt = tilt_sigmas(vertical, best.pose.rotation, best.pose.covariance)
+    if height is not None:
+        off = height_sigmas(height, best.pose.center, best.pose.covariance)
     return Witness(
         at=best.seen.at / best.seen.focal_px / features.half_view,
         xyz=best.seen.xyz,
@@ -258,6 +267,7 @@ def witness_of(found: Found, features: HasView, vertical: KnownVertical | None =
         inliers=best.pose.inliers,
         information=best.pose.information,
         tilt_sigmas=tilt,
+        height_sigmas=off,
         rival_inliers=found.rival_inliers,
         focal_change=fit_focal_length(best.seen, best.pose),
     )

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from spn_data.geometry.pose import Poses
 from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
+from spn_model.landmarks.solver import KnownVertical
 
 Batch = dict[str, Tensor]
 UNKNOWN_COUNT = 10**12  # number of images of a stage, if not known in advance
@@ -150,7 +151,12 @@ class PoseModel(ABC):
         """Return the loss to minimise and detached metrics for the log; the network is in training mode."""
 
     @abstractmethod
-    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+    def estimate(
+        self,
+        images: np.ndarray,
+        intrinsics: np.ndarray,
+        verticals: Sequence[KnownVertical | None] | None = None,
+    ) -> PoseEstimates:
         """Estimate the poses of images, in eval mode.
 
         Parameters
@@ -159,6 +165,8 @@ class PoseModel(ABC):
             Undistorted RGB images.
         intrinsics : ndarray, shape (B, 3, 3)
             Intrinsic matrices K.
+        verticals : sequence of (KnownVertical or None), optional
+            Up in the camera of each image, one more observation where it is known.
         """
 
     def held_out_views(self, data: TrainingSet, count: int) -> HeldOutViews | None:

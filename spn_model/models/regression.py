@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spn_data.errors import InputError
+from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.regression_examples import (
     FeatureCache,
@@ -33,6 +34,7 @@ from spn_model.networks.pose_loss import (
 )
 from spn_model.networks.pose_network import PoseNetwork
 from spn_model.networks.registry import build, options_of
+from spn_model.onboard.decoding import with_aids
 from spn_model.pretrained import weights
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 
@@ -209,12 +211,18 @@ class RegressionModel(PoseModel):
         return pose_loss + likelihood, figures
 
     @torch.inference_mode()
-    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+    def estimate(
+        self,
+        images: np.ndarray,
+        intrinsics: np.ndarray,
+        verticals: Sequence[KnownVertical | None] | None = None,
+    ) -> PoseEstimates:
         """Estimate poses as `PoseModel.estimate` does.
 
         K is not used: images must come from the camera of the training images.
         """
-        return self.read_out(*self._answers(images))
+        found = self.read_out(*self._answers(images))
+        return found if verticals is None else _levelled(found, verticals)
 
     def read_out(self, x: np.ndarray, q: np.ndarray, log_std: np.ndarray) -> PoseEstimates:
         """Convert network outputs of N images, x (N, 3), q (N, 4) and log_std (N, 6), to poses."""
@@ -331,3 +339,19 @@ class RegressionModel(PoseModel):
                 f"images of {width} x {height} are too small: {self._options.network} needs at least "
                 f"{smallest} px a side"
             )
+
+
+def _levelled(found: PoseEstimates, verticals: Sequence[KnownVertical | None]) -> PoseEstimates:
+    """Add the known vertical of each image to its pose; one that contradicts it is none."""
+    centers, quats = found.poses.centers.copy(), found.poses.quats_wxyz.copy()
+    covariance, reasons = found.covariance.copy(), found.reasons.astype(object)
+    for k, vertical in enumerate(verticals):
+        if vertical is None or not np.isfinite(covariance[k]).all():
+            continue
+        try:
+            pose, covariance[k] = with_aids(found.poses[k : k + 1], covariance[k], vertical)
+            centers[k], quats[k] = pose.centers[0], pose.quats_wxyz[0]
+        except GeometryError as error:
+            centers[k], quats[k], covariance[k] = np.nan, np.nan, np.nan
+            reasons[k] = str(error)
+    return PoseEstimates(Poses(centers, quats), covariance, reasons.astype(np.str_))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from threading import Lock
 from typing import Any, ClassVar
@@ -16,6 +16,7 @@ from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.scene_examples import SceneExamples, SceneStageOptions
 from spn_model.networks.imagenet import MEAN, STD
@@ -196,7 +197,11 @@ class SceneCoordinatesModel(PoseModel):
         )
 
     def decode(
-        self, coordinates: np.ndarray, log_scale: np.ndarray, matrix: np.ndarray
+        self,
+        coordinates: np.ndarray,
+        log_scale: np.ndarray,
+        matrix: np.ndarray,
+        vertical: KnownVertical | None = None,
     ) -> PoseEstimate:
         """Estimate a pose from the network's outputs (3, h, w) and (h, w) for one image with K (3, 3)."""
         return decode(
@@ -206,6 +211,7 @@ class SceneCoordinatesModel(PoseModel):
             first_px=self.network.first_cell_px,
             stride_px=self.network.stride_px,
             options=self.decoding_options,
+            vertical=vertical,
         )
 
     def _check_size(self, width: int, height: int) -> None:
@@ -217,7 +223,12 @@ class SceneCoordinatesModel(PoseModel):
             )
 
     @torch.inference_mode()
-    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+    def estimate(
+        self,
+        images: np.ndarray,
+        intrinsics: np.ndarray,
+        verticals: Sequence[KnownVertical | None] | None = None,
+    ) -> PoseEstimates:
         """Estimate poses as `PoseModel.estimate` does, in float32 like the exported network."""
         self._check_size(images.shape[2], images.shape[1])
         device = self.network.center.device
@@ -232,7 +243,8 @@ class SceneCoordinatesModel(PoseModel):
             x = torch.from_numpy(np.ascontiguousarray(image[None])).to(device)
             coordinates, log_scale = (t[0].cpu().numpy() for t in self.network(_normalised(x)))
             try:
-                estimate = self.decode(coordinates, log_scale[0], matrix)
+                vertical = None if verticals is None else verticals[k]
+                estimate = self.decode(coordinates, log_scale[0], matrix, vertical)
             except GeometryError as error:
                 reasons[k] = str(error)
                 continue

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,16 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.json_values import bounded, numbers
 from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
+from spn_model.autopilot.frames import Mounting
+from spn_model.autopilot.received_attitude import ReceivedAttitude
 from spn_model.landmarks.solver import KnownVertical
+from spn_model.onboard.telemetry_file import MAX_TIME_S, between, read_columns
 from spn_model.onboard.view import View
 
 GIMBAL, CAMERA, BODY = "gimbal", "camera", "body"  # whose angles a file states
 MAX_TURN_DEG = 10.0  # of a mounting
-MAX_GAP_S = 1.0  # between records that are interpolated
 MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 45.0
-_TIME, _PITCH, _ROLL, _SIGMA = "time_s", "pitch_deg", "roll_deg", "sigma_deg"
-_MAX_BYTES, _MAX_ROWS = 50_000_000, 500_000
-_MAX_TIME_S = 1e10
+_PITCH, _ROLL, _SIGMA = "pitch_deg", "roll_deg", "sigma_deg"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,12 +101,10 @@ class Attitude:
 
     def at(self, time_s: float) -> KnownVertical | None:
         """Return up in the camera at a time; None outside the records, and in gaps of more than a second."""
-        after = int(np.searchsorted(self.time_s, time_s))
-        k = [max(after - 1, 0), min(after, len(self.time_s) - 1)]
-        first_s, last_s = self.time_s[k]
-        if not first_s <= time_s <= last_s or last_s - first_s > MAX_GAP_S:
+        found = between(self.time_s, time_s)
+        if found is None:
             return None
-        share = (time_s - first_s) / (last_s - first_s) if last_s > first_s else 0.0
+        k, share = found
         up = (1 - share) * self.up[k[0]] + share * self.up[k[1]]
         x, y, z = (up / np.linalg.norm(up)).tolist()
         return KnownVertical(up=(x, y, z), sigma_deg=float(self.sigma_deg[k].max()))
@@ -150,16 +147,12 @@ def read_attitude(
     InputError
         If the file cannot be read, a value is none, or the standard deviation is not known.
     """
-    if sigma_deg is not None and not MIN_SIGMA_DEG <= sigma_deg <= MAX_SIGMA_DEG:
-        raise InputError(
-            f"--attitude-sigma {sigma_deg:g}: must be {MIN_SIGMA_DEG:g} to {MAX_SIGMA_DEG:g} degrees"
-        )
-    if not abs(offset_s) <= _MAX_TIME_S:
-        raise InputError(f"--attitude-offset {offset_s:g}: must be a number of seconds")
-    rows = np.array(list(_rows(path)), dtype=np.float64).reshape(-1, 4)
-    rows = rows[np.isfinite(rows[:, :3]).all(axis=1)]
-    if not len(rows):
-        raise InputError(f"has no record with {_PITCH} and {_ROLL}", path=path)
+    _check_stated(sigma_deg, offset_s)
+    rows = read_columns(
+        path,
+        {_PITCH: (-180, 180), _ROLL: (-180, 180)},
+        {_SIGMA: (MIN_SIGMA_DEG, MAX_SIGMA_DEG)},
+    )
     own = mounting if of == GIMBAL else None
     sigma = rows[:, 3]
     if sigma_deg is not None:
@@ -183,6 +176,15 @@ def read_attitude(
     )
 
 
+def _check_stated(sigma_deg: float | None, offset_s: float) -> None:
+    if sigma_deg is not None and not MIN_SIGMA_DEG <= sigma_deg <= MAX_SIGMA_DEG:
+        raise InputError(
+            f"--attitude-sigma {sigma_deg:g}: must be {MIN_SIGMA_DEG:g} to {MAX_SIGMA_DEG:g} degrees"
+        )
+    if not abs(offset_s) <= MAX_TIME_S:
+        raise InputError(f"--attitude-offset {offset_s:g}: must be a number of seconds")
+
+
 def _up_in_body(pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
     """Return up (N, 3) in body axes (forward, right, down)."""
     pitch, roll = np.deg2rad(pitch_deg), np.deg2rad(roll_deg)
@@ -191,53 +193,72 @@ def _up_in_body(pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
     )
 
 
-def _rows(path: Path) -> Iterator[tuple[float, float, float, float]]:
-    """Yield time, pitch, roll and standard deviation of each record; NaN for what is not stated."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"is larger than {_MAX_BYTES // 1_000_000} MB", path=path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = ((k, line) for k, line in enumerate(file, 1) if not line.startswith("#"))
-            yield from _parsed(path, lines)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot be read as an attitude file ({error})", path=path) from error
+class LiveAttitude:
+    """Up in the camera while flying, from what an autopilot or its gimbal sends.
 
+    Parameters
+    ----------
+    received : ReceivedAttitude
+        Of the link to the autopilot.
+    of : str
+        "gimbal", "camera" or "body": whose angles they are.
+    mounting : GimbalMounting or None
+        Applied to the attitude of a gimbal; None if it is not known.
+    body_from_camera : ndarray, shape (3, 3)
+        Rotation from camera to body axes, for the attitude of the body.
+    sigma_deg : float, optional
+        Standard deviation of each angle, instead of that of the mounting.
+    offset_s : float
+        Added to the times of the messages, to give times of the images.
 
-def _parsed(
-    path: Path, lines: Iterator[tuple[int, str]]
-) -> Iterator[tuple[float, float, float, float]]:
-    first = next(lines, (1, ""))
-    header = [name.strip() for name in next(csv.reader([first[1]]), [])]
-    missing = [name for name in (_TIME, _PITCH, _ROLL) if header.count(name) != 1]
-    if missing:
-        raise InputError(
-            f"its header needs the columns {_TIME}, {_PITCH} and {_ROLL}, once each; write it with "
-            "spn-data telemetry FILE --to ATTITUDE.csv",
-            path=path,
-            line=first[0],
+    Raises
+    ------
+    InputError
+        If the standard deviation is not known, or a value is out of range.
+    """
+
+    def __init__(
+        self,
+        received: ReceivedAttitude,
+        *,
+        of: str,
+        mounting: GimbalMounting | None,
+        body_from_camera: np.ndarray,
+        sigma_deg: float | None = None,
+        offset_s: float = 0.0,
+    ):
+        _check_stated(sigma_deg, offset_s)
+        own = mounting if of == GIMBAL else None
+        if sigma_deg is None:
+            if own is None:
+                raise InputError(
+                    "the bundle knows no standard deviation for the angles of --live-attitude; give "
+                    "--attitude-sigma"
+                )
+            sigma_deg = own.sigma_deg
+        self._received, self._offset_us = received, round(1e6 * offset_s)
+        self._sigma_deg = sigma_deg
+        self._camera_from_sender = (
+            body_from_camera.T if of == BODY else Mounting().body_from_camera.T
         )
-    at = [header.index(name) if name in header else -1 for name in (_TIME, _PITCH, _ROLL, _SIGMA)]
-    bounds = ((-_MAX_TIME_S, _MAX_TIME_S), (-180, 180), (-180, 180), (MIN_SIGMA_DEG, MAX_SIGMA_DEG))
-    previous_s = -math.inf
-    for count, (number, line) in enumerate(lines):
-        cells = next(csv.reader([line]), [])
-        if not cells:
-            continue
-        try:
-            if count >= _MAX_ROWS:
-                raise ValueError(f"more than {_MAX_ROWS} records")
-            if len(cells) != len(header):
-                raise ValueError(f"{len(cells)} cells instead of {len(header)}")
-            values = [
-                bounded(float(cells[k]), *between) if k >= 0 and cells[k].strip() else math.nan
-                for k, between in zip(at, bounds, strict=True)
-            ]
-            if not values[0] > previous_s:
-                raise ValueError(f"{_TIME} {cells[at[0]]!r} is not later than that before")
-        except ValueError as error:
-            raise InputError(str(error), path=path, line=number) from error
-        previous_s = values[0]
-        yield values[0], values[1], values[2], values[3]
+        if own is not None:
+            self._camera_from_sender = own.rotation @ self._camera_from_sender
+
+    def at(self, time_us: int) -> KnownVertical | None:
+        """Return up in the camera at a time on the clock of the link; None if no message is near."""
+        found = self._received.at(time_us - self._offset_us)
+        if found is None:
+            return None
+        x, y, z = (self._camera_from_sender @ found[0]).tolist()
+        return KnownVertical(up=(x, y, z), sigma_deg=math.hypot(self._sigma_deg, found[1]))
+
+    def coverage(self, known: int, images: int) -> str:
+        """Return a sentence on how many images the attitude is known for."""
+        got = self._received
+        text = f"Attitude: received for {known} of {images} images, {got.taken} messages."
+        if got.refused:
+            text += f" {got.refused} messages were refused, the last one because {got.reason}."
+        return text
 
 
 def attitude_of(
@@ -249,12 +270,7 @@ def attitude_of(
     """Return the attitude that the options of a command line name, or None; see `read_attitude`."""
     if given.attitude is None:
         return None
-    if not view.up_is_known:
-        raise InputError(
-            "the world of the bundle does not know up, so an attitude says nothing in it; georeference the "
-            "area, or leave out --attitude",
-            path=given.bundle,
-        )
+    check_up(view, given.bundle)
     return read_attitude(
         given.attitude,
         of=given.attitude_of,
@@ -263,6 +279,16 @@ def attitude_of(
         sigma_deg=given.attitude_sigma,
         offset_s=given.attitude_offset,
     )
+
+
+def check_up(view: View, path: Path) -> None:
+    """Raise InputError, naming the network's file, if its world does not know up."""
+    if not view.up_is_known:
+        raise InputError(
+            "its world does not know up, so an attitude says nothing in it; georeference the area, or leave "
+            "out --attitude",
+            path=path,
+        )
 
 
 def add_options(parser: argparse.ArgumentParser, kinds: tuple[str, ...]) -> None:

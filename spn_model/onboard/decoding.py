@@ -10,13 +10,20 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.pinhole import residuals_and_jacobian
 from spn_data.geometry.pose import Poses, to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
-from spn_model.landmarks.solver import KnownVertical, pose_by_ransac, tilt_sigmas, vertical_terms
+from spn_model.landmarks.solver import (
+    KnownHeight,
+    KnownVertical,
+    aid_terms,
+    height_sigmas,
+    pose_by_ransac,
+    tilt_sigmas,
+)
 
 # Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
 # few pixels still converges.
 _ROBUST_SCALES = (4.0, 2.0, *[1.0] * 10)
 _CONVERGED_PX = 1e-3
-_MAX_TILT_SIGMAS = 5.0  # between a known vertical and the network
+_MAX_AID_SIGMAS = 5.0  # between a known vertical or height and the network
 _MIN_SLOPE = 0.2  # bounds the growth of the covariance (1 / slope^2) if cells contradict each other
 
 
@@ -86,6 +93,7 @@ def decode(
     stride_px: float,
     options: DecodingOptions | None = None,
     vertical: KnownVertical | None = None,
+    height: KnownHeight | None = None,
 ) -> PoseEstimate:
     """Estimate a camera pose from scene coordinates.
 
@@ -108,6 +116,8 @@ def decode(
         Options of the estimation.
     vertical : KnownVertical, optional
         Up in the camera, one more observation in the least squares.
+    height : KnownHeight, optional
+        Another one, in the world of the cells.
 
     Returns
     -------
@@ -116,14 +126,14 @@ def decode(
     Raises
     ------
     GeometryError
-        If too few cells agree on any pose, or they contradict the known vertical.
+        If too few cells agree on any pose, or they contradict the known vertical or height.
 
     Notes
     -----
     The covariance is the sandwich estimator of the last step (Huber 1967): it uses the scatter of the
-    residuals rather than the scales of the cells, times `cells_per_observation`. A known vertical has the
-    weight of that many cells' observations, and its stated variance in the covariance. First, the pose of the
-    cells alone is compared with it: cells that disagree would lose their weights and be silent.
+    residuals rather than the scales of the cells, times `cells_per_observation`. A known vertical or height
+    has the weight of that many cells' observations, and its stated variance in the covariance. First, the
+    pose of the cells alone is compared with it: cells that disagree would lose their weights and be silent.
 
     References
     ----------
@@ -144,10 +154,10 @@ def decode(
         raise GeometryError(f"only {len(xyz)} cells are confident, need {options.min_inliers}")
     first = _first_pose(xyz, at, matrix, options)
     found = _refined(xyz, sigma_m, at, matrix, *first, options)
-    if vertical is None:
+    if vertical is None and height is None:
         return found
-    _check_tilt(found.poses, found.covariance, vertical)
-    return _refined(xyz, sigma_m, at, matrix, *first, options, vertical)
+    _check_aids(found.poses, found.covariance, vertical, height)
+    return _refined(xyz, sigma_m, at, matrix, *first, options, vertical, height)
 
 
 def _refined(
@@ -159,9 +169,10 @@ def _refined(
     rotation: np.ndarray,
     options: DecodingOptions,
     vertical: KnownVertical | None = None,
+    height: KnownHeight | None = None,
 ) -> PoseEstimate:
-    """Refine a pose by iteratively reweighted least squares over cells and, if known, the vertical."""
-    turn, count = np.zeros((6, 6)), options.cells_per_observation
+    """Refine a pose by iteratively reweighted least squares over cells and what is known beside them."""
+    count = options.cells_per_observation
     focal_px = np.sqrt(matrix[0, 0] * matrix[1, 1])
     for width in options.robust * np.array(_ROBUST_SCALES):
         in_camera = to_camera(xyz, center, rotation)
@@ -178,11 +189,10 @@ def _refined(
         gradients = np.einsum("nij,ni->nj", jacobian, residuals) * weights[:, None]
         information = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian)
         gradient = gradients.sum(axis=0)
-        if vertical is not None:
-            by, off = vertical_terms(vertical, rotation)
-            turn = count * by.T @ by
-            gradient += count * by.T @ off
-        step = -_inverse(information + turn) @ gradient
+        by, off = aid_terms(vertical, height, center, rotation)
+        known = count * by.T @ by
+        gradient += count * by.T @ off
+        step = -_inverse(information + known) @ gradient
         center = center + step[:3]
         rotation = rotations_from_vectors(step[None, 3:])[0] @ rotation
         if width == options.robust and np.abs(jacobian @ step).mean() < _CONVERGED_PX:
@@ -196,8 +206,8 @@ def _refined(
     # slope of the influence function is smaller than the weight, because the weight decreases with the
     # residual.
     slope = ((1 + normalised_sq) ** -3 * (1 - normalised_sq) / sigma_px**2).sum() / weights.sum()
-    inverse = _inverse(max(slope, _MIN_SLOPE) * information + turn)
-    covariance = inverse @ (gradients.T @ gradients + turn) @ inverse * count
+    inverse = _inverse(max(slope, _MIN_SLOPE) * information + known)
+    covariance = inverse @ (gradients.T @ gradients + known) @ inverse * count
     return PoseEstimate(
         Poses.from_rotations(center[None], rotation[None]),
         (covariance + covariance.T) / 2,
@@ -206,10 +216,13 @@ def _refined(
     )
 
 
-def with_vertical(
-    poses: Poses, covariance: np.ndarray, vertical: KnownVertical
+def with_aids(
+    poses: Poses,
+    covariance: np.ndarray,
+    vertical: KnownVertical | None,
+    height: KnownHeight | None = None,
 ) -> tuple[Poses, np.ndarray]:
-    """Add a known vertical to a pose that a network regressed, to first order.
+    """Add a known vertical and height to a pose that a network regressed, to first order.
 
     Parameters
     ----------
@@ -217,7 +230,8 @@ def with_vertical(
         One pose.
     covariance : ndarray, shape (6, 6)
         As that of a `PoseEstimate`.
-    vertical : KnownVertical
+    vertical : KnownVertical or None
+    height : KnownHeight, optional
 
     Returns
     -------
@@ -227,22 +241,32 @@ def with_vertical(
     Raises
     ------
     GeometryError
-        If the pose contradicts the vertical.
+        If the pose contradicts them.
     """
-    _check_tilt(poses, covariance, vertical)
-    by, off = vertical_terms(vertical, poses.rotations[0])
-    gain = np.linalg.solve(np.eye(3) + by @ covariance @ by.T, by @ covariance).T
+    _check_aids(poses, covariance, vertical, height)
+    by, off = aid_terms(vertical, height, poses.centers[0], poses.rotations[0])
+    gain = np.linalg.solve(np.eye(len(off)) + by @ covariance @ by.T, by @ covariance).T
     step = -gain @ off
     rotation = rotations_from_vectors(step[None, 3:])[0] @ poses.rotations[0]
-    levelled = Poses.from_rotations(poses.centers + step[:3], rotation[None])
-    return levelled, covariance - gain @ by @ covariance
+    moved = Poses.from_rotations(poses.centers + step[:3], rotation[None])
+    return moved, covariance - gain @ by @ covariance
 
 
-def _check_tilt(poses: Poses, covariance: np.ndarray, vertical: KnownVertical) -> None:
-    tilt = tilt_sigmas(vertical, poses.rotations[0], covariance)
-    if tilt > _MAX_TILT_SIGMAS:
+def _check_aids(
+    poses: Poses,
+    covariance: np.ndarray,
+    vertical: KnownVertical | None,
+    height: KnownHeight | None,
+) -> None:
+    tilt = 0.0 if vertical is None else tilt_sigmas(vertical, poses.rotations[0], covariance)
+    if tilt > _MAX_AID_SIGMAS:
         raise GeometryError(
             f"the network contradicts the stated attitude by {tilt:.1f} standard deviations"
+        )
+    off = 0.0 if height is None else height_sigmas(height, poses.centers[0], covariance)
+    if off > _MAX_AID_SIGMAS:
+        raise GeometryError(
+            f"the network contradicts the stated height by {off:.1f} standard deviations"
         )
 
 

@@ -17,20 +17,25 @@ from spn_data.geometry.camera_file import read_camera
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
 from spn_model.autopilot.datum import Datum
 from spn_model.autopilot.frames import Mounting
-from spn_model.autopilot.link import FixSink, open_link
+from spn_model.autopilot.link import FixSink, Link, open_link
 from spn_model.autopilot.parameters import parameter_file
 from spn_model.autopilot.profiles import PROFILES, ROS2, Message
 from spn_model.autopilot.writers import open_writer
 from spn_model.integrity.fix import Fix, NoFix
+from spn_model.integrity.height import HeightErrors
 from spn_model.onboard.attitude import (
     BODY,
     CAMERA,
     GIMBAL,
     Attitude,
+    GimbalMounting,
+    LiveAttitude,
     add_options,
     attitude_of,
+    check_up,
 )
 from spn_model.onboard.flight_report import FlightReport
+from spn_model.onboard.height import BarometerHeights, add_height_options, heights_of
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.pre_arm import StatedPosition, pre_arm
 from spn_model.onboard.replay import FlownImage, RealTime
@@ -53,6 +58,11 @@ def fly(arguments: list[str]) -> None:
         raise InputError(
             "--mavlink goes to an autopilot: give --profile px4 or ardupilot; --to writes a ROS 2 bag"
         )
+    is_live = given.live_attitude
+    if is_live and (given.mavlink is None or given.attitude is not None or given.pre_arm):
+        raise InputError(
+            "--live-attitude comes over --mavlink, takes the place of --attitude, and is not for --pre-arm"
+        )
     if given.parameters is not None:
         _write_parameters(given.parameters, given.profile, messages, use_height=given.use_height)
     cv2.setNumThreads(given.threads)
@@ -60,40 +70,28 @@ def fly(arguments: list[str]) -> None:
     stated = None
     if given.at is not None:
         stated = StatedPosition(lat_deg=given.at[0], lon_deg=given.at[1], sigma_m=given.at_sigma)
-    pilot = Pilot(
-        given.bundle,
-        read_camera(given.camera),
-        PilotOptions(network=not given.no_network),
-        int8=given.int8,
-        threads=given.threads,
-    )
-    view = pilot.localizer.bundle.view
-    if view.units != "m":
-        raise InputError(
-            "its world has no metres, so a fix in it means nothing outside; georegister the area",
-            path=given.bundle,
-        )
-    datum = (
-        None
-        if view.origin is None
-        else Datum(
-            origin=above_sea(view.origin, given.takeoff_height),
-            geoid_height_m=given.geoid_height,
-        )
-    )
+    pilot = _pilot(given)
+    view, gimbal = pilot.localizer.bundle.view, pilot.localizer.bundle.gimbal
+    datum = _datum(given, view.origin)
     mounting = Mounting.pitched(given.pitch, np.array(given.lever_arm))
-    attitude = attitude_of(given, pilot.localizer.bundle.gimbal, view, mounting.body_from_camera)
-    images = _images(given, attitude)
+    attitude: Attitude | LiveAttitude | None = attitude_of(
+        given, gimbal, view, mounting.body_from_camera
+    )
+    if is_live:
+        check_up(view, given.bundle)
+    heights = heights_of(given, view)
+    images = _images(given, attitude, heights)
     if given.pre_arm:
         for line in pre_arm(pilot, images, stated):
             sys.stdout.write(line + "\n")
         sys.stdout.write("Ready.\n")
         return
-    report, count, known, clock = FlightReport(), 0, 0, RealTime()
+    report, count, known, with_height, clock = FlightReport(), 0, 0, 0, RealTime()
     with ExitStack() as stack:
         sinks: list[FixSink] = []
         if given.to is not None:
-            sinks.append(open_writer(given.to, datum=datum, mounting=mounting))
+            sinks.append(open_writer(given.to, datum=datum, mounting=mounting, coast_s=given.coast))
+            stack.callback(sinks[-1].close)
         if given.mavlink is not None:
             link = open_link(
                 given.profile,
@@ -103,14 +101,19 @@ def fly(arguments: list[str]) -> None:
                 messages=messages,
                 use_height=given.use_height,
                 coast_s=given.coast,
+                attitude_of="" if not is_live else BODY if given.attitude_of == BODY else GIMBAL,
             )
             sinks.append(link)
+            stack.callback(link.close)
+            if is_live:
+                attitude = _live_attitude(given, link, gimbal, mounting)
             images = clock.paced(images)
-        for sink in sinks:
-            stack.callback(sink.close)
-        for time_us, image, vertical in images:
+        for time_us, image, vertical, height_m in images:
+            if isinstance(attitude, LiveAttitude):
+                vertical = attitude.at(time_us)
             count, known = count + 1, known + (vertical is not None)
-            item: Fix | NoFix = pilot.fix(image, time_us, vertical)
+            with_height += height_m is not None
+            item: Fix | NoFix = pilot.fix(image, time_us, vertical, height_m)
             report.add(item, pilot.steps_s)
             for sink in sinks:
                 sink.send(item)
@@ -121,8 +124,55 @@ def fly(arguments: list[str]) -> None:
         )
     if attitude is not None:
         lines.append(attitude.coverage(known, count))
+    if heights is not None:
+        zero = pilot.height
+        lines.append(
+            f"Height: known for {with_height} of {count} images; its zero is {zero.zero_m:+.2f} m from the "
+            f"stated one, known to {math.sqrt(zero.variance):.2f} m."
+        )
     for line in lines:
         sys.stdout.write(line + "\n")
+
+
+def _pilot(given: argparse.Namespace) -> Pilot:
+    """Return the pilot of a bundle; raise InputError if its world has no metres."""
+    pilot = Pilot(
+        given.bundle,
+        read_camera(given.camera),
+        PilotOptions(
+            network=not given.no_network,
+            height=HeightErrors(sigma_m=given.height_sigma, zero_m=given.height_zero_sigma),
+        ),
+        int8=given.int8,
+        threads=given.threads,
+    )
+    if pilot.localizer.bundle.view.units != "m":
+        raise InputError(
+            "its world has no metres, so a fix in it means nothing outside; georegister the area",
+            path=given.bundle,
+        )
+    return pilot
+
+
+def _datum(given: argparse.Namespace, origin: GeoOrigin | None) -> Datum | None:
+    if origin is None:
+        return None
+    return Datum(origin=above_sea(origin, given.takeoff_height), geoid_height_m=given.geoid_height)
+
+
+def _live_attitude(
+    given: argparse.Namespace, link: FixSink, gimbal: GimbalMounting | None, mounting: Mounting
+) -> LiveAttitude:
+    assert isinstance(link, Link)
+    assert link.attitude is not None
+    return LiveAttitude(
+        link.attitude,
+        of=given.attitude_of,
+        mounting=gimbal,
+        body_from_camera=mounting.body_from_camera,
+        sigma_deg=given.attitude_sigma,
+        offset_s=given.attitude_offset,
+    )
 
 
 def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
@@ -138,12 +188,17 @@ def above_sea(origin: GeoOrigin, takeoff_height_m: float | None) -> GeoOrigin:
     return GeoOrigin(origin.lat_deg, origin.lon_deg, height, HeightReference.AMSL)
 
 
-def _images(given: argparse.Namespace, attitude: Attitude | None) -> Iterator[FlownImage]:
-    """Yield time in microseconds, image, and up in the camera if it is known."""
+def _images(
+    given: argparse.Namespace,
+    attitude: Attitude | LiveAttitude | None,
+    heights: BarometerHeights | None,
+) -> Iterator[FlownImage]:
+    """Yield the images with what is known at their times."""
     for number, time_s, image in frames(given.source):
         seconds = number / given.fps if math.isnan(time_s) else time_s
-        vertical = None if attitude is None else attitude.at(seconds)
-        yield _FIRST_US + round(1e6 * seconds), image, vertical
+        vertical = attitude.at(seconds) if isinstance(attitude, Attitude) else None
+        height_m = None if heights is None else heights.at(seconds)
+        yield _FIRST_US + round(1e6 * seconds), image, vertical, height_m
 
 
 def _write_parameters(
@@ -204,6 +259,12 @@ def _parser() -> argparse.ArgumentParser:
         help="of the camera from the body's centre, m",
     )
     add_options(parser, (GIMBAL, CAMERA, BODY))
+    parser.add_argument(
+        "--live-attitude",
+        action="store_true",
+        help="take the attitude from what the autopilot (of the body) or its gimbal sends over --mavlink",
+    )
+    add_height_options(parser)
     parser.add_argument(
         "--pre-arm",
         action="store_true",

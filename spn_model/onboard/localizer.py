@@ -17,7 +17,7 @@ from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
 from spn_data.geometry.rotations import canonical_quats
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.solver import KnownHeight, KnownVertical
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,
@@ -28,7 +28,7 @@ from spn_model.onboard.bundle import (
     read_bundle,
     verified_path,
 )
-from spn_model.onboard.decoding import decode, with_vertical
+from spn_model.onboard.decoding import decode, with_aids
 
 # Rendering from 1280 to 480 px then takes 2 x 2 samples per pixel, which is four times as fast as 3 x 3.
 # Images of simulated flights differ from those of the data set by 0.7 grey levels on average.
@@ -121,6 +121,7 @@ class Localizer:
         *,
         rgb: bool = False,
         vertical: KnownVertical | None = None,
+        height: KnownHeight | None = None,
     ) -> Located:
         """Estimate the pose of an image.
 
@@ -134,6 +135,8 @@ class Localizer:
             Whether the image is RGB.
         vertical : KnownVertical, optional
             Up in the camera.
+        height : KnownHeight, optional
+            Height of the camera in the world.
 
         Returns
         -------
@@ -148,7 +151,9 @@ class Localizer:
         """
         seen = self.view(image, camera, rgb=rgb)
         reason = missing_texture(image)
-        return Located.failed(reason) if reason else self.decode(self.run(seen), vertical=vertical)
+        if reason:
+            return Located.failed(reason)
+        return self.decode(self.run(seen), vertical=vertical, height=height)
 
     def view(self, image: np.ndarray, camera: Camera, *, rgb: bool = False) -> np.ndarray:
         """Render an image into the network's own camera.
@@ -194,6 +199,7 @@ class Localizer:
         outputs: list[np.ndarray],
         matrix: np.ndarray | None = None,
         vertical: KnownVertical | None = None,
+        height: KnownHeight | None = None,
     ) -> Located:
         """Convert outputs of the network to a pose in the world.
 
@@ -205,17 +211,22 @@ class Localizer:
             Camera matrix K of the image, if it is not that of the bundle's camera.
         vertical : KnownVertical, optional
             Up in the camera.
+        height : KnownHeight, optional
+            Height of the camera in the world.
 
         Returns
         -------
         Located
         """
         by, offset = self.bundle.decoding, self.bundle.view.offset
+        if height is not None:
+            height = replace(height, up_m=height.up_m - offset[2])
         try:
             if isinstance(by, PoseDecoding):
                 found = _decode_regression(by, *outputs)
-                if vertical is not None and np.isfinite(found.covariance).all():
-                    found = Located(*with_vertical(found.poses, found.covariance, vertical))
+                is_aided = vertical is not None or height is not None
+                if is_aided and np.isfinite(found.covariance).all():
+                    found = Located(*with_aids(found.poses, found.covariance, vertical, height))
                 return replace(found, poses=found.poses.moved_by(offset))
             coordinates, log_scale = outputs
             estimate = decode(
@@ -226,6 +237,7 @@ class Localizer:
                 stride_px=by.stride_px,
                 options=by.options,
                 vertical=vertical,
+                height=height,
             )
         except GeometryError as error:
             return Located.failed(str(error))

@@ -18,6 +18,7 @@ from spn_data.geometry.pose import Poses, interpolate_pose
 from spn_data.matching.features import extract, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
+from spn_model.integrity.height import HeightErrors, HeightZero
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
 from spn_model.landmarks.anchor import LandmarkAnchor
 from spn_model.landmarks.landmark_map import LandmarkMap
@@ -31,7 +32,7 @@ from spn_model.landmarks.search import (
     search,
     witness_of,
 )
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.solver import KnownHeight, KnownVertical
 from spn_model.onboard.bundle import verified_landmarks
 from spn_model.onboard.localizer import Localizer
 
@@ -62,6 +63,8 @@ class PilotOptions:
     radius_px : float
         Search radius around predicted projections, plus `radius_px_s` for each second since the last fix.
     radius_px_s : float
+    height : HeightErrors
+        Of a known height.
     """
 
     limits: IntegrityLimits = field(default_factory=IntegrityLimits)
@@ -73,6 +76,7 @@ class PilotOptions:
     sure_share: float = 0.65
     radius_px: float = 30.0
     radius_px_s: float = 150.0
+    height: HeightErrors = field(default_factory=HeightErrors)
 
 
 class Pilot:
@@ -94,6 +98,8 @@ class Pilot:
     ----------
     steps_s : dict of str to float
         Time that each step of the last image took.
+    height : HeightZero
+        Zero of the known heights, as the usable fixes so far tell it.
 
     Raises
     ------
@@ -124,10 +130,16 @@ class Pilot:
         ] = []  # the last two poses that passed, with their times
         self._anchor: tuple[int, LandmarkAnchor] | None = None  # with its time
         self._searched_us = 0
+        self.height = HeightZero(self.options.height)
+        self._height: KnownHeight | None = None  # of the present image, without the offset
         self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
 
     def fix(
-        self, image: np.ndarray, time_us: int, vertical: KnownVertical | None = None
+        self,
+        image: np.ndarray,
+        time_us: int,
+        vertical: KnownVertical | None = None,
+        height_m: float | None = None,
     ) -> Fix | NoFix:
         """Localize an image.
 
@@ -139,6 +151,8 @@ class Pilot:
             Middle of the exposure; later than that of the last image.
         vertical : KnownVertical, optional
             Direction of up in the camera.
+        height_m : float, optional
+            Up of the camera in the world by a barometer, whose zero may be wrong.
 
         Returns
         -------
@@ -152,11 +166,14 @@ class Pilot:
         """
         begin = time.perf_counter()
         self.steps_s = {}
+        self._height = self._expected_height(height_m, time_us)
         found, verdict, reason = self._found(image, time_us, vertical)
         if found is None or verdict is None or verdict.reason:
             if verdict is not None:
                 reason = verdict.reason
             state = self._agreement.failed(time_us) if self.options.sequence else FixState.SEARCH
+            if state is FixState.LOST:
+                self.height.reset()
             return NoFix(
                 time_us=time_us,
                 state=state,
@@ -170,6 +187,8 @@ class Pilot:
             state = self._agreement.passed(time_us, pose.center, pose.rotation, sigma_m)
             if state in (FixState.COAST, FixState.LOST):
                 self._anchor = None
+                if state is FixState.LOST:
+                    self.height.reset()
                 return NoFix(
                     time_us=time_us,
                     state=state,
@@ -178,6 +197,9 @@ class Pilot:
                 )
             self._remember(time_us, Poses.from_rotations(pose.center[None], pose.rotation[None]))
         shown = Poses.from_rotations((pose.center + self._offset)[None], pose.rotation[None])
+        if height_m is not None and self.options.sequence and state is FixState.TRACK:
+            sigma_m = float(np.sqrt(verdict.covariance[2, 2]))
+            self.height.learn(height_m, time_us, float(shown.centers[0, 2]), sigma_m)
         return Fix(
             time_us=time_us,
             center=shown.centers[0],
@@ -190,6 +212,12 @@ class Pilot:
             quality=verdict.quality,
             processing_s=time.perf_counter() - begin,
         )
+
+    def _expected_height(self, height_m: float | None, time_us: int) -> KnownHeight | None:
+        if height_m is None:
+            return None
+        up_m, sigma_m = self.height.expected(height_m, time_us)
+        return KnownHeight(up_m=up_m - float(self._offset[2]), sigma_m=sigma_m)
 
     def _found(
         self, image: np.ndarray, time_us: int, vertical: KnownVertical | None
@@ -270,7 +298,7 @@ class Pilot:
         if found is None:
             return None
         with self._step("judgement"):
-            witness = witness_of(found, view, vertical)
+            witness = witness_of(found, view, vertical, self._height)
             verdict = judge(witness, self.options.limits)
         if not self.options.sequence:
             return verdict
@@ -324,7 +352,10 @@ class Pilot:
     def _from_network(self, image: np.ndarray, vertical: KnownVertical | None) -> list[Hypothesis]:
         if not self.options.network:
             return []
-        located = self.localizer.localize(image, self.camera, vertical=vertical)
+        height = self._height
+        if height is not None:
+            height = replace(height, up_m=height.up_m + float(self._offset[2]))
+        located = self.localizer.localize(image, self.camera, vertical=vertical, height=height)
         if located.reason:
             return []
         center = located.poses.centers[0] - self._offset

@@ -12,12 +12,14 @@ from spn_data.errors import InputError
 from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.rotations import rotations_from_quats
 from spn_model.integrity.fix import Fix
+from spn_model.integrity.height import HeightZero
 from spn_model.landmarks.solver import KnownVertical, tilt_sigmas
 from spn_model.onboard.flight_report import kind_of_reason
 from spn_model.onboard.pilot import Pilot
+from spn_model.onboard.replay import FlownImage
 
 _IMAGES = 60  # tried
-_SIGMAS = 3.0  # of a stated position
+_SIGMAS = 3.0  # of a stated position or height
 _MAX_TILT_SIGMAS = 5.0
 
 
@@ -52,7 +54,7 @@ class StatedPosition:
 
 def pre_arm(
     pilot: Pilot,
-    images: Iterable[tuple[int, np.ndarray, KnownVertical | None]],
+    images: Iterable[FlownImage],
     stated: StatedPosition | None = None,
 ) -> Iterator[str]:
     """Test a bundle on the first images, and yield a line for each test that passed.
@@ -61,8 +63,8 @@ def pre_arm(
     ----------
     pilot : Pilot
         Which has checked the hashes of its bundle.
-    images : iterable of tuple
-        Time in microseconds, image, and up in the camera if it is known.
+    images : iterable of FlownImage
+        Images with what is known at their times.
     stated : StatedPosition, optional
 
     Yields
@@ -83,7 +85,7 @@ def pre_arm(
             path=bundle.folder,
         )
     reasons: Counter[str] = Counter()
-    for count, (time_us, image, vertical) in enumerate(images, 1):
+    for count, (time_us, image, vertical, height_m) in enumerate(images, 1):
         if count == 1:
             height, width = image.shape[:2]
             seen = pilot.localizer.renderer(pilot.camera, width, height).valid.mean()
@@ -96,6 +98,7 @@ def pre_arm(
             )
             yield _position(item, stated, origin)
             yield _attitude(item, vertical)
+            yield _height(item, height_m, HeightZero(pilot.options.height))
             return
         reasons[item.reason] += 1
         if count == _IMAGES:
@@ -133,3 +136,16 @@ def _attitude(fix: Fix, vertical: KnownVertical | None) -> str:
             "deviations are allowed"
         )
     return f"Attitude: {off} from the stated one."
+
+
+def _height(fix: Fix, height_m: float | None, zero: HeightZero) -> str:
+    if height_m is None:
+        return "Height: not compared; state it with --height."
+    up_m, sigma_m = zero.expected(height_m, fix.time_us)
+    off_m = float(fix.center[2]) - up_m
+    allowed_m = _SIGMAS * float(np.hypot(sigma_m, np.sqrt(fix.covariance[2, 2])))
+    if abs(off_m) > allowed_m:
+        raise InputError(
+            f"not ready: the first fix is {off_m:+.1f} m from the stated height, {allowed_m:.1f} m is allowed"
+        )
+    return f"Height: {off_m:+.1f} m from the stated one, {allowed_m:.1f} m is allowed."

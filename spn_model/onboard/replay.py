@@ -12,7 +12,8 @@ from spn_model.landmarks.solver import KnownVertical
 
 _LATE_US = 100_000  # after which an image is left out, as by a camera whose images are not fetched
 
-FlownImage = tuple[int, np.ndarray, KnownVertical | None]
+# Time in microseconds, image, and if known: up in the camera, and the reading of a barometer.
+FlownImage = tuple[int, np.ndarray, KnownVertical | None, float | None]
 
 
 class RealTime:
@@ -30,7 +31,7 @@ class RealTime:
     def paced(self, images: Iterable[FlownImage]) -> Iterator[FlownImage]:
         """Yield the images that are not late, each at its time after the first one."""
         begin_us: int | None = None
-        for time_us, image, vertical in images:
+        for time_us, image, vertical, height_m in images:
             now_us = unix_us()
             if begin_us is None:
                 begin_us = now_us - time_us
@@ -39,4 +40,4 @@ class RealTime:
                 self.late += 1
                 continue
             time.sleep(max(0, due_us - now_us) * 1e-6)
-            yield due_us, image, vertical
+            yield due_us, image, vertical, height_m

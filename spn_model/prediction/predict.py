@@ -17,7 +17,9 @@ from spn_data.geometry.pose import position_text
 from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.models.checkpoint import Checkpoint
+from spn_model.onboard.attitude import Attitude
 from spn_model.prediction.flights import Flight, FlightFrame, FrameFilter, ViewRenderers, frames
 from spn_model.prediction.predicted_files import PoseRows, PoseTable, tum_texts, write_wgs84
 
@@ -38,11 +40,14 @@ class PredictOptions:
         Of `FORMATS`; the CSV is always written.
     batch : int
         Batch size.
+    attitude : Attitude or None
+        Pitch and roll over the times of the one flight.
     """
 
     choice: FrameFilter = field(default_factory=FrameFilter)
     formats: tuple[str, ...] = ("csv",)
     batch: int = 8
+    attitude: Attitude | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +55,7 @@ class Predicted:
     """What was written. counts : frames by status; reasons : of failures, most frequent first.
 
     complete : whether all frames were processed; seen : smallest share of the network's view that a camera
-    covered; seconds : time of the network alone.
+    covered; seconds : time of the network alone; with_attitude : frames whose attitude was known.
     """
 
     folder: Path
@@ -59,6 +64,7 @@ class Predicted:
     complete: bool
     seen: float
     seconds: float
+    with_attitude: int = 0
 
 
 def check_target(folder: Path, *, overwrite: bool) -> None:
@@ -141,14 +147,16 @@ def predict(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     views = ViewRenderers(network.view)
-    seconds = 0.0
+    seconds, known = 0.0, 0
     try:
         with PoseTable(partial / POSES) as table:
             complete, stop = False, None
             try:
-                for rows, took in _estimate_batches(network, flights, views, progress, options):
+                batches = _estimate_batches(network, flights, views, progress, options)
+                for rows, took, with_attitude in batches:
                     table.add(rows)
                     seconds += took
+                    known += with_attitude
                 complete = True
             except KeyboardInterrupt as error:
                 stop = error
@@ -167,6 +175,7 @@ def predict(
             complete=complete,
             seen=views.seen,
             seconds=seconds,
+            with_attitude=known,
         )
         view = network.view.to_json()
         write_json(
@@ -179,6 +188,7 @@ def predict(
                 "formats": list(options.formats),
                 "every": options.choice.every,
                 "fps": options.choice.fps,
+                "with_attitude": found.with_attitude,
                 **{k: view[k] for k in ("units", "origin", "up_is_known", "offset") if k in view},
                 "flights": [
                     {"sequence": flight.source.sequence, "camera": flight.camera_source}
@@ -215,16 +225,20 @@ def _estimate_batches(
     views: ViewRenderers,
     progress: Progress,
     options: PredictOptions,
-) -> Iterator[tuple[PoseRows, float]]:
-    """Yield the rows of one batch after the other, and the seconds that the network took."""
+) -> Iterator[tuple[PoseRows, float, int]]:
+    """Yield the rows of each batch, the seconds that the network took, and how many had an attitude."""
     for flight in flights:
         done, expected = 0, max(1, flight.expected_of(options.choice))
         for batch in _batches(frames(flight, views, options.choice), options.batch):
-            rows, seconds = _estimate_batch(network, batch)
+            verticals = [
+                None if options.attitude is None else options.attitude.at(frame.time_s)
+                for frame in batch
+            ]
+            rows, seconds = _estimate_batch(network, batch, verticals)
             done += len(batch)
             # The number of frames in the container may be wrong.
             progress(flight.source.sequence, done, max(expected, done))
-            yield rows, seconds
+            yield rows, seconds, sum(one is not None for one in verticals)
 
 
 def _batches(found: Iterator[FlightFrame], size: int) -> Iterator[list[FlightFrame]]:
@@ -239,7 +253,9 @@ def _batches(found: Iterator[FlightFrame], size: int) -> Iterator[list[FlightFra
         yield batch
 
 
-def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[PoseRows, float]:
+def _estimate_batch(
+    network: Checkpoint, batch: Sequence[FlightFrame], verticals: Sequence[KnownVertical | None]
+) -> tuple[PoseRows, float]:
     rows, seconds = PoseRows.unknown(batch), 0.0
     shows = [k for k, frame in enumerate(batch) if frame.image is not None]
 
@@ -253,7 +269,8 @@ def _estimate_batch(network: Checkpoint, batch: Sequence[FlightFrame]) -> tuple[
         images = np.stack([frame.image for frame in (batch[k] for k in chosen)])
         matrices = np.stack([batch[k].matrix for k in chosen])
         started = time.perf_counter()
-        estimates = network.model.estimate(images, matrices).moved_by(network.view.offset)
+        up = [verticals[k] for k in chosen]
+        estimates = network.model.estimate(images, matrices, up).moved_by(network.view.offset)
         seconds += time.perf_counter() - started
         rows.set_estimates(chosen, estimates)
     return rows, seconds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,13 +12,17 @@ from spn_data.dataset.hdf5_schema import Role
 from spn_data.errors import InputError
 from spn_data.inputs.evaluation_flights import EvaluationFlight
 from spn_data.storage.files import read_csv, write_csv
+from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
-from spn_model.evaluation.availability import ExpectedFix, PlannedViews
+from spn_model.evaluation.availability import Expectation, ExpectedFix, PlannedViews
 from spn_model.evaluation.fix_files import FIX_COLUMNS, number_cell
 from spn_model.evaluation.fixes import SEARCH, chosen_rows
 from spn_model.examples.training_set import TrainingSet
+from spn_model.onboard.bundle import FLOAT32, read_bundle
 from spn_model.runs.run_files import RunFiles
 from spn_model.runs.run_fixes import flown_bundle
+
+_KEPT = 200  # waypoints without a fix that are kept for the report
 
 
 def expect_fixes(
@@ -96,6 +101,38 @@ def write_expected(path: Path, expected: Sequence[ExpectedFix]) -> None:
             "error": [number_cell(one.error_m) for one in expected],
             "protection_horizontal": [number_cell(one.protection_m[0]) for one in expected],
             "protection_vertical": [number_cell(one.protection_m[1]) for one in expected],
+        },
+    )
+
+
+def keep_plan(run: RunFiles, plan: str, expected: Sequence[ExpectedFix]) -> None:
+    """Write what is expected of a plan into the folder of a run, for the report; the last plan counts.
+
+    Raises StageError if it cannot be written.
+    """
+    bundle = read_bundle(run.bundle)
+    assert bundle.landmarks is not None  # flown_bundle
+    said = Counter(one.expectation for one in expected)
+    lacking = [one for one in expected if one.expectation is not Expectation.YES]
+    write_json(
+        run.expected,
+        {
+            "version": 1,
+            "plan": plan,
+            "bundle": {
+                "network": bundle.graphs[FLOAT32].sha256,
+                "landmarks": bundle.landmarks.sha256,
+            },
+            "counts": {one.value: said[one] for one in Expectation},
+            "lacking": [
+                {
+                    "name": one.name,
+                    "expected": one.expectation.value,
+                    "landmarks": one.landmarks,
+                    "reason": one.reason,
+                }
+                for one in lacking[:_KEPT]
+            ],
         },
     )
 

@@ -67,6 +67,11 @@ class RunFiles:
         return self.folder / names.FIXES
 
     @property
+    def expected(self) -> Path:
+        """What is expected of the last plan with the bundle."""
+        return self.folder / names.EXPECTED
+
+    @property
     def figures(self) -> Path:
         """Folder of the figures of the last evaluation."""
         return self.folder / names.FIGURES

@@ -70,6 +70,7 @@ def fixes_of_runs(
     progress: Progress,
     *,
     required: bool,
+    attitude: bool = True,
 ) -> dict[str, RunFixes]:
     """Measure the fixes of the bundles of several runs.
 
@@ -82,6 +83,8 @@ def fixes_of_runs(
         Receives the run and the flight, images done, and images in total.
     required : bool
         Whether to raise the error if fixes of a run cannot be measured, instead of returning it as reason.
+    attitude : bool
+        Whether to measure them a second time, with a known attitude.
 
     Returns
     -------
@@ -100,7 +103,7 @@ def fixes_of_runs(
         try:
             own_bundle(run)
             flights = flights or read_flights()
-            found[run.name] = measure_fixes(run, flights, progress)
+            found[run.name] = measure_fixes(run, flights, progress, attitude=attitude)
         except (InputError, StageError) as error:
             if required:
                 raise
@@ -108,7 +111,9 @@ def fixes_of_runs(
     return found
 
 
-def measure_fixes(run: RunFiles, found: EvaluationFlights, progress: Progress) -> RunFixes:
+def measure_fixes(
+    run: RunFiles, found: EvaluationFlights, progress: Progress, *, attitude: bool
+) -> RunFixes:
     """Localize the images of all evaluation flights with the bundle of a run.
 
     Parameters
@@ -117,6 +122,8 @@ def measure_fixes(run: RunFiles, found: EvaluationFlights, progress: Progress) -
     found : EvaluationFlights
     progress : Progress
         Receives the run and the flight, images done, and images in total.
+    attitude : bool
+        Whether to localize them a second time, with a known attitude.
 
     Returns
     -------
@@ -131,14 +138,14 @@ def measure_fixes(run: RunFiles, found: EvaluationFlights, progress: Progress) -
     measured: list[FlightFixes] = []
     notes: list[str] = []
     for flight in found.flights:
-        total, done = steps_of(flight), 0
+        total, done = steps_of(flight, attitude=attitude), 0
 
         def count(name: str = f"{run.name}, fixes of {flight.name}", total: int = total) -> None:
             nonlocal done
             done += 1
             progress(name, done, total)
 
-        fixes, note = measure_flight(bundle.folder, flight, count)
+        fixes, note = measure_flight(bundle.folder, flight, count, attitude=attitude)
         measured += fixes
         notes += [note] if note else []
     assert bundle.landmarks is not None  # flown_bundle

@@ -218,7 +218,7 @@ class TinyModel(PoseModel):
         return position + turn, {"position": position.detach(), "turn": turn.detach()}
 
     @torch.no_grad()
-    def estimate(self, images: np.ndarray, intrinsics: np.ndarray) -> PoseEstimates:
+    def estimate(self, images, intrinsics, verticals=None) -> PoseEstimates:
         device = self.network.center.device
         out = self.network(torch.from_numpy(images / 255.0).float().permute(0, 3, 1, 2).to(device))
         centers = (out[:, :3] * self.network.scale + self.network.center).double().cpu().numpy()

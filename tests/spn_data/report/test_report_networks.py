@@ -95,9 +95,10 @@ FIXES = {
                 **{"error_m": off, "error_deg": 0.04, "largest_m": 0.1, "nees": 0.9},
                 **{"misleading_at_most": 0.003, "protected": None, "longest_outage_s": 0.4},
             }
-            for method, off in (("coarse", 12.3), ("track", 0.0123))
+            for method, off in (("coarse", 12.3), ("track", 0.0123), ("track, attitude", 0.0456))
         }
     },
+    "attitudes": ["Attitude on low: to < 1 deg."],
     "reason": "",
     "bundle": {},
 }
@@ -111,6 +112,8 @@ def test_fixes_stand_beside_coarse_poses(root):
     part = shown[shown.index("<h3>first: fixes of its bundle") :].split("</table>")[0]
     assert "<td>coarse</td><td>1,199 of 1,200</td><td>12.30 m, 0.04&deg;</td>" in part
     assert "<td>track</td><td>1,199 of 1,200</td><td>1.2 cm, 0.04&deg;</td>" in part
+    assert "<td>track, attitude</td><td>1,199 of 1,200</td><td>4.6 cm, 0.04&deg;</td>" in part
+    assert "Attitude on low: to &lt; 1 deg.</p>" in shown
     assert "<td>0 (&le; 0.3 %)</td><td>0.90</td><td>&ndash;</td><td>0.4 s</td>" in part
 
 

@@ -103,10 +103,10 @@ def bag_messages(folder):
         ]
 
 
-def write_bag(folder, *items, datum=DATUM):
+def write_bag(folder, *items, datum=DATUM, **options):
     """Write results into a bag."""
     pytest.importorskip("rosbags")
-    writer = open_link("ros2", str(folder), mounting=MOUNTING, datum=datum)
+    writer = open_link("ros2", str(folder), mounting=MOUNTING, datum=datum, **options)
     for item in items:
         writer.send(item)
     writer.close()
@@ -154,6 +154,49 @@ def test_a_bag_says_when_there_is_no_fix(tmp_path):
         assert message.status.status == -1
         assert math.isnan(message.latitude)
         assert message.position_covariance_type == 0
+
+
+def moving(k: int, state: FixState = FixState.TRACK):
+    """Return the fix of an image, 5 in a second, of a camera that flies 2 m/s to the east."""
+    return make_fix(
+        time_us=NOW_US + 200_000 * k, center=FIX.center + np.array([0.4 * k, 0, 0]), state=state
+    )
+
+
+def test_a_bag_has_predictions_between_images_on_their_own_topic(tmp_path):
+    """From the second fix on, 30 in a second, along the motion, less sure than a fix; none after a loss."""
+    lost = NoFix(time_us=NOW_US + 600_000, state=FixState.LOST, reason="x", processing_s=0.0)
+    later = NoFix(time_us=NOW_US + 1_200_000, state=FixState.LOST, reason="x", processing_s=0.0)
+    write_bag(tmp_path / "bag", moving(0), moving(1), moving(2), lost, later)
+    found = bag_messages(tmp_path / "bag")
+    fixes = [message for topic, _, message in found if topic == "/spn/odometry"]
+    between = [(log, message) for topic, log, message in found if topic == "/spn/predicted"]
+    assert len(fixes) == 3
+    logs = np.array([log for log, _ in between]) // 1000 - NOW_US
+    assert len(logs) == pytest.approx(11, abs=1)  # 0.25 to 0.6 s, as a fix takes 0.05 s
+    assert logs[0] >= 250_000
+    assert logs[-1] < 600_000
+    assert set(np.diff(logs)) <= {33_333}
+    for (log, message), after in zip(between, logs, strict=True):
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert stamp == log
+        east_m = message.pose.pose.position.x - fixes[0].pose.pose.position.x
+        assert east_m == pytest.approx(2e-6 * after, abs=1e-6)
+        assert message.pose.covariance[0] > 10 * fixes[0].pose.covariance[0]
+
+
+def test_predictions_end_with_the_age_of_the_fix(tmp_path):
+    """After half a second without any image they end; with --coast 0 there are none."""
+    for coast_s, last_us in ((0.5, 700_000), (0.0, None)):
+        folder = tmp_path / f"bag-{coast_s}"
+        write_bag(folder, moving(0), moving(1), moving(20), coast_s=coast_s)
+        logs = [log for topic, log, _ in bag_messages(folder) if topic == "/spn/predicted"]
+        assert bool(logs) == (last_us is not None)
+        if last_us is not None:
+            assert last_us - 33_333 <= max(logs) // 1000 - NOW_US <= last_us
+    with pytest.raises(InputError, match=r"predictions go out for 2\.0 s, not 0 to 1"):
+        write_bag(tmp_path / "other", FIX, coast_s=2.0)
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_world_without_a_place_has_no_navsatfix(tmp_path):

@@ -22,6 +22,7 @@ from spn_model.evaluation.fixes import (
     fix_error,
     largest_share,
 )
+from spn_model.evaluation.flight_attitude import FlightAttitude
 from spn_model.export.model_card import card_with_metrics, card_with_verdict
 from spn_model.integrity.fix import Fix, FixSource, FixState
 
@@ -128,6 +129,24 @@ def test_a_flight_is_summarized():
 GOOD = FlightFixes(flight="low", method=SEARCH, images=images(fix(off_m=(0.02, 0, 0)), None, fix()))
 
 
+def attitude(*, is_simulated: bool) -> FlightAttitude:
+    """Return an attitude whose sentence says what kind it is."""
+    text = "Simulated." if is_simulated else "Recorded."
+    return FlightAttitude(verticals=(None,) * 3, is_simulated=is_simulated, text=text)
+
+
+def test_rows_with_an_attitude_stand_apart():
+    """Recorded and simulated attitudes have rows of their own; the diagram leaves them out."""
+    aided = replace(GOOD, attitude=attitude(is_simulated=False))
+    other = replace(aided, attitude=attitude(is_simulated=True))
+    document = RunFixes(flights=(GOOD, aided, other)).to_json()
+    rows = ["search", "search, attitude", "search, simulated attitude"]
+    assert list(document["flights"]["low"]) == rows
+    assert [row[1] for row in fix_rows(document["flights"])] == rows
+    assert document["attitudes"] == ["Recorded.", "Simulated."]
+    assert stanford_diagrams([GOOD, aided]) == stanford_diagrams([GOOD])
+
+
 def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
     """fixes.csv has the reason of an image without a fix; the diagram shows fixes, not coarse poses."""
     coarse = replace(GOOD, method=COARSE)
@@ -147,7 +166,7 @@ def test_every_image_has_a_row_and_each_fix_a_dot(tmp_path):
 
 def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     """Sections on errors and fixes are replaced, the others stay; a card without sections is unchanged."""
-    fixes = RunFixes(flights=(GOOD,))
+    fixes = RunFixes(flights=(GOOD, replace(GOOD, attitude=attitude(is_simulated=True))))
     document = fixes.to_json()
     metrics = {"units": "m", "groups": {}, "fixes": document}
     card = "# first\n\n## Errors\n\nold\n\n## Fixes\n\nold\n\n## Limits\n\nnone\n"
@@ -156,7 +175,9 @@ def test_the_card_of_a_bundle_gets_the_fixes_of_a_later_evaluation():
     assert made.startswith("# first\n\n## Errors\n\nMeasured by")
     assert made.endswith("\n\n## Limits\n\nnone\n")
     assert "| low | search | 2 of 3 | 1.0 cm, 0.00 deg | 0 (<= 77.6 %) |" in made
-    assert len(fix_rows(document["flights"])) == 1
+    assert "| low | search, simulated attitude | 2 of 3 |" in made
+    assert "\n\nSimulated.\n\n" in made
+    assert len(fix_rows(document["flights"])) == 2
     assert card_with_metrics("# other\n", metrics, run="first", trained_on=()) == "# other\n"
 
 

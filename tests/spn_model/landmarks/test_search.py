@@ -11,7 +11,7 @@ from spn_data.geometry.rotations import rotation_vectors
 from spn_model.integrity.judgement import IntegrityLimits, judge
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import Hypothesis, follow, search, witness_of
-from spn_model.landmarks.solver import KnownVertical, fit_focal_length
+from spn_model.landmarks.solver import KnownHeight, KnownVertical, fit_focal_length
 from tests.worlds.landmark_world import CAMERA, OPTIONS, pose, room, seen_from
 
 ROOM = room()
@@ -117,6 +117,21 @@ def test_a_vertical_that_contradicts_is_refused():
         found = search(ROOM, seen)
         reason = judge(witness_of(found, seen, vertical), LIMITS).reason
         assert told in reason
+        assert bool(reason) == bool(told)
+
+
+def test_a_height_that_contradicts_the_pose_is_named():
+    """A height within its standard deviation does not matter; one that is 3 m off by 0.5 m is the reason."""
+    center, rotation = pose(40.0)
+    seen = features(center, rotation)
+    found = search(ROOM, seen)
+    for off_m, told in (
+        (0.4, ""),
+        (3.0, "the images contradict the stated height by 6.0 standard"),
+    ):
+        height = KnownHeight(up_m=float(center[2]) + off_m, sigma_m=0.5)
+        reason = judge(witness_of(found, seen, height=height), LIMITS).reason
+        assert reason.startswith(told)
         assert bool(reason) == bool(told)
 
 

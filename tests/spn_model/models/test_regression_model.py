@@ -13,9 +13,11 @@ from torch import nn
 from spn_data.dataset.hdf5_reader import Dataset
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses, pose_errors
+from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.evaluation.calibration import calibrate
 from spn_model.evaluation.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.models.registry import make
 from spn_model.models.regression import RegressionModel
 from spn_model.models.regression_examples import augmented_example
@@ -367,6 +369,26 @@ def test_stated_covariances_become_those_of_the_errors(data):
     again = model.estimate(all_images(data), data.intrinsics)
     assert again.covariance == pytest.approx(2 * found.covariance, rel=1e-4)
     assert (again.poses.centers == found.poses.centers).all()
+
+
+def test_a_known_vertical_levels_the_pose_of_its_image(data):
+    """One image is levelled, one that contradicts its vertical has a reason, one without stays as it was."""
+    model = begun(data, {})
+    alone = model.estimate(all_images(data)[:3], data.intrinsics[:3])
+    up = alone.poses.rotations[:, :, 2]
+    turn = rotations_from_vectors(np.deg2rad([[1.0, 0.0, 0.0]]))[0]
+    verticals = [
+        KnownVertical(up=tuple(turn @ up[0]), sigma_deg=0.01),
+        None,
+        KnownVertical(up=tuple(-up[2]), sigma_deg=0.01),
+    ]
+    found = model.estimate(all_images(data)[:3], data.intrinsics[:3], verticals)
+    assert found.poses.rotations[0][:, 2] == pytest.approx(turn @ up[0], abs=1e-3)
+    assert np.linalg.det(found.covariance[0]) < np.linalg.det(alone.covariance[0])
+    assert found.poses.rotations[1] == pytest.approx(alone.poses.rotations[1])
+    assert found.reasons.tolist()[:2] == ["", ""]
+    assert "contradicts the stated attitude" in found.reasons[2]
+    assert np.isnan(found.poses.centers[2]).all()
 
 
 def test_its_state_is_the_whole_member(data):

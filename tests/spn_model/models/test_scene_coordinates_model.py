@@ -16,6 +16,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.examples.training_set import TrainingSet
+from spn_model.landmarks.solver import KnownVertical
 from spn_model.models.pose_model import PoseEstimates
 from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.models.scene_examples import SceneStageOptions
@@ -370,3 +371,9 @@ def test_it_learns_sixteen_images_by_heart(data):
     error_m, error_deg = pose_errors(found.poses, data.poses)
     assert np.median(error_m) < 0.1
     assert np.median(error_deg) < 1
+    # Up of the first image is known, another one than that of its cells; none of the second.
+    up = data.poses.rotations[:2, :, 2]
+    known = [KnownVertical(up=tuple(-up[0]), sigma_deg=0.5), None]
+    again = model.estimate(images[:2], data.intrinsics[:2], known)
+    assert "contradicts the stated attitude" in again.reasons[0]
+    assert again.poses.centers[1] == pytest.approx(found.poses.centers[1])

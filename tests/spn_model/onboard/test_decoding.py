@@ -13,8 +13,8 @@ import pytest
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
-from spn_model.landmarks.solver import KnownVertical
-from spn_model.onboard.decoding import DecodingOptions, decode, with_vertical
+from spn_model.landmarks.solver import KnownHeight, KnownVertical
+from spn_model.onboard.decoding import DecodingOptions, decode, with_aids
 
 MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])
 GRID = (59, 33)  # cells of a 480 x 270 image, the first at (7.5, 7.5), 8 px apart
@@ -27,6 +27,7 @@ def decoded(
     log_scale: np.ndarray,
     options: DecodingOptions | None = None,
     vertical: KnownVertical | None = None,
+    height: KnownHeight | None = None,
 ):
     return decode(
         *(xyz, log_scale, MATRIX),
@@ -34,6 +35,7 @@ def decoded(
         stride_px=8.0,
         options=options,
         vertical=vertical,
+        height=height,
     )
 
 
@@ -218,7 +220,7 @@ def test_a_known_vertical_levels_a_regressed_pose():
     turn = rotations_from_vectors(np.deg2rad([[4.0, 0.0, 0.0]]))
     tilted = Poses.from_rotations(TRUE.centers, turn @ TRUE.rotations)
     covariance = np.diag([0.5**2] * 3 + [np.deg2rad(3.0) ** 2] * 3)
-    found, after = with_vertical(tilted, covariance, vertical_off_by(0.0, 0.5))
+    found, after = with_aids(tilted, covariance, vertical_off_by(0.0, 0.5))
     up, before = found.rotations[0][:, 2], tilted.rotations[0][:, 2]
     off_deg, before_deg = (np.rad2deg(np.arccos(u @ TRUE.rotations[0][:, 2])) for u in (up, before))
     assert off_deg < 0.05 * before_deg
@@ -227,7 +229,27 @@ def test_a_known_vertical_levels_a_regressed_pose():
     assert about_up @ after[3:, 3:] @ about_up == pytest.approx(np.deg2rad(3.0) ** 2, rel=0.05)
     assert np.trace(after[3:, 3:]) < 0.4 * np.trace(covariance[3:, 3:])
     with pytest.raises(GeometryError, match="contradicts the stated attitude"):
-        with_vertical(tilted, covariance, vertical_off_by(-20.0, 0.5))
+        with_aids(tilted, covariance, vertical_off_by(-20.0, 0.5))
+
+
+def test_a_known_height_moves_a_pose_to_it():
+    """Where the height is known better than by the cells, it counts; one that is 20 m off is refused."""
+    xyz, log_scale = scene(21), np.full(GRID[::-1], -3.0)
+    xyz += laplace(np.random.default_rng(21), np.exp(log_scale))
+    weak, true_m = replace(STILL, cells_per_observation=100.0), float(TRUE.centers[0, 2])
+    alone = decoded(xyz, log_scale, weak)
+    off_m = float(alone.poses.centers[0, 2]) - true_m
+    sigma_m = float(np.sqrt(alone.covariance[2, 2]))
+    known = KnownHeight(up_m=true_m, sigma_m=sigma_m / 10)
+    found = decoded(xyz, log_scale, weak, height=known)
+    assert abs(found.poses.centers[0, 2] - true_m) < 0.2 * abs(off_m)
+    assert found.covariance[2, 2] < 0.1 * alone.covariance[2, 2]
+    with pytest.raises(GeometryError, match="the network contradicts the stated height by"):
+        decoded(xyz, log_scale, weak, height=KnownHeight(up_m=true_m + 20, sigma_m=0.1))
+    covariance = np.diag([0.5**2] * 3 + [0.01**2] * 3)
+    raised, after = with_aids(TRUE, covariance, None, KnownHeight(up_m=true_m + 1, sigma_m=0.5))
+    assert raised.centers[0] - TRUE.centers[0] == pytest.approx([0, 0, 0.5])
+    assert np.diag(after)[:3] == pytest.approx([0.25, 0.25, 0.125])
 
 
 def test_nonsense_gives_no_pose():

@@ -103,6 +103,23 @@ def test_an_attitude_is_compared_with_each_fix(flown_area, camera_file, flight1,
     assert "the images contradict the stated attitude by # standard deviations" in printed
 
 
+def test_a_height_is_compared_with_each_fix(flown_area, camera_file, flight1, capsys):
+    """The flight's own heights change no fix, and their zero is learnt; a zero 40 m off leaves no fix."""
+    bundle = flown_area / "runs" / "default" / "bundle"
+    table = flown_area / "1-frames" / "telemetry" / "flight1.csv"
+    words = ["fly", str(bundle), str(flight1 / "flight1.mp4"), "--camera", str(camera_file)]
+    usable = []
+    for given in ([], ["--height", str(table)], ["--height", str(table), "--height-zero", "40"]):
+        assert main([*words, "--no-network", *given]) == 0
+        printed = capsys.readouterr().out
+        usable.append(int(printed.split("Usable fixes: ")[1].split()[0]))
+        assert ("Height: known for" in printed) == bool(given)
+    assert usable[0] == usable[1] > 0
+    assert usable[2] == 0
+    assert "the images contradict the stated height by # standard deviations" in printed
+    assert "its zero is +0.00 m from the stated one, known to 3.00 m" in printed
+
+
 def test_the_self_test_compares_the_first_fix(flown_area, camera_file, flight1, capsys):
     """At the labelled place of the first images the drone is ready; 50 m away it is not, nor at no place."""
     labels = spn_data.open_area(flown_area).labels()

@@ -39,6 +39,16 @@ def test_a_link_to_ros_is_refused(capsys):
     assert "--to writes a ROS 2 bag" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--mavlink", "udpout:127.0.0.1:1", "--pre-arm"], ["--attitude", "a.csv"]],
+)
+def test_a_live_attitude_needs_a_link_of_its_own(options, capsys):
+    """Without a link, beside a file, and before take-off there is none."""
+    assert main([*WORDS, "--live-attitude", *options]) == 1
+    assert "--live-attitude comes over --mavlink" in capsys.readouterr().err
+
+
 def test_unknown_messages_are_refused(capsys):
     """Another message than the three is an error of the command line."""
     with pytest.raises(SystemExit):

@@ -22,8 +22,8 @@ def test_images_come_when_they_are_due_with_unix_time() -> None:
     clock, begin_us = RealTime(), unix_us()
     came = [
         (time_us, unix_us())
-        for time_us, _, _ in clock.paced(
-            (t, IMAGE, None) for t in (1_000_000, 1_050_000, 1_200_000)
+        for time_us, *_ in clock.paced(
+            (t, IMAGE, None, None) for t in (1_000_000, 1_050_000, 1_200_000)
         )
     ]
     stamps = [stamp for stamp, _ in came]
@@ -36,7 +36,7 @@ def test_images_come_when_they_are_due_with_unix_time() -> None:
 def test_images_that_cannot_be_fetched_in_time_are_left_out_and_counted() -> None:
     """While an image takes 0.3 s, images that are more than 0.1 s late are left out."""
     clock, found = RealTime(), []
-    for time_us, _, _ in clock.paced((t, IMAGE, None) for t in range(0, 500_000, 50_000)):
+    for time_us, *_ in clock.paced((t, IMAGE, None, None) for t in range(0, 500_000, 50_000)):
         found.append(time_us)
         if len(found) == 1:
             time.sleep(0.3)

@@ -29,9 +29,12 @@ from spn_data.simulate.video_out import write_video
 from spn_data.storage.files import read_csv
 from spn_data.storage.json_files import write_json
 from spn_model.models.checkpoint import Checkpoint
+from spn_model.onboard.attitude import read_attitude
 from spn_model.prediction.flights import FrameFilter, ViewRenderers, find_flights, frames
 from spn_model.prediction.predict import Predicted, PredictionStopped, PredictOptions, predict
 from spn_model.prediction.predicted_files import COLUMNS, ESTIMATED, FAILED, UNREADABLE
+from spn_model.runs.run_files import RunFiles
+from spn_model.runs.run_prediction import AttitudeFile, prepare_prediction
 from tests.worlds.judged_world import write_judged, write_network
 from tests.worlds.training_world import CAMERA, frame
 
@@ -454,3 +457,47 @@ def test_a_damaged_photo_beside_a_good_one_ends_nothing(network, photos, tmp_pat
     assert done.counts == {ESTIMATED: 1, FAILED: 0, UNREADABLE: 1}
     with pytest.raises(InputError, match="none of its photos can be read"):
         find_flights([bad], CAMERA)
+
+
+def test_each_frame_is_estimated_with_its_own_attitude(network, video, tmp_path, monkeypatch):
+    """The network gets up at the time of each frame, none where the file ends; predict.json counts them."""
+    asked: list[Any] = []
+    estimate = type(network.model).estimate
+
+    def noted(model, images, intrinsics, verticals):
+        asked.extend(verticals)
+        return estimate(model, images, intrinsics)
+
+    monkeypatch.setattr(type(network.model), "estimate", noted)
+    table = tmp_path / "a.csv"
+    table.write_text("time_s,pitch_deg,roll_deg,sigma_deg\n0,-10,0,1\n1,-30,0,1\n")
+    body = np.eye(3)
+    attitude = read_attitude(table, of="camera", mounting=None, body_from_camera=body)
+    found = predicted(network, video, tmp_path / "out", attitude=attitude)
+    assert found.with_attitude == 6  # 0 to 1 s, five a second
+    assert [one is not None for one in asked] == [True] * 6 + [False] * 4
+    down = [np.rad2deg(np.arcsin(one.up[2])) for one in asked[:6]]
+    assert down == pytest.approx([-10, -14, -18, -22, -26, -30], abs=0.2)
+    assert json.loads((tmp_path / "out" / "predict.json").read_text())["with_attitude"] == 6
+
+
+def test_whose_attitude_it_is_has_to_be_clear(network, photos, video, tmp_path):
+    """Several sources and a gimbal with an unknown mounting are told; the camera's own angles need none."""
+    table = tmp_path / "a.csv"
+    table.write_text("time_s,pitch_deg,roll_deg\n0,-10,0\n1,-30,0\n")
+    run = RunFiles(tmp_path / "runs" / "first")
+    camera = tmp_path / "camera.json"
+    write_json(camera, camera_to_json(CAMERA))
+
+    def prepared(*sources: Path, **given: Any):
+        file = AttitudeFile(path=table, **given)
+        return prepare_prediction(run, sources, camera, tmp_path / "out", attitude=file)
+
+    with pytest.raises(InputError, match=r"belongs to one video, and there are 2 sequences"):
+        prepared(photos, video, sigma_deg=1.0)
+    with pytest.raises(InputError, match="states no sigma_deg"):
+        prepared(video)
+    noted = prepared(video, sigma_deg=1.0).notes
+    assert "its angles count as they are" in " ".join(noted)
+    assert "there is no bundle" in " ".join(noted)
+    assert not prepared(video, sigma_deg=1.0, of="camera").notes
