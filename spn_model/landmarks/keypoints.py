@@ -1,8 +1,8 @@
 """Scale space of an image and its SIFT keypoints, in NumPy and OpenCV: half the time of OpenCV's own.
 
 Lowe 2004, with OpenCV's parameters. Three things save time: keypoints weaker than those that are kept are
-neither refined nor oriented, no octave is blurred further than the next one can take over, and all images share
-their memory.
+neither refined nor oriented, no octave is blurred further than the next one can take over, and all images
+share their memory.
 """
 
 from __future__ import annotations
@@ -126,19 +126,19 @@ class ScaleSpace:
         edge : float
             Largest ratio of principal curvatures.
         """
-        kept: list[np.ndarray] = []
+        kept = [np.zeros((3, 0))]
         for number, images in enumerate(self._octaves):
             index, strength = self._extrema(number, contrast)
             kept.append(_away_from_edges(images, index, strength, edge, number))
         rows = np.concatenate(kept, axis=1)  # number of the octave, index, strength
         rows = rows[:, np.argsort(-rows[2], kind="stable")[: _SPARE * most]]
-        found = []
+        found = [np.zeros((6, 0))]
         for number, images in enumerate(self._octaves):
             index = np.sort(rows[1, rows[0] == number].astype(np.int64))
             if len(index):
                 fine = _refined(images, index, 1 + (number == 0), contrast, edge)
                 found.append(np.vstack([np.full((1, fine.shape[1]), number), fine]))
-        values = np.concatenate(found, axis=1) if found else np.zeros((6, 0))
+        values = np.concatenate(found, axis=1)
         values = values[:, np.argsort(-values[5], kind="stable")[:most]]
         return Keypoints(
             octaves=values[0].astype(np.int64),

@@ -159,7 +159,7 @@ class LandmarkMap:
         }
         with path.open("wb") as handle:
             stored = {n: np.asarray(a).astype(_ARRAYS[n][0]) for n, a in arrays.items()}
-            np.savez(handle, allow_pickle=False, **stored)
+            np.savez_compressed(handle, allow_pickle=False, **stored)
 
     @classmethod
     def load(cls, path: Path) -> LandmarkMap:

@@ -279,12 +279,11 @@ def match_all(
     count, every = len(queries), np.arange(len(queries))
     nearest = np.zeros(count, np.int64)
     first, second = np.full((2, count), np.inf, np.float32)
-    room = np.empty(
-        count * _BLOCK, np.float32
-    )  # new memory for each block would cost as much again
+    # New memory for each block would cost as much again.
+    room = np.empty(count * _BLOCK, np.float32)
     for start in range(0, len(landmarks), _BLOCK):
         block = landmarks.reduced[:, start : start + _BLOCK]
-        distance_sq = room[: count * block.shape[1]].reshape(count, -1)
+        distance_sq = room[: count * block.shape[1]].reshape(count, block.shape[1])
         np.matmul(sides, block, out=distance_sq)
         best = distance_sq.argmin(axis=1)
         found = distance_sq[every, best]

@@ -11,8 +11,8 @@ import numpy as np
 from spn_model.integrity.judgement import Witness
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import (
-    Expected,
     STRONGEST,
+    Expected,
     ImageFeatures,
     expected,
     match,

@@ -17,11 +17,11 @@ from spn_model.landmarks.keypoints import Keypoints, ScaleSpace
 
 _CHUNK = 64  # keypoints sampled at once, so that their patches fit into the CPU cache
 _ANGLES = 36  # bins of the histogram of an orientation
-_ANGLE_SIGMA, _ANGLE_STEP, _ANGLE_STEPS = 1.5, 0.9, 5  # of its window, in scales
+_ANGLE_SIGMA, _ANGLE_STEP, _ANGLE_STEPS = 1.5, 0.75, 6  # of its window, in scales
 _OTHER_PEAK = 0.8  # of the highest one, from which a keypoint has another orientation
 _CELLS, _BINS = 4, 8  # of a descriptor, on each side and by angle
 _CELL_SIGMAS = 3.0  # side of a cell, in scales
-_SAMPLES = 12  # on each side, over five cells
+_SAMPLES = 16  # on each side, over five cells
 _MOST = 0.2  # of an element of a descriptor of length one
 
 
@@ -163,6 +163,6 @@ def _descriptors(space: ScaleSpace, points: Keypoints, angles: np.ndarray) -> np
             np.multiply(off, size, out=binned[:, k])
         cells = binned.reshape(-1, _SAMPLES**2) @ weights
         found[some] = cells.reshape(len(some), _BINS, -1).transpose(0, 2, 1)
-    flat = found.reshape(len(points), -1)
+    flat = found.reshape(len(points), _CELLS**2 * _BINS)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
     return np.minimum(flat, _MOST)

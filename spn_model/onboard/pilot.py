@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses, interpolate_pose
-from spn_data.matching.features import reduced
+from spn_data.matching.features import Features, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
@@ -95,6 +95,8 @@ class Pilot:
     ----------
     steps_s : dict of str to float
         Time that each step of the last image took.
+    extract : callable
+        Returns the features of a grey image; benchmarks replace it.
 
     Raises
     ------
@@ -117,7 +119,7 @@ class Pilot:
         self.camera = camera
         self.localizer = Localizer(folder, int8=int8, threads=threads)
         self.landmarks = LandmarkMap.load(verified_landmarks(self.localizer.bundle))
-        self._sift = Sift(self.landmarks.facts.features)
+        self.extract: Callable[[np.ndarray], Features] = Sift(self.landmarks.facts.features).extract
         self._agreement = Agreement(self.options.motion)
         self._offset = np.array(self.localizer.bundle.view.offset)
         self.steps_s: dict[str, float] = {}
@@ -300,8 +302,8 @@ class Pilot:
     def _features(self, gray: np.ndarray) -> ImageFeatures:
         height, width = gray.shape
         camera = camera_at_size(self.camera, width, height)
-        width_px = self._sift.options.max_image_size_px
-        return ImageFeatures.of(self._sift.extract(gray), camera, width_px)
+        width_px = self.landmarks.facts.features.max_image_size_px
+        return ImageFeatures.of(self.extract(gray), camera, width_px)
 
     def _hypotheses(
         self, image: np.ndarray, guess: Hypothesis | None, vertical: KnownVertical | None
