@@ -3,10 +3,10 @@
     PYTHONPATH=. python benchmarks/search_speed.py AREA BUNDLE [--every 2] [--foreign FOLDER ...]
 
 AREA has evaluation flights with labels, which are the truth here, and BUNDLE landmarks. Each frame is
-searched for alone, without the network. A fix is misleading as in `benchmarks/fixes.py`, and always if its image
-is of a foreign folder. Times are CPU times of one thread, in ms: median, and 95 % in brackets; compare them in
-one table only. The last lines say how the features on board differ from those of OpenCV, and the most memory
-that this process has used.
+searched for alone, without the network. A fix is misleading as in `benchmarks/fixes.py`, and always if its
+image is of a foreign folder. Times are CPU times of one thread, in ms: median, and 95 % in brackets; compare
+them in one table only. The last lines say how the features on board differ from those of OpenCV, and the most
+memory that this process has used.
 """
 
 from __future__ import annotations

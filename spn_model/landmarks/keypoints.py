@@ -1,4 +1,4 @@
-"""Scale space of an image and its SIFT keypoints, in NumPy and OpenCV: half the time of OpenCV's own.
+"""Scale space of an image and its SIFT keypoints, in two thirds of the time of OpenCV's own.
 
 Lowe 2004, with OpenCV's parameters. Three things save time: keypoints weaker than those that are kept are
 neither refined nor oriented, no octave is blurred further than the next one can take over, and all images
