@@ -162,6 +162,8 @@ class Camera:
             x/z and y/z of their rays in the camera frame.
         """
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        if not len(pixels):  # for which OpenCV returns nothing
+            return np.zeros((0, 2))
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
         return cv2.undistortPoints(
             pixels, self.matrix, self.opencv_distortion, criteria=criteria

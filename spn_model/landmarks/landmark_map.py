@@ -134,15 +134,10 @@ class LandmarkMap:
 
     @cached_property
     def reduced(self) -> np.ndarray:
-        """Mean descriptor of each landmark in the reduced space, (B, L) float32."""
+        """Mean descriptors in the reduced space, and their squared lengths in the last row, (B + 1, L)."""
         first = np.searchsorted(self.landmark, np.arange(len(self)))
-        return np.ascontiguousarray(_unit(np.add.reduceat(self.units, first)) @ self.basis).T.copy()
-
-    @cached_property
-    def reduced_sq(self) -> np.ndarray:
-        """Squared lengths (L,) of `reduced`."""
-        found: np.ndarray = (self.reduced**2).sum(axis=0)
-        return found
+        means = _unit(np.add.reduceat(self.units, first)) @ self.basis
+        return np.vstack([means.T, (means**2).sum(axis=1)])
 
     def save(self, path: Path) -> None:
         """Write the map to a file. Values are rounded as the file stores them."""
@@ -164,7 +159,7 @@ class LandmarkMap:
         }
         with path.open("wb") as handle:
             stored = {n: np.asarray(a).astype(_ARRAYS[n][0]) for n, a in arrays.items()}
-            np.savez(handle, allow_pickle=False, **stored)
+            np.savez_compressed(handle, allow_pickle=False, **stored)
 
     @classmethod
     def load(cls, path: Path) -> LandmarkMap:

@@ -177,13 +177,33 @@ def match(
     Sightings
         At most one for each landmark and each feature.
     """
-    similarity = features.units @ landmarks.units[candidates.rows].T
-    row, column = np.nonzero(similarity > _MIN_SIMILARITY)
+    if not len(features) or not len(candidates.rows):
+        return _sightings(features, landmarks, *np.zeros((2, 0), np.int64))
+    first = np.searchsorted(candidates.owner, np.arange(len(candidates.landmarks)))
+    # Of each feature and landmark, that of the descriptor most alike.
+    similarity = np.maximum.reduceat(
+        features.units @ landmarks.units[candidates.rows].T, first, axis=1
+    )
     if radius_px is not None:
-        off_px = np.abs(features.at[row] - candidates.at[candidates.owner[column]])
-        near = (off_px < radius_px).all(axis=1)
-        row, column = row[near], column[near]
-    return _best(features, landmarks, candidates, row, column, similarity[row, column])
+        for axis in range(2):
+            off_px = np.abs(features.at[:, None, axis] - candidates.at[:, axis])
+            similarity[off_px >= radius_px] = 0
+    mutual = similarity.argmax(axis=0)
+    every, nearest = np.arange(len(features)), similarity.argmax(axis=1)
+    near = similarity[every, nearest]
+    similarity[every, nearest] = 0
+    second = similarity.max(axis=1)
+    second[second <= _MIN_SIMILARITY] = 0  # an unrelated descriptor
+    feature = np.flatnonzero(
+        (mutual[nearest] == every) & (near > _MIN_SIMILARITY) & _is_distinct(near, second)
+    )
+    return _sightings(features, landmarks, candidates.landmarks[nearest[feature]], feature)
+
+
+def _is_distinct(near: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return whether a similarity is enough above the second one: the ratio of distances."""
+    found: np.ndarray = 2 - 2 * near < _MAX_RATIO**2 * (2 - 2 * second)
+    return found
 
 
 def match_near(
@@ -244,24 +264,27 @@ def _best(
     second = np.zeros(len(features))  # similarity of an unrelated descriptor
     second[with_other] = similarity[others[where]]
     near = similarity[first]
-    good = is_first[first] & (2 - 2 * near < _MAX_RATIO**2 * (2 - 2 * second[feature]))
+    good = is_first[first] & _is_distinct(near, second[feature])
     return _sightings(features, landmarks, candidates.landmarks[owner[first[good]]], feature[good])
 
 
 def match_all(
-    features: ImageFeatures, landmarks: LandmarkMap, strongest: int = STRONGEST
+    features: ImageFeatures, landmarks: LandmarkMap, rows: slice = slice(STRONGEST)
 ) -> Sightings:
-    """Match the strongest features with all landmarks of the map, by descriptors in a reduced space."""
-    queries = features.units[:strongest] @ landmarks.basis
+    """Match some features, the strongest first, with all landmarks, by descriptors in a reduced space."""
+    begin, end, _ = rows.indices(len(features))
+    queries = features.units[begin:end] @ landmarks.basis
+    # Squared distances, less what all distances of a feature have in common, in one product.
+    sides = np.column_stack([-2 * queries, np.ones(len(queries), np.float32)])
     count, every = len(queries), np.arange(len(queries))
     nearest = np.zeros(count, np.int64)
     first, second = np.full((2, count), np.inf, np.float32)
+    # New memory for each block would cost as much again.
+    room = np.empty(count * _BLOCK, np.float32)
     for start in range(0, len(landmarks), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        # Squared distances, less what all distances of a feature have in common.
-        distance_sq = queries @ landmarks.reduced[:, block]
-        distance_sq *= -2
-        distance_sq += landmarks.reduced_sq[block]
+        block = landmarks.reduced[:, start : start + _BLOCK]
+        distance_sq = room[: count * block.shape[1]].reshape(count, block.shape[1])
+        np.matmul(sides, block, out=distance_sq)
         best = distance_sq.argmin(axis=1)
         found = distance_sq[every, best]
         distance_sq[every, best] = np.inf
@@ -270,7 +293,7 @@ def match_all(
         nearest[nearer], first[nearer] = start + best[nearer], found[nearer]
     own_sq = (queries**2).sum(axis=1)
     feature = np.flatnonzero(first + own_sq < _MAX_RATIO**2 * (second + own_sq))
-    return _sightings(features, landmarks, nearest[feature], feature)
+    return _sightings(features, landmarks, nearest[feature], begin + feature)
 
 
 def _sightings(

@@ -11,6 +11,7 @@ import numpy as np
 from spn_model.integrity.judgement import Witness
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import (
+    STRONGEST,
     Expected,
     ImageFeatures,
     expected,
@@ -139,7 +140,7 @@ def search(
         seen = _guided(landmarks, features, guess)
         found.append(_candidate(landmarks, features, guess.source, seen))
     if _is_weak(found):
-        compared = match_all(features, landmarks, len(features))
+        compared = compared.followed_by(match_all(features, landmarks, slice(STRONGEST, None)))
         found.append(_candidate(landmarks, features, MAP, compared))
     best = max((c for c in found if c), key=lambda c: c.agreeing, default=None)
     if best is None:

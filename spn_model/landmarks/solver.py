@@ -72,6 +72,18 @@ class Sightings:
             focal_px=self.focal_px,
         )
 
+    def followed_by(self, more: Sightings) -> Sightings:
+        """Return these sightings and others of the same image."""
+        return Sightings(
+            landmarks=np.concatenate([self.landmarks, more.landmarks]),
+            features=np.concatenate([self.features, more.features]),
+            xyz=np.concatenate([self.xyz, more.xyz]),
+            covariance=np.concatenate([self.covariance, more.covariance]),
+            at=np.concatenate([self.at, more.at]),
+            sigma_px=np.concatenate([self.sigma_px, more.sigma_px]),
+            focal_px=self.focal_px,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class KnownVertical:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.camera_file import camera_at_size
 from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses, interpolate_pose
-from spn_data.matching.features import extract, reduced
+from spn_data.matching.features import Features, reduced
 from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.height import HeightErrors, HeightZero
@@ -32,6 +32,7 @@ from spn_model.landmarks.search import (
     search,
     witness_of,
 )
+from spn_model.landmarks.sift import Sift
 from spn_model.landmarks.solver import KnownHeight, KnownVertical
 from spn_model.onboard.bundle import verified_landmarks
 from spn_model.onboard.localizer import Localizer
@@ -100,6 +101,8 @@ class Pilot:
         Time that each step of the last image took.
     height : HeightZero
         Zero of the known heights, as the usable fixes so far tell it.
+    extract : callable
+        Returns the features of a grey image; benchmarks replace it.
 
     Raises
     ------
@@ -122,6 +125,7 @@ class Pilot:
         self.camera = camera
         self.localizer = Localizer(folder, int8=int8, threads=threads)
         self.landmarks = LandmarkMap.load(verified_landmarks(self.localizer.bundle))
+        self.extract: Callable[[np.ndarray], Features] = Sift(self.landmarks.facts.features).extract
         self._agreement = Agreement(self.options.motion)
         self._offset = np.array(self.localizer.bundle.view.offset)
         self.steps_s: dict[str, float] = {}
@@ -326,8 +330,8 @@ class Pilot:
     def _features(self, gray: np.ndarray) -> ImageFeatures:
         height, width = gray.shape
         camera = camera_at_size(self.camera, width, height)
-        options = self.landmarks.facts.features
-        return ImageFeatures.of(extract(gray, None, options), camera, options.max_image_size_px)
+        width_px = self.landmarks.facts.features.max_image_size_px
+        return ImageFeatures.of(self.extract(gray), camera, width_px)
 
     def _hypotheses(
         self, image: np.ndarray, guess: Hypothesis | None, vertical: KnownVertical | None
