@@ -16,7 +16,9 @@ from spn_data.georegistration.result import GeoFit
 from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.fix_facts import BundleFixes
+from spn_data.report.frame_errors import FlightErrors
 from spn_data.report.network_state import NetworkState
+from spn_data.report.photogrammetry_facts import Photogrammetry
 from spn_data.split import audit
 from spn_data.split.groups import Split
 from spn_data.storage.stage_record import StageRecord
@@ -308,6 +310,7 @@ class RunFacts:
         Number of figures not shown.
     fixes : BundleFixes
         Without rows and verdicts in an evaluation of several runs.
+    frame_errors : tuple of FlightErrors
     """
 
     name: str
@@ -323,6 +326,7 @@ class RunFacts:
     figures: tuple[Figure, ...]
     left_out: int = 0
     fixes: BundleFixes = field(default_factory=BundleFixes)
+    frame_errors: tuple[FlightErrors, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -365,6 +369,8 @@ class ReportData:
         Why other runs cannot be shown.
     trained : tuple of NetworkState
         Trained networks, the newest first.
+    photogrammetry : Photogrammetry or None
+        None if there is no model.
     """
 
     title: str
@@ -386,6 +392,7 @@ class ReportData:
     runs: tuple[RunFacts, ...] = ()
     broken_runs: tuple[str, ...] = ()
     trained: tuple[NetworkState, ...] = ()
+    photogrammetry: Photogrammetry | None = None
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from spn_data.report.data import ReportData
 from spn_data.report.figures import key_figures
 from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
+from spn_data.report.photogrammetry import photogrammetry
 from spn_data.report.scene import pack_scene
 from spn_data.report.thinning import thin_frames
 
@@ -42,6 +43,7 @@ def render(data: ReportData, *, max_points: int = 100_000, max_frames: int = 30_
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data) + sections.control(data),
+        "photogrammetry": photogrammetry(data),
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),
