@@ -63,6 +63,20 @@ from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
     show_default=True,
     help="Batch size.",
 )
+@click.option(
+    "--figures",
+    "formats",
+    multiple=True,
+    type=click.Choice(("png", "pdf")),
+    help="Also write the figures in this format; may be repeated.  [default: SVG alone]",
+)
+@click.option(
+    "--error-limits",
+    nargs=2,
+    type=(options.Finite(0.001, 1e6), options.Finite(0.001, 1e6)),
+    metavar="DISTANCE DEGREES",
+    help="Ends of the scales in histograms of errors, to compare figures.  [default: those of each group]",
+)
 @options.device
 @options.threads
 @options.seed
@@ -78,6 +92,8 @@ def evaluate(
     dropout_samples: int | None,
     training_images: int,
     batch: int,
+    formats: tuple[str, ...],
+    error_limits: tuple[float, float] | None,
     device: str,
     threads: int | None,
     seed: int,
@@ -94,6 +110,7 @@ def evaluate(
         spn-model evaluate --area fields/north --run first
     """
     from spn_cli import page, show_networks
+    from spn_data.charts.convert import convert_figures, require_matplotlib
     from spn_data.inputs.evaluation_flights import read_evaluation_flights
     from spn_model.evaluation.evaluate import EvaluateOptions
     from spn_model.evaluation.fix_files import RunFixes
@@ -101,6 +118,8 @@ def evaluate(
     from spn_model.runs.run_files import RunFiles
     from spn_model.runs.run_fixes import fixes_of_runs
 
+    if formats:
+        require_matplotlib()
     area = options.open_area(area_folder)
     runs = [RunFiles(area.run_folder(name)) for name in dict.fromkeys(names)]
     for run in runs:
@@ -130,10 +149,12 @@ def evaluate(
         )
     show_networks.comparison(evaluated.comparison)
     show_networks.fixes(evaluated)
-    written = write_evaluation(evaluated)
+    written = write_evaluation(evaluated, error_limits)
     for note in written.notes:
         console.note(note)
     for folder in written.folders:
+        if formats:
+            convert_figures(folder / FIGURES, dict.fromkeys(formats))
         has_fixes = (folder / FIXES).is_file()
         console.out.print(
             f"{folder}: {METRICS}, {ERRORS}, {f'{FIXES}, ' if has_fixes else ''}{FIGURES}/."

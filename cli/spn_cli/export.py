@@ -8,7 +8,18 @@ import click
 
 from spn_cli import console, options
 
-FORMATS = ("tum", "nerfstudio", "kapture", "geojson", "kml", "colmap-text", "colmap", "nvm", "all")
+FORMATS = (
+    "tum",
+    "nerfstudio",
+    "kapture",
+    "geojson",
+    "kml",
+    "colmap-text",
+    "colmap",
+    "nvm",
+    "geotiff",
+    "all",
+)
 
 
 @click.command()
@@ -43,8 +54,9 @@ def export(
 ) -> None:
     """Export the poses of all registered frames to formats of other programs.
 
-    FORMAT is tum, nerfstudio, kapture, geojson, kml, colmap-text, colmap or nvm; all writes a folder of each.
-    Mapping and evaluation frames are exported; the area is not changed.
+    FORMAT is tum, nerfstudio, kapture, geojson, kml, colmap-text, colmap, nvm or geotiff (an orthophoto of
+    the ground); all writes a folder of each. Mapping and evaluation frames are exported; the area is not
+    changed.
 
     \b
     Example:
@@ -63,5 +75,7 @@ def export(
     console.out.print(f"Written to {target}: {', '.join(done.formats)}.")
     if done.units != "m":
         console.out.print("The map is not georegistered: lengths are in model units, not metres.")
+    for note in done.notes:
+        console.out.print(note)
     for name, reason in done.left_out.items():
-        console.out.print(f"{name} is left out: it {reason}.")
+        console.out.print(f"{name} is left out: {reason}.")

@@ -32,6 +32,8 @@ _KINDS: dict[str, dict[str, Any]] = {
             "*": {
                 **{"focal_px": KNOWN, "fov_deg": KNOWN, "model?": TEXT, "params?": [KNOWN]},
                 **{"focal_doubt_px?": KNOWN, "focal_error_px?": NUMBER},
+                **{"estimated?": [TEXT], "sigma?": [KNOWN], "correlation?": [[KNOWN]]},
+                **{"principal_point_sigma_px?": [KNOWN]},
             },
         },
         "shutter": [{"sequence": TEXT, "rolls?": FLAG}],

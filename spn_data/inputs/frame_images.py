@@ -56,7 +56,7 @@ def frame_images(
     for sequence in sequences:
         mine = np.flatnonzero(labels.sequences == sequence)
         stored = (
-            (row, _stored(area, str(labels.names[row]), sequence))
+            (row, stored_image(area, str(labels.names[row]), sequence))
             for row in mine[~labels.tracked[mine]].tolist()
         )
         tracked = mine[labels.tracked[mine]]
@@ -71,7 +71,8 @@ def image_path(area: Area, name: str, sequence: str) -> Path:
     return area.folder(FRAMES) / name
 
 
-def _stored(area: Area, name: str, sequence: str) -> np.ndarray:
+def stored_image(area: Area, name: str, sequence: str) -> np.ndarray:
+    """Read the image of a chosen frame, BGR; raise InputError if it is missing or damaged."""
     path = image_path(area, name, sequence)
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:

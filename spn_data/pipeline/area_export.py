@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spn_data.area.area import Area
-from spn_data.errors import StageError
+from spn_data.errors import GeometryError, StageError
 from spn_data.exports.colmap_export import IMAGE_FOLDER as COLMAP_IMAGES
 from spn_data.exports.colmap_export import write_colmap
 from spn_data.exports.exported_frames import ExportedFrames
@@ -27,6 +27,7 @@ from spn_data.exports.nvm_export import write_nvm_export
 from spn_data.exports.tum import write_tum
 from spn_data.inputs.area_labels import LabelledArea, map_folder, merge_labels, read_labelled_area
 from spn_data.inputs.frame_images import image_path
+from spn_data.pipeline.area_orthophoto import NoOrthophotoError, write_orthophoto
 from spn_data.storage.files import replace_folder
 from spn_data.storage.json_files import VERSION, write_json
 
@@ -44,6 +45,7 @@ class Format(StrEnum):
     COLMAP_TEXT = "colmap-text"
     COLMAP = "colmap"
     NVM = "nvm"
+    GEOTIFF = "geotiff"
     ALL = "all"
 
 
@@ -54,7 +56,7 @@ _IMAGES = {
     Format.COLMAP_TEXT: COLMAP_IMAGES,
     Format.COLMAP: COLMAP_IMAGES,
 }
-_NEED_ORIGIN = (Format.GEOJSON, Format.KML)
+_NEED_ORIGIN = (Format.GEOJSON, Format.KML, Format.GEOTIFF)
 _WITH_MAP = (Format.COLMAP_TEXT, Format.COLMAP)  # contain the whole map, whatever is selected
 _WITH_TRACKED = (Format.TUM, Format.GEOJSON, Format.KML)
 
@@ -92,12 +94,15 @@ class ExportedLabels:
         Formats that were written.
     left_out : dict of str to str
         Formats that were left out, with the reason.
+    notes : tuple of str
+        What to know about what was written.
     """
 
     units: str
     frames: dict[str, int]
     formats: tuple[str, ...]
     left_out: dict[str, str]
+    notes: tuple[str, ...] = ()
 
 
 def export(
@@ -134,8 +139,9 @@ def export(
     labelled = read_labelled_area(area)
     wanted = [f for f in Format if f != Format.ALL] if format_name == Format.ALL else [format_name]
     left_out: dict[str, str] = {}
+    notes: tuple[str, ...] = ()
     if format_name == Format.ALL and labelled.origin is None:
-        left_out = {f.value: "needs a georegistered map" for f in _NEED_ORIGIN}
+        left_out = {f.value: "it needs a georegistered map" for f in _NEED_ORIGIN}
         wanted = [f for f in wanted if f not in _NEED_ORIGIN]
     if options.all_frames and format_name != Format.ALL and format_name not in _WITH_TRACKED:
         raise StageError(
@@ -153,7 +159,14 @@ def export(
                 labelled, options.sequences, tracked=tracked, whole_map=one in _WITH_MAP
             )
             counts = {name: len(rows) for name, rows in frames.sequences()}
-            _write(area, one, folder, frames, images=options.images)
+            try:
+                notes += _write(area, one, folder, frames, images=options.images)
+            except (NoOrthophotoError, GeometryError) as error:
+                # An area may be without ground, which the other formats do not need.
+                if format_name != Format.ALL or one != Format.GEOTIFF:
+                    raise
+                shutil.rmtree(folder)
+                left_out[one.value] = f"cannot be made: {error}"
         if format_name == Format.ALL:
             write_json(partial / RECORD, {"version": VERSION, "format": Format.ALL.value})
         replace_folder(partial, target)
@@ -162,8 +175,9 @@ def export(
     return ExportedLabels(
         units=labelled.units,
         frames=counts,
-        formats=tuple(f.value for f in wanted),
+        formats=tuple(f.value for f in wanted if f.value not in left_out),
         left_out=left_out,
+        notes=notes,
     )
 
 
@@ -239,7 +253,10 @@ def select_frames(
     )
 
 
-def _write(area: Area, one: Format, folder: Path, frames: ExportedFrames, *, images: bool) -> None:
+def _write(
+    area: Area, one: Format, folder: Path, frames: ExportedFrames, *, images: bool
+) -> tuple[str, ...]:
+    """Write one format to a new folder, and return what to know about it."""
     folder.mkdir(parents=True)
     writers: dict[Format, Callable[[Path, ExportedFrames], None]] = {
         Format.TUM: write_tum,
@@ -249,13 +266,19 @@ def _write(area: Area, one: Format, folder: Path, frames: ExportedFrames, *, ima
         Format.KML: write_kml,
         Format.NVM: write_nvm_export,
     }
+    more: dict[str, Any] = {}
+    notes: tuple[str, ...] = ()
     if one in writers:
         writers[one](folder, frames)
+    elif one == Format.GEOTIFF:
+        orthophoto = write_orthophoto(area, folder, frames)
+        more, notes = {"orthophoto": orthophoto.plain()}, orthophoto.notes()
     else:
         write_colmap(folder, frames, map_folder(area), text=one == Format.COLMAP_TEXT)
     if images and one in _IMAGES:
         _copy_images(area, folder / _IMAGES[one], frames)
-    write_json(folder / RECORD, {"version": VERSION, **_record(area, one, frames)})
+    write_json(folder / RECORD, {"version": VERSION, **_record(area, one, frames), **more})
+    return notes
 
 
 def _copy_images(area: Area, folder: Path, frames: ExportedFrames) -> None:

@@ -39,6 +39,7 @@ from spn_data.inputs.network_runs import read_runs, trained_runs
 from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
+from spn_data.pipeline.area_photogrammetry import photogrammetry_of
 from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
@@ -168,6 +169,7 @@ def report_data(area: Area) -> ReportData:
         trained=trained_runs(area, runs),
         expect_low=frozenset(area.facts.expect_low),
         recorded=_recorded_flight(area),
+        photogrammetry=None if labelled is None else photogrammetry_of(fresh, labelled),
     )
 
 

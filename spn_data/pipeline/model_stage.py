@@ -38,6 +38,8 @@ from spn_data.reconstruction.registration_file import write_registration
 from spn_data.reconstruction.shutter import ShutterDiagnosis, diagnose_shutter
 from spn_data.reconstruction.view_variety import viewing_distance
 from spn_data.storage.stage_record import StageRecord, current_options
+from spn_data.uncertainty.bundle_jacobians import estimated_names
+from spn_data.uncertainty.map_covariance import MapCovariance
 from spn_data.work.timing import Progress, Stopwatch
 
 
@@ -89,10 +91,13 @@ def build_model(
     distance = viewing_distance(result.refined.scene, result.refined.observations)
     with stopwatch.step("focal lengths"):
         trials = _trials(area, result.refined, to_map, distance, geo or GeoStageOptions(), progress)
-    _write_labels(work.path, result, chosen, trials)
+    doubts = {i: trial.doubt_px for i, trial in trials.items()}
+    covariance = result.refined.covariance
+    covariance = None if covariance is None else covariance.with_focal_errors(doubts)
+    _write_labels(work.path, result, chosen, covariance)
     _move_results(work.path, result)
     return work.finish(
-        counts=_counts(result, trials, distance, shutters),
+        counts=_counts(result, trials, covariance, distance, shutters),
         seconds=stopwatch.seconds,
         cpu_seconds=stopwatch.cpu_seconds,
         notes=(
@@ -171,20 +176,41 @@ def _trials(
 
 
 def _write_labels(
-    work: Path, result: ReconstructResult, chosen: Frames, trials: Mapping[int, FocalTrial]
+    work: Path, result: ReconstructResult, chosen: Frames, covariance: MapCovariance | None
 ) -> None:
     """Write labels of the mapping frames in the model's gauge, if they have covariances."""
     refined = result.refined
-    if refined.covariance is None:
+    if covariance is None:
         return
-    doubts = {i: trial.doubt_px for i, trial in trials.items()}
-    covariance = refined.covariance.with_focal_errors(doubts)
     reasons = {row.name: row.reason for row in result.registrations}
     labels, seen = mapping_labels(
         chosen, refined.scene, refined.observations, refined.points, reasons, covariance
     )
     write_labels(work / POSES, labels)
     write_label_observations(work / OBSERVATIONS, seen)
+
+
+def _lens_errors(
+    refined: RefinedModel, covariance: MapCovariance | None
+) -> dict[int, dict[str, object]]:
+    """Return standard deviations and correlations of each lens by camera id; empty without a covariance."""
+    found: dict[int, dict[str, object]] = {}
+    if covariance is None:
+        return found
+    for camera_id, (is_free, of_lens) in covariance.lens_covariances().items():
+        names = estimated_names(refined.scene.cameras[camera_id])
+        sigma = np.sqrt(np.diag(of_lens))
+        scale = np.where(sigma > 0, sigma, 1.0)
+        point = covariance.shared.principal_points.get(camera_id)
+        found[camera_id] = {
+            "estimated": [name for name, free in zip(names, is_free, strict=True) if free],
+            "sigma": [float(f"{value:.4g}") for value in sigma],
+            "correlation": np.round(of_lens / np.outer(scale, scale), 4).tolist(),
+            "principal_point_sigma_px": []
+            if point is None
+            else [float(f"{value:.4g}") for value in point.sigma_px],
+        }
+    return found
 
 
 def _unlabelled(result: ReconstructResult) -> tuple[str, ...]:
@@ -222,12 +248,14 @@ def _move_results(work: Path, result: ReconstructResult) -> None:
 def _counts(
     result: ReconstructResult,
     trials: Mapping[int, FocalTrial],
+    covariance: MapCovariance | None,
     distance: float,
     shutters: tuple[ShutterDiagnosis, ...],
 ) -> dict[str, object]:
     registered = [r for r in result.registrations if r.registered]
     observations = sum(r.observations for r in registered)
     scene = result.refined.scene
+    errors = _lens_errors(result.refined, covariance)
     cameras = {
         trial.camera: {
             "focal_px": round(trial.adjusted_px, 2),
@@ -235,8 +263,9 @@ def _counts(
             "model": trial.adjusted.model,
             "params": [round(float(p), 6) for p in trial.adjusted.params],
             **trial.counts(),
+            **errors.get(camera_id, {}),
         }
-        for trial in trials.values()
+        for camera_id, trial in trials.items()
     }
     return {
         "cameras": cameras,

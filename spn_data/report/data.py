@@ -17,7 +17,9 @@ from spn_data.labels.labels import LabelStatus
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.expected import ExpectedPlan
 from spn_data.report.fix_facts import BundleFixes
+from spn_data.report.frame_errors import FlightErrors
 from spn_data.report.network_state import NetworkState, RecordedFlight
+from spn_data.report.photogrammetry_facts import Photogrammetry
 from spn_data.split import audit
 from spn_data.split.groups import Split
 from spn_data.storage.stage_record import StageRecord
@@ -309,6 +311,7 @@ class RunFacts:
         Number of figures not shown.
     fixes : BundleFixes
         Without rows in an evaluation of several runs.
+    frame_errors : tuple of FlightErrors
     """
 
     name: str
@@ -324,6 +327,7 @@ class RunFacts:
     figures: tuple[Figure, ...]
     left_out: int = 0
     fixes: BundleFixes = field(default_factory=BundleFixes)
+    frame_errors: tuple[FlightErrors, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -372,6 +376,8 @@ class ReportData:
         An evaluation flight whose video is known.
     plans, broken_plans : tuple of ExpectedPlan, tuple of str
         What is expected of planned waypoints, and why others cannot be shown.
+    photogrammetry : Photogrammetry or None
+        None if there is no model.
     """
 
     title: str
@@ -397,6 +403,7 @@ class ReportData:
     recorded: RecordedFlight | None = None
     plans: tuple[ExpectedPlan, ...] = ()
     broken_plans: tuple[str, ...] = ()
+    photogrammetry: Photogrammetry | None = None
 
     @property
     def evaluation_sequences(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from spn_data.report.expected import expected_plans
 from spn_data.report.figures import key_figures
 from spn_data.report.networks import networks
 from spn_data.report.pack import script_json
+from spn_data.report.photogrammetry import photogrammetry
 from spn_data.report.scene import pack_scene
 from spn_data.report.thinning import thin_frames
 
@@ -53,6 +54,7 @@ def render(
         "figures": key_figures(data),
         "view": sections.view(data, max_points),
         "residuals": sections.residuals(data) + sections.control(data),
+        "photogrammetry": photogrammetry(data),
         "timeline": sections.timeline(data, left_out),
         "coverage": sections.coverage(data),
         "split": sections.split(data),

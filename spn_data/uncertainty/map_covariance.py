@@ -320,6 +320,24 @@ class MapCovariance:
             ) + shared @ np.swapaxes(shared, 1, 2)
         return found
 
+    def lens_covariances(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Return the covariance of the intrinsics of each lens that were not held.
+
+        Returns
+        -------
+        dict of int to (ndarray of bool of shape (L,), ndarray of shape (F, F))
+            By camera id: which of its `estimated_names` were estimated, and the covariance of those.
+        """
+        found = {}
+        for camera_id, columns in self._unknowns.lens_columns.items():
+            is_free = ~np.isin(columns, self._inverse.held)
+            free = columns[is_free]
+            right = np.zeros((self._unknowns.count, len(free)))
+            right[free, np.arange(len(free))] = 1.0
+            solved, shared = self._inverse.solve(right), self.shared.unknowns[free]
+            found[camera_id] = is_free, solved.T @ (self._meat @ solved) + shared @ shared.T
+        return found
+
     def _right_side(self, functional: Functional) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives by the points' whitened errors (r, K, 3), and by poses and intrinsics (n, r)."""
         row = self._point_row[functional.point_idx]

@@ -57,6 +57,7 @@ def write_comparison(
     drawings: Path,
     more_drawings: Mapping[str, str] | None = None,
     fixes: Mapping[str, Any] | None = None,
+    error_limits: tuple[float, float] | None = None,
 ) -> None:
     """Write metrics.json, errors.csv and a folder of SVG figures.
 
@@ -75,6 +76,8 @@ def write_comparison(
         Further SVG figures by name, without suffix.
     fixes : mapping, optional
         Fixes of the run, as plain values.
+    error_limits : tuple of float, optional
+        Ends of the scales of position and rotation errors in histograms; by default, those of each group.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def write_comparison(
     drawings.mkdir(parents=True)
     names = file_names([group.frames.group for group in comparison.groups])
     for name, group in zip(names, comparison.groups, strict=True):
-        for what, drawing in draw_figures(group, comparison).items():
+        for what, drawing in draw_figures(group, comparison, error_limits).items():
             write_atomically(drawings / f"{name}-{what}.svg", drawing)
     for what, drawing in (more_drawings or {}).items():
         write_atomically(drawings / f"{what}.svg", drawing)
@@ -127,7 +130,11 @@ def cost_facts(cost: NetworkCost) -> dict[str, Any]:
     return {**asdict(cost), "ms_an_image": round(1000 * cost.seconds / cost.images, 3)}
 
 
-def draw_figures(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[str, str]:
+def draw_figures(
+    group: EvaluatedGroup,
+    comparison: NetworkComparison,
+    error_limits: tuple[float, float] | None = None,
+) -> dict[str, str]:
     """Draw the figures of a group, by name.
 
     Training groups have none, because the nearest training frame of each of their frames is itself.
@@ -142,7 +149,9 @@ def draw_figures(group: EvaluatedGroup, comparison: NetworkComparison) -> dict[s
         "trajectories": figures.trajectories(
             comparison.training, group.frames, _select_methods(group.estimates, shown), unit=unit
         ),
-        "histograms": figures.histograms(_select_methods(group.evaluations, shown), unit=unit),
+        "histograms": figures.histograms(
+            _select_methods(group.evaluations, shown), unit=unit, limits=error_limits
+        ),
         "distance": figures.error_curves(compared, unit=unit),
     }
     if any(e.calibration is not None and e.calibration.frames for e in group.evaluations):

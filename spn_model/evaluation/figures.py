@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from spn_data.charts import svg
+from spn_data.charts.svg import COLOURS, INK, MARKERS, SOFT, Panel
 from spn_data.geometry.pose import Poses
-from spn_model.evaluation import svg
 from spn_model.evaluation.metrics import ENU, CurveBin, Estimates, Evaluation, EvaluationFrames
-from spn_model.evaluation.svg import COLOURS, INK, SOFT, Panel
 from spn_model.evaluation.trajectory_view import thinned, trajectory_panel
 
 _MOST_BARS = 25
@@ -22,8 +22,9 @@ def trajectories(
 ) -> str:
     """Draw training cameras, true trajectory and estimates, obliquely and from above (the paper's 6 and 8).
 
-    A thin line connects each estimate with its true position. Estimates far outside the area are counted in
-    the legend instead of drawn. Long sequences are thinned evenly.
+    A thin line connects each estimate with its true position, and short lines show where cameras look.
+    Estimates far outside the area are counted in the legend instead of drawn. Long sequences are thinned
+    evenly.
     """
     heading = f"{frames.group}: trajectories"
     drawn = len(thinned(len(frames)))
@@ -38,40 +39,52 @@ def trajectories(
             (left, 50.0, width, 400.0), (azimuth, elevation), training, frames, estimates, unit
         )
         parts += [svg.text(left, 44, words, colour=SOFT), panel]
-    entries = [("training cameras", SOFT), ("true trajectory", INK)]
+    entries = [
+        (_counted("training cameras", len(thinned(len(training))), len(training)), SOFT),
+        (_counted("true poses", drawn, len(frames)), INK),
+    ]
     for k, one in enumerate(estimates):
         missing = int(np.isnan(one.poses.centers).any(axis=1).sum())
         notes = [
+            f"{len(frames) - missing} estimates",
             *([f"{outside[k]} outside the plot"] if outside[k] else []),
             *([f"{missing} without a pose"] if missing else []),
-            *([f"{drawn} of {len(frames)} frames drawn"] if drawn < len(frames) else []),
         ]
-        more = f" ({', '.join(notes)})" if notes else ""
-        entries.append((one.method + more, COLOURS[k % len(COLOURS)]))
-    parts.append(svg.legend(28, 480, entries))
+        entries.append((f"{one.method} ({', '.join(notes)})", COLOURS[k % len(COLOURS)]))
+    markers = ["circle", "circle", *(_marker(k) for k in range(len(estimates)))]
+    parts.append(svg.legend(28, 480, entries, markers))
     return svg.document(1000, 480 + 17 * len(entries), heading, parts)
 
 
-def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
+def histograms(
+    evaluations: Sequence[Evaluation],
+    *,
+    unit: str = "m",
+    limits: tuple[float, float] | None = None,
+) -> str:
     """Draw histograms of position and rotation errors on one group, one row per method (the paper's 7 and 9).
 
-    All methods share the scales. If a few errors are far larger than the others, the scale ends at the
-    largest p95, and a paler bar counts the errors beyond it.
+    Bars are shares of the frames, those without a pose included. All methods share the scales. If a few
+    errors are far larger than the others, the scale ends at the largest p95, and a paler bar is the share
+    beyond it. limits : ends of the scales of position and rotation errors instead.
     """
     heading = f"{evaluations[0].frames.group}: errors"
     parts = [svg.text(20, 22, heading, bold=True)]
     steps: list[float] = []
     tops: list[float] = []
-    for values in (
-        [e.errors.error_m for e in evaluations],
-        [e.errors.error_deg for e in evaluations],
+    for column, values in enumerate(
+        ([e.errors.error_m for e in evaluations], [e.errors.error_deg for e in evaluations])
     ):
-        reach = max(_reach(v[np.isfinite(v)]) for v in values)
+        reach = limits[column] if limits else max(_reach(v[np.isfinite(v)]) for v in values)
         steps.append(svg.round_step(reach / _MOST_BARS))
         tops.append(float(np.ceil(reach / steps[-1] - 1e-9) * steps[-1]))
     counts = [
         [_counts(v, s, t) for v, s, t in zip(_both(one), steps, tops, strict=True)]
         for one in evaluations
+    ]
+    highest = [
+        max(float(c[k].max()) / len(e.frames) for c, e in zip(counts, evaluations, strict=True))
+        for k in range(2)
     ]
     for k, one in enumerate(evaluations):
         colour = COLOURS[k % len(COLOURS)]
@@ -85,17 +98,19 @@ def histograms(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
                 420.0,
                 80.0,
                 (0.0, edge + 1.5 * steps[column]),
-                (0.0, max(1.0, float(bars.max()) * 1.3)),  # room for the text
+                (0.0, min(max(0.05, highest[column]), 1.0) * 1.3),  # room for the text
             )
             label = f"position error ({unit})" if column == 0 else "rotation error (deg)"
-            parts.append(panel.axes(label, "frames", one.method))
-            parts.append(_bars(panel, bars, steps[column], colour))
+            parts.append(panel.axes(label, "share of frames", one.method))
+            parts.append(_bars(panel, bars / len(one.frames), steps[column], colour))
             median = one.summary.position.median if column == 0 else one.summary.rotation_deg.median
             if median <= edge:
                 ends = panel.on_page(np.array([median, median]), np.array(panel.y_range))
                 parts.append(svg.line(ends, INK, dash="4 3"))
             missing = one.summary.frames - one.summary.located
-            caption = f"median {median:.2f}" if np.isfinite(median) else "no median: too few poses"
+            of = unit if column == 0 else "deg"
+            told = f"median {median:.2f} {of}" if np.isfinite(median) else "no median"
+            caption = f"{len(one.frames)} frames: {told}"
             caption += f", {bars[-1]} beyond {edge:g}" if bars[-1] else ""
             caption += f", {missing} without a pose" if missing else ""
             parts.append(
@@ -129,15 +144,23 @@ def error_curves(evaluations: Sequence[Evaluation], *, unit: str = "m") -> str:
             ends = panel.on_page(np.array([0.0, end]), np.array([0.0, end]))
             parts.append(svg.line(ends, SOFT, dash="5 4"))
         for k, one in enumerate(evaluations):
-            parts.append(_curve(panel, one.curve, far, column, COLOURS[k % len(COLOURS)]))
+            parts.append(
+                _curve(panel, one.curve, far, column, COLOURS[k % len(COLOURS)], _marker(k))
+            )
         for part in evaluations[0].curve:
             place = panel.on_page(np.array([_middle(part, far)]), np.array([limit]))[0]
             parts.append(
                 svg.text(place[0], place[1] + 10, str(part.frames), anchor="middle", colour=SOFT)
             )
     parts.append(svg.text(54, 376, "Numbers at the top: frames per bin.", colour=SOFT))
-    entries = [(one.method, COLOURS[k % len(COLOURS)]) for k, one in enumerate(evaluations)]
-    parts.append(svg.legend(62, 398, entries))
+    entries = [
+        (
+            f"{one.method} ({one.summary.located} of {len(one.frames)} frames)",
+            COLOURS[k % len(COLOURS)],
+        )
+        for k, one in enumerate(evaluations)
+    ]
+    parts.append(svg.legend(62, 398, entries, [_marker(k) for k in range(len(entries))]))
     return svg.document(1000, 398 + 17 * len(entries), heading, parts)
 
 
@@ -167,9 +190,8 @@ def calibration(evaluations: Sequence[Evaluation]) -> str:
         figures, colour = one.calibration, COLOURS[k % len(COLOURS)]
         assert figures is not None
         points = panel.on_page(np.array(figures.expected), np.array(figures.observed))
-        ends = panel.on_page(np.array([0, 1]), np.array([0, 1]))
-        parts.append(svg.line(np.vstack([ends[:1], points, ends[1:]]), colour, width=1.5))
-        parts.append(svg.dots(points, colour))
+        parts.append(svg.line(points, colour, width=1.5))
+        parts.append(svg.marks(points, colour, _marker(k)))
         entries.append(
             (
                 f"{one.method}: ratio {figures.ratio:.2f} (ideal: 1), "
@@ -177,7 +199,7 @@ def calibration(evaluations: Sequence[Evaluation]) -> str:
                 colour,
             )
         )
-    parts.append(svg.legend(62, 440, entries))
+    parts.append(svg.legend(62, 440, entries, [_marker(k) for k, _ in stated]))
     return svg.document(640, 440 + 17 * len(entries), heading, parts)
 
 
@@ -215,8 +237,10 @@ def _bars(panel: Panel, counts: np.ndarray, step: float, colour: str) -> str:
     return "".join(parts)
 
 
-def _curve(panel: Panel, bins: Sequence[CurveBin], far: float, column: int, colour: str) -> str:
-    """Draw medians as a line with dots and quartiles as a band, clipped at the top; skip infinite values."""
+def _curve(
+    panel: Panel, bins: Sequence[CurveBin], far: float, column: int, colour: str, marker: str
+) -> str:
+    """Draw medians as a line with marks and quartiles as a band, clipped at the top; skip infinite values."""
     x = np.array([_middle(part, far) for part in bins])
     median = np.array(
         [part.position_median if column == 0 else part.rotation_median_deg for part in bins]
@@ -231,8 +255,16 @@ def _curve(panel: Panel, bins: Sequence[CurveBin], far: float, column: int, colo
         edge = np.vstack([panel.on_page(x[shown], low), panel.on_page(x[shown], high)[::-1]])
         parts.append(svg.area(edge, colour, opacity=0.1))
     parts.append(svg.line(points, colour, width=1.5) if len(points) > 1 else "")
-    parts.append(svg.dots(points, colour, radius=3))
+    parts.append(svg.marks(points, colour, marker, radius=3))
     return "".join(parts)
+
+
+def _counted(what: str, drawn: int, count: int) -> str:
+    return f"{what} ({count})" if drawn == count else f"{what} ({drawn} of {count} drawn)"
+
+
+def _marker(k: int) -> str:
+    return MARKERS[k % len(MARKERS)]
 
 
 def _middle(part: CurveBin, far: float) -> float:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spn_model.evaluation import svg
+from spn_data.charts import svg
+from spn_data.charts.svg import COLOURS, GRID, INK, SOFT, Panel
 from spn_model.evaluation.comparison_files import file_names
 from spn_model.evaluation.fixes import COARSE, FlightFixes
-from spn_model.evaluation.svg import COLOURS, GRID, INK, SOFT, Panel
 
 _LIMITS_M = (1e-4, 1e2)
 _SIDE = 360.0

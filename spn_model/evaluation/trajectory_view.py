@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from spn_data.charts import svg
+from spn_data.charts.svg import COLOURS, GRID, INK, MARKERS, SOFT
 from spn_data.geometry.pose import Poses
-from spn_model.evaluation import svg
 from spn_model.evaluation.metrics import Estimates, EvaluationFrames
-from spn_model.evaluation.svg import COLOURS, GRID, INK, SOFT
 
 _MARGIN = 0.25  # of the area's extent: estimates farther outside are not drawn
 MOST_DRAWN = 1500  # cameras, and estimates of one method; more are thinned evenly
@@ -78,10 +78,16 @@ def trajectory_panel(
         )
 
     parts = [_floor(on_page, low, high, step, frames.axes, unit, view_deg=view_deg)]
-    tick = 0.02 * float((high - low).max())
+    tick = 0.03 * float((high - low).max())
+
+    def viewing(poses: Poses, colour: str, width: float) -> str:
+        """Draw where cameras look."""
+        ahead = poses.centers + tick * poses.rotations[:, 2]
+        ends = zip(on_page(poses.centers), on_page(ahead), strict=True)
+        return svg.strokes(ends, colour, width=width)
+
     cameras = training[thinned(len(training))]
-    ahead = cameras.centers + tick * cameras.rotations[:, 2]
-    parts.append(svg.strokes(zip(on_page(cameras.centers), on_page(ahead), strict=True), SOFT))
+    parts.append(viewing(cameras, SOFT, 1.0))
     parts.append(svg.dots(on_page(cameras.centers), SOFT, radius=1.6))
     parts.append(
         svg.strokes(
@@ -89,6 +95,7 @@ def trajectory_panel(
         )
     )
     rows = thinned(len(frames))
+    parts.append(viewing(frames.poses[rows], INK, 0.9))
     for k, (one, within) in enumerate(zip(estimates, inside, strict=True)):
         colour = COLOURS[k % len(COLOURS)]
         shown = rows[within[rows]]
@@ -97,7 +104,9 @@ def trajectory_panel(
             parts.append(
                 svg.strokes(zip(ends, places, strict=True), colour, width=0.6, opacity=0.5)
             )
-            parts.append(svg.dots(places, colour, titles=frames.names[shown].tolist()))
+            parts.append(viewing(one.poses[shown], colour, 0.9))
+            marker, titles = MARKERS[k % len(MARKERS)], frames.names[shown].tolist()
+            parts.append(svg.marks(places, colour, marker, titles=titles))
     located = [np.isfinite(e.poses.centers).all(axis=1) for e in estimates]
     return "".join(parts), [int((a & ~b).sum()) for a, b in zip(located, inside, strict=True)]
 

@@ -125,13 +125,17 @@ def evaluate_runs(
     return EvaluatedRuns(runs=tuple(runs), comparison=comparison, facts=facts, fixes=fixes)
 
 
-def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
+def write_evaluation(
+    evaluated: EvaluatedRuns, error_limits: tuple[float, float] | None = None
+) -> WrittenEvaluation:
     """Write results and figures into the folder of each run, and those of several runs into one more.
 
     Parameters
     ----------
     evaluated : EvaluatedRuns
         Result of `evaluate_runs`.
+    error_limits : tuple of float, optional
+        Ends of the scales of position and rotation errors in histograms; by default, those of each group.
 
     Returns
     -------
@@ -165,7 +169,7 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
             write_fixes(run.fixes, fixes.flights)
         drawings = {**figures[run.name], **stanford_diagrams(fixes.flights)}
         document = fixes.to_json()
-        _write(run, select_network(comparison, run.name), own, drawings, document)
+        _write(run, select_network(comparison, run.name), own, drawings, document, error_limits)
         if run.bundle.exists():
             try:
                 _complete_card(run, facts[run.name]["training"].get("trained_on", ()))
@@ -174,7 +178,7 @@ def write_evaluation(evaluated: EvaluatedRuns) -> WrittenEvaluation:
     folders = [run.folder for run in evaluated.runs]
     if len(evaluated.runs) > 1:
         folders.append(folders[0].parent / COMPARED)
-        _write(RunFiles(folders[-1]), comparison, facts, {})
+        _write(RunFiles(folders[-1]), comparison, facts, {}, None, error_limits)
     return WrittenEvaluation(folders=tuple(folders), notes=tuple(notes))
 
 
@@ -195,7 +199,8 @@ def _write(
     comparison: NetworkComparison,
     runs: Mapping[str, Any],
     figures: Mapping[str, str],
-    fixes: Mapping[str, Any] | None = None,
+    fixes: Mapping[str, Any] | None,
+    error_limits: tuple[float, float] | None,
 ) -> None:
     files.folder.mkdir(parents=True, exist_ok=True)
     write_comparison(
@@ -206,4 +211,5 @@ def _write(
         drawings=files.figures,
         more_drawings=figures,
         fixes=fixes,
+        error_limits=error_limits,
     )

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.charts import svg
+from spn_data.charts.svg import COLOURS, INK, SOFT, Panel
 from spn_data.errors import InputError
 from spn_data.storage.files import read_csv
-from spn_model.evaluation import svg
-from spn_model.evaluation.svg import COLOURS, INK, SOFT, Panel
 from spn_model.training.training_state import COLUMNS
 
 _MOST_POINTS = 400  # largest number of points of a line; of more, an even selection is drawn

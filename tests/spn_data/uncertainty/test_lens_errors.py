@@ -136,6 +136,10 @@ def test_a_held_focal_length_is_as_uncertain_as_stated(hold: Hold) -> None:
     stated = MapCovariance.of(made.scene, made.seen, MapCovarianceOptions(lenses=prior))
     free = MapCovariance.of(made.scene, made.seen)
     assert 1 not in stated.shared.focal_lengths
+    is_free, of_lens = stated.lens_covariances()[1]
+    assert not is_free[0]
+    assert is_free.any() == (hold is Hold.FOCAL)
+    assert of_lens.shape == 2 * (is_free.sum(),)
     assert free.shared.focal_lengths[1].error_px < 5.0
     size = np.einsum(
         "nii->ni", stated.pose_covariances() / np.maximum(free.pose_covariances(), 1e-30)

@@ -219,6 +219,11 @@ def test_independent_errors_give_what_the_whole_dense_system_gives() -> None:
     assert np.abs(scaled).max() < 1e-4
     unknowns, _ = linearized(made.scene, made.seen)
     n = unknowns.count
+    for camera_id, (is_free, found) in covariance.lens_covariances().items():
+        assert is_free.all()
+        of_lens = dense[np.ix_(*2 * [unknowns.lens_columns[camera_id]])]
+        sigma = np.sqrt(np.diag(of_lens))
+        assert np.abs((found - of_lens) / np.outer(sigma, sigma)).max() < 1e-4
     for camera_id in (None, 2):
         wanted = some_functional(made.scene, camera_id)
         row = np.zeros((3, len(dense)))

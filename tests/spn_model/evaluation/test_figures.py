@@ -8,10 +8,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from spn_data.charts import svg
+from spn_data.charts.convert import convert_figures
 from spn_data.geometry.pose import Poses
-from spn_data.geometry.rotations import rotations_from_vectors
-from spn_model.evaluation import figures, svg
+from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
+from spn_model.evaluation import figures
 from spn_model.evaluation.metrics import Estimates, evaluate, evaluation_frames
 from spn_model.evaluation.trajectory_view import view_matrix
 
@@ -104,10 +107,15 @@ def test_what_is_not_drawn_is_counted():
     centers[0], centers[1] = 1e6, np.nan
     one = replace(found, poses=Poses(centers, found.poses.quats_wxyz))
     tree = parsed(figures.trajectories(TRAINING, frames(), [one, shifted([1, 1, 1], "other")]))
-    assert "net (1 outside the plot, 1 without a pose)" in texts(tree)
-    assert "other" in texts(tree)
+    assert "net (3 estimates, 1 outside the plot, 1 without a pose)" in texts(tree)
+    assert {"other (4 estimates)", "true poses (4)", f"training cameras ({len(TRAINING)})"} <= set(
+        texts(tree)
+    )
     assert len(circles(tree, svg.COLOURS[0])) == 4
-    assert len(circles(tree, svg.COLOURS[1])) == 8
+    # The second method has squares instead of circles, so that a figure without colours can be read.
+    assert not circles(tree, svg.COLOURS[1]).size
+    squares = [g for g in tree.iter(f"{SVG}g") if g.get("fill") == svg.COLOURS[1]]
+    assert sum(len(g.findall(f"{SVG}path")) for g in squares) == 8 + 1  # two views and the legend
 
 
 def test_names_cannot_break_out_of_a_figure():
@@ -141,11 +149,11 @@ def test_nothing_with_a_pose_can_be_drawn():
     """A method without any pose has empty panels that say so."""
     lost = Estimates("lost", Poses(np.full((4, 3), np.nan), np.full((4, 4), np.nan)))
     one = evaluate(lost, frames())
-    assert "lost (4 without a pose)" in texts(
+    assert "lost (0 estimates, 4 without a pose)" in texts(
         parsed(figures.trajectories(TRAINING, frames(), [lost]))
     )
     words = texts(parsed(figures.histograms([one])))
-    assert "no median: too few poses, 4 without a pose" in words
+    assert "4 frames: no median, 4 without a pose" in words
     curve = parsed(figures.error_curves([one]))
     assert [c for c in curve.iter(f"{SVG}circle") if c.get("r") == "3"] == []
 
@@ -161,7 +169,7 @@ def test_very_many_frames_are_thinned():
     figure = figures.trajectories(training, some, [Estimates("net", true)])
     tree = parsed(figure)
     assert len(circles(tree, svg.COLOURS[0])) == 2 * 1500
-    assert "net (1500 of 5000 frames drawn)" in texts(tree)
+    assert {"net (5000 estimates)", "true poses (1500 of 5000 drawn)"} <= set(texts(tree))
     assert len(figure) < 1e6
 
 
@@ -181,7 +189,8 @@ def test_bars_are_as_high_as_their_counts():
     drawn = bars(tree, svg.COLOURS[0])
     assert len(drawn) == 3
     assert drawn[0][0] == pytest.approx(3 * drawn[1][0], abs=0.2)
-    assert "median 1.00" in texts(tree)
+    assert "4 frames: median 1.00 m" in texts(tree)
+    assert "share of frames" in texts(tree)
 
 
 def test_errors_beyond_the_scale_have_their_own_bar():
@@ -195,7 +204,56 @@ def test_errors_beyond_the_scale_have_their_own_bar():
     assert len(pale) == 1
     # The largest p95 is 1.9 m, the bins 0.1 m wide.
     (told,) = (words for words in texts(tree) if "beyond" in words)
-    assert re.fullmatch(r"median 1\.\d\d, [1-9] beyond (1\.9|2)", told)
+    assert re.fullmatch(r"100 frames: median 1\.\d\d m, [1-9] beyond (1\.9|2)", told)
+
+
+def test_limits_give_figures_of_several_groups_one_scale():
+    """With given limits, groups with other errors have bars at the same place for the same error."""
+    drawn = []
+    for far in (1.5, 9.0):
+        centers = TRUE.centers + np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, far]])
+        one = evaluate(Estimates("net", Poses(centers, TRUE.quats_wxyz)), frames())
+        tree = parsed(figures.histograms([one], limits=(20, 180)))
+        (first, *_) = [b for b in tree.iter(f"{SVG}rect") if b.get("fill") == svg.COLOURS[0]]
+        drawn.append([first.get(name) for name in ("x", "width", "height")])
+    assert drawn[0] == drawn[1]
+
+
+def test_trajectories_show_where_cameras_look():
+    """From above, the view of a level camera that looks north is a line upwards, of truth and estimate."""
+    north = Poses.from_rotations(TRUE.centers, rotations_from_angles(np.zeros((4, 3))))
+    tree = parsed(figures.trajectories(TRAINING, frames(north), [Estimates("net", north)]))
+    for colour in (svg.INK, svg.COLOURS[0]):
+        short = [
+            [tuple(map(float, end.split())) for end in step.split("L")]
+            for p in tree.iter(f"{SVG}path")
+            if p.get("stroke") == colour and p.get("stroke-width") == "0.9"
+            for step in p.get("d")[1:].split("M")
+        ]
+        assert len(short) == 8  # four frames in two views
+        for (x0, y0), (x1, y1) in short[4:]:
+            assert x1 == pytest.approx(x0, abs=0.11)
+            assert y1 < y0 - 2
+
+
+def test_figures_become_png_and_pdf(tmp_path):
+    """Both formats hold the drawing: its size and colours, and text as text."""
+    pytest.importorskip("matplotlib")
+    drawn = figures.trajectories(
+        TRAINING, frames(), [shifted([0, 4, 0]), shifted([1, 1, 1], "$b_1$")]
+    )
+    (tmp_path / "a.svg").write_text(drawn, encoding="utf-8")
+    assert convert_figures(tmp_path, ("png", "pdf")) == 2
+    with Image.open(tmp_path / "a.png") as image:
+        pixels = np.array(image.convert("RGB")).reshape(-1, 3)
+        width, height = map(float, parsed(drawn).get("viewBox").split()[2:])
+        assert image.size == pytest.approx((width * 200 / 96, height * 200 / 96), abs=2)
+    for colour in svg.COLOURS[:2]:
+        wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+        assert (np.abs(pixels - wanted).max(axis=1) < 8).sum() > 100
+    pdf = (tmp_path / "a.pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert b"/Type0" in pdf or b"/TrueType" in pdf
 
 
 def test_the_oracle_lies_on_the_dashed_line():
@@ -231,6 +289,12 @@ def test_right_covariances_are_drawn_on_the_diagonal():
     )
     assert len(dots) == 19
     np.testing.assert_allclose(dots.sum(axis=1), dots.sum(axis=1)[0], atol=0.11)
+    (curve,) = (
+        p.get("d")
+        for p in tree.iter(f"{SVG}path")
+        if p.get("stroke") == svg.COLOURS[0] and p.get("stroke-width") == "1.5"
+    )
+    assert curve.count("L") == 18  # from the first to the last dot, and no further
 
 
 def test_calibration_needs_a_covariance():

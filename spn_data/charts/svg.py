@@ -12,6 +12,8 @@ import numpy as np
 INK, SOFT, GRID = "#222222", "#8a8f98", "#e3e5e8"
 # The colour-blind safe palette of Okabe and Ito.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+# Shapes that tell series apart without colours.
+MARKERS = ("circle", "square", "triangle", "diamond", "cross", "plus")
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,8 @@ class Panel:
             axis=-1,
         )
 
-    def axes(self, x_label: str, y_label: str, title: str = "") -> str:
-        """Draw grid, ticks and labels."""
+    def axes(self, x_label: str, y_label: str, title: str = "", *, decades: bool = False) -> str:
+        """Draw grid, ticks and labels. decades : whether y is the logarithm to base 10 of what it shows."""
         bottom, right = self.top + self.height, self.left + self.width
         parts = []
         for value in ticks(*self.x_range):
@@ -51,9 +53,12 @@ class Panel:
             parts.append(line([(x, self.top), (x, bottom)], GRID))
             parts.append(text(x, bottom + 15, f"{value:g}", anchor="middle"))
         for value in ticks(*self.y_range):
+            if decades and value != round(value):
+                continue
             y = self.on_page(np.array([self.x_range[0]]), np.array([value]))[0, 1]
             parts.append(line([(self.left, y), (right, y)], GRID))
-            parts.append(text(self.left - 6, y + 4, f"{value:g}", anchor="end"))
+            shown = 10.0**value if decades else value
+            parts.append(text(self.left - 6, y + 4, f"{shown:g}", anchor="end"))
         parts.append(line([(self.left, self.top), (self.left, bottom), (right, bottom)], SOFT))
         parts.append(text(self.left + self.width / 2, bottom + 32, x_label, anchor="middle"))
         parts.append(text(self.left - 34, self.top - 10, y_label))
@@ -115,6 +120,39 @@ def dots(
     return f'<g fill="{colour}">{circles}</g>'
 
 
+def marks(
+    points: np.ndarray,
+    colour: str,
+    marker: str,
+    *,
+    radius: float = 2.5,
+    titles: Sequence[str] = (),
+) -> str:
+    """Draw marks, one of `MARKERS`, at page positions (N, 2). titles : tooltips."""
+    if marker == "circle":
+        return dots(points, colour, radius=radius, titles=titles)
+    r = radius
+    shapes = {
+        "square": [(-r, -r), (r, -r), (r, r), (-r, r)],
+        "triangle": [(0, -1.3 * r), (1.2 * r, r), (-1.2 * r, r)],
+        "diamond": [(0, -1.4 * r), (1.4 * r, 0), (0, 1.4 * r), (-1.4 * r, 0)],
+        "cross": [(-r, -r), (r, r), (-r, r), (r, -r)],
+        "plus": [(-1.3 * r, 0), (1.3 * r, 0), (0, -1.3 * r), (0, 1.3 * r)],
+    }
+    is_open = marker in ("cross", "plus")
+    tooltips = [f"<title>{_words(title)}</title>" for title in titles] or [""] * len(points)
+    parts = []
+    for (x, y), title in zip(points, tooltips, strict=True):
+        corners = [f"{x + a:.1f} {y + b:.1f}" for a, b in shapes[marker]]
+        if is_open:
+            path = f"M{corners[0]}L{corners[1]}M{corners[2]}L{corners[3]}"
+        else:
+            path = f"M{'L'.join(corners)}Z"
+        parts.append(f'<path d="{path}">{title}</path>')
+    style = f'stroke="{colour}" stroke-width="1.4"' if is_open else f'fill="{colour}"'
+    return f"<g {style}>{''.join(parts)}</g>"
+
+
 def area(points: np.ndarray, colour: str, *, opacity: float = 0.15) -> str:
     """Draw a filled polygon of page positions (N, 2)."""
     path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
@@ -140,11 +178,15 @@ def text(
     )
 
 
-def legend(x: float, y: float, entries: Sequence[tuple[str, str]]) -> str:
-    """Draw legend entries (text, colour) below each other."""
+def legend(
+    x: float, y: float, entries: Sequence[tuple[str, str]], markers: Sequence[str] = ()
+) -> str:
+    """Draw legend entries (text, colour) below each other. markers : one of each; circles by default."""
+    shapes = markers or ["circle"] * len(entries)
     return "".join(
-        dots(np.array([[x, y + 17 * k - 4]]), colour, radius=4) + text(x + 10, y + 17 * k, words)
-        for k, (words, colour) in enumerate(entries)
+        marks(np.array([[x, y + 17 * k - 4]]), colour, shape, radius=4)
+        + text(x + 10, y + 17 * k, words)
+        for k, ((words, colour), shape) in enumerate(zip(entries, shapes, strict=True))
     )
 
 
