@@ -33,12 +33,15 @@ from spn_data.geometry.pose import Poses
 from spn_data.georegistration.result import GeoFit
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.inputs.network_runs import read_runs, trained_runs
+from spn_data.inputs.run_estimates import read_estimates
+from spn_data.inputs.thumbnails import read_thumbnails
 from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.next_step import next_step
+from spn_data.report.pictures import Pictures, worst_frames
 from spn_data.report.verdict import AreaVerdict, VerdictReason, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
@@ -84,9 +87,29 @@ def write_report(
     """
     options = options or ReportOptions()
     path, data = area.root / REPORT, report_data(area)
-    html = render(data, max_points=options.max_points, max_frames=options.max_frames)
+    html = render(
+        data,
+        _pictures(area, data),
+        max_points=options.max_points,
+        max_frames=options.max_frames,
+    )
     write_atomically(path, html)
     return path, *_judged(data)
+
+
+def _pictures(area: Area, data: ReportData) -> Pictures:
+    """Read estimates and images; worst frames, and training frames beside them, come before others."""
+    estimates, notes = read_estimates(area, data.runs)
+    worst = worst_frames(data.frames, estimates)
+    wanted = {name for one in worst for name in (one.name, one.nearest, one.taken_for)}
+    images = read_thumbnails(area, data.frames, wanted)
+    return Pictures(
+        estimates=estimates,
+        worst=worst,
+        thumbnails=images.images,
+        files=images.files,
+        notes=(*notes, *images.notes),
+    )
 
 
 def judge_area(area: Area) -> tuple[AreaVerdict, VerdictReason]:
