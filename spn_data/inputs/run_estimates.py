@@ -73,7 +73,8 @@ def _read(
         try:
             of[cells["name"][:_MAX_TEXT]] = _row(cells)
         except ValueError as error:
-            raise InputError(f"not an estimated pose ({error})", path=path, line=line) from error
+            what = f"not an estimated pose ({str(error)[:_MAX_TEXT]})"
+            raise InputError(what, path=path, line=line) from error
     return [_estimates(run, methods[method], of) for method, of in rows.items() if of]
 
 

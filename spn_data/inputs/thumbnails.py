@@ -77,9 +77,8 @@ def read_thumbnails(area: Area, frames: FrameTable, wanted: Collection[str] = ()
     for name, path in _paths(area, frames, rows).items():
         try:
             stamp = _stamp(area.root, path)
-            old = kept.get(name)
-            is_kept = old is not None and old[:2] == stamp
-            made[name] = old if is_kept else [*stamp, _thumbnail(path, most)]
+            old = kept.get(name, [])
+            made[name] = old if old[:2] == stamp else [*stamp, _thumbnail(path, most)]
             files[name] = path.relative_to(area.root).as_posix()
         except InputError as error:
             broken.append(str(error))

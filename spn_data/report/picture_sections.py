@@ -8,9 +8,9 @@ from itertools import groupby
 import numpy as np
 
 from spn_data.report.data import FAILED, FrameTable
-from spn_data.report.pictures import Pictures, WorstFrame
+from spn_data.report.pictures import COARSE, Pictures, WorstFrame
 
-_MAX_FAILED = 60
+_MAX_FAILED = 24  # of each kind
 
 
 def worst(pictures: Pictures, units: str) -> str:
@@ -54,36 +54,44 @@ def _row(one: WorstFrame, unit: str) -> str:
 
 
 def failed(frames: FrameTable, pictures: Pictures) -> str:
-    """Return pictures of failed frames with their reasons; empty if there are none.
+    """Return pictures of frames without a label, and without a usable fix, with their reasons.
 
     Parameters
     ----------
     frames : FrameTable
-        All frames; of many failed ones, an evenly spaced subset is shown.
+        All frames.
     pictures : Pictures
 
     Returns
     -------
     str
-        The section; the page's script fills in the images.
+        The section, empty if there are none; the page's script fills in the images.
     """
-    has = np.isin(frames.names, list(pictures.thumbnails)) & (frames.status == FAILED)
-    rows = np.flatnonzero(has)
+    has_none = frames.status == FAILED
+    parts = [
+        _gallery("No pose in the map", frames.names[has_none], frames.reason[has_none], pictures)
+    ]
+    for one in pictures.estimates:
+        if one.method != COARSE:
+            title = f"No usable fix: {one.run}, {one.method}"
+            parts.append(
+                _gallery(title, one.names[~one.located], one.reasons[~one.located], pictures)
+            )
+    shown = "".join(parts)
+    return f'<section id="failed"><h2>Failed frames</h2>{shown}</section>' if shown else ""
+
+
+def _gallery(title: str, names: np.ndarray, reasons: np.ndarray, pictures: Pictures) -> str:
+    """Return pictures of the frames that have an image; of many, an evenly spaced subset."""
+    rows = np.flatnonzero(np.isin(names, list(pictures.thumbnails)))
     if not len(rows):
         return ""
     shown = rows[np.linspace(0, len(rows) - 1, min(_MAX_FAILED, len(rows))).astype(np.int64)]
-    figures = "".join(
-        _figure(str(name), str(reason))
-        for name, reason in zip(frames.names[shown], frames.reason[shown], strict=True)
-    )
-    left_out = (
-        f'<p class="note">{len(shown):,} of {len(rows):,} are shown, evenly.</p>'
-        if len(shown) < len(rows)
-        else ""
-    )
+    figures = "".join(_figure(str(names[row]), str(reasons[row])) for row in shown)
     return (
-        '<section id="failed"><h2>Frames without a pose</h2>'
-        f'<div class="gallery">{figures}</div>{left_out}</section>'
+        f'<h3>{escape(title)}</h3><div class="gallery">{figures}</div>'
+        f'<p class="note">{len(shown):,} of {len(names):,} frames are shown; frames without a stored image '
+        "are not.</p>"
     )
 
 

@@ -111,10 +111,10 @@ function makeView(onPick, onEstimates) {
   function told() {
     if (!chosenEstimates) { document.getElementById("estimated").textContent = ""; return; }
     const n = chosenEstimates.row.length, none = n - guessed.shown - guessed.far;
-    document.getElementById("estimated").textContent = `${chosenEstimates.label}: ${guessed.shown} of ${n} estimates are drawn`
-      + (none ? `, ${none} frames have none` : "")
-      + (guessed.far ? `, ${guessed.far} are farther out than the view.` : ".")
-      + " Estimates are red, and joined to where the frame was; training images are not evaluated here.";
+    document.getElementById("estimated").textContent = `${chosenEstimates.label}: ${guessed.shown} estimates of ${n} frames are drawn`
+      + (none ? `; frames without an estimate: ${none}` : "")
+      + (guessed.far ? `; farther out than the view: ${guessed.far}` : "")
+      + ". Estimates are red, and joined to where the frame was. Those of training images are left out.";
   }
 
   function pick(i, center) {
@@ -208,5 +208,10 @@ function makeView(onPick, onEstimates) {
   legend();
   told();
   draw();
-  return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas, onScreen: center => onScreen(matrix(), ...center)};
+  // Where a frame and its estimate are on the canvas, for tests.
+  function placeOf(name) {
+    const i = rows.find(k => frames.name(k) === name), m = matrix(), k = chosenEstimates && chosenEstimates.of.get(i);
+    return {truth: onScreen(m, ...centerOf(i)), estimate: chosenEstimates && onScreen(m, ...centerIn(chosenEstimates.center, k))};
+  }
+  return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas, placeOf};
 }

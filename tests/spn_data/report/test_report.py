@@ -427,7 +427,9 @@ def test_residuals_are_drawn_true_to_scale():
     x0, y0, x1, y1 = map(
         float,
         re.findall(
-            r'class="fix"><title>[^<]*</title><path d="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)', svg
+            r'class="fix" data-frame="[^"]*"><title>[^<]*</title>'
+            r'<path d="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)',
+            svg,
         )[0],
     )
     assert factor > 1
