@@ -14,13 +14,13 @@ from spn_data.area.names import ERRORS, FIXES, RUNS
 from spn_data.errors import InputError
 from spn_data.geometry.pose import Poses
 from spn_data.report.data import RunFacts
-from spn_data.report.pictures import COARSE, PoseEstimates
+from spn_data.report.pictures import COARSE, RunEstimates
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _ERRORS = ("method", "name", "error", "error_deg", *_POSE)
 _FIXES = (*_ERRORS, "reason")
-_FIX_METHODS = ("search", "track")  # coarse poses are those of errors.csv
 _MAX_BYTES, _MAX_ROWS, _MAX_TEXT = 500_000_000, 2_000_000, 200
+_MAX_METHODS = 20
 _MAX_UNIT_ERROR = 1e-3  # of the norm of a quaternion
 
 _Row = tuple[list[float], float, float, str]  # pose, errors, reason
@@ -28,7 +28,7 @@ _Row = tuple[list[float], float, float, str]  # pose, errors, reason
 
 def read_estimates(
     area: Area, runs: Sequence[RunFacts]
-) -> tuple[tuple[PoseEstimates, ...], tuple[str, ...]]:
+) -> tuple[tuple[RunEstimates, ...], tuple[str, ...]]:
     """Read the estimated poses of the runs of an area.
 
     Parameters
@@ -39,12 +39,12 @@ def read_estimates(
 
     Returns
     -------
-    estimates : tuple of PoseEstimates
+    estimates : tuple of RunEstimates
         By run: the network alone first, then fixes.
     notes : tuple of str
         Why poses of a run cannot be shown.
     """
-    found: list[PoseEstimates] = []
+    found: list[RunEstimates] = []
     notes: list[str] = []
     for run in runs:
         if len(run.networks) != 1 or not run.is_current or run.is_outdated:
@@ -52,30 +52,30 @@ def read_estimates(
         (network,) = run.networks
         folder = area.root / RUNS / run.name
         try:
-            found += _read(folder / ERRORS, _ERRORS, {network: COARSE}, run.name)
+            rows = _read(folder / ERRORS, _ERRORS).get(network)
+            found += [_estimates(run.name, COARSE, rows)] if rows else []
             if (folder / FIXES).is_file():
-                methods = {method: method for method in _FIX_METHODS}
-                found += _read(folder / FIXES, _FIXES, methods, run.name)
+                by_method = _read(folder / FIXES, _FIXES)
+                by_method.pop(COARSE, None)  # of fewer frames than errors.csv has
+                found += [_estimates(run.name, *item) for item in by_method.items()]
         except InputError as error:
             notes.append(f"{error}; run spn-model evaluate --run {run.name} again")
     return tuple(found), tuple(notes)
 
 
-def _read(
-    path: Path, columns: Sequence[str], methods: dict[str, str], run: str
-) -> list[PoseEstimates]:
-    """Return the estimates of a table by method, in the order of `methods`."""
-    rows: dict[str, dict[str, _Row]] = {method: {} for method in methods}
+def _read(path: Path, columns: Sequence[str]) -> dict[str, dict[str, _Row]]:
+    """Return the estimates of a table by method and frame."""
+    rows: dict[str, dict[str, _Row]] = {}
     for line, cells in _cells(path, columns):
-        of = rows.get(cells["method"])
-        if of is None:
-            continue
+        of = rows.setdefault(cells["method"][:_MAX_TEXT], {})
+        if len(rows) > _MAX_METHODS:
+            raise InputError(f"has more than {_MAX_METHODS} methods", path=path, line=line)
         try:
             of[cells["name"][:_MAX_TEXT]] = _row(cells)
         except ValueError as error:
             what = f"not an estimated pose ({str(error)[:_MAX_TEXT]})"
             raise InputError(what, path=path, line=line) from error
-    return [_estimates(run, methods[method], of) for method, of in rows.items() if of]
+    return rows
 
 
 def _cells(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
@@ -118,9 +118,9 @@ def _number(cell: str) -> float:
     return value
 
 
-def _estimates(run: str, method: str, rows: dict[str, _Row]) -> PoseEstimates:
+def _estimates(run: str, method: str, rows: dict[str, _Row]) -> RunEstimates:
     poses = np.array([row[0] for row in rows.values()])
-    return PoseEstimates(
+    return RunEstimates(
         run=run,
         method=method,
         names=np.array(list(rows), dtype=np.str_),

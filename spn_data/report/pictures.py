@@ -22,7 +22,7 @@ _NEAREST = CoverageOptions(high_m=np.inf, high_deg=np.inf, medium_m=np.inf, medi
 
 
 @dataclass(frozen=True, eq=False)
-class PoseEstimates:
+class RunEstimates:
     """Poses that one way to localize gave for N frames.
 
     Attributes
@@ -30,7 +30,7 @@ class PoseEstimates:
     run : str
         Name of the run.
     method : str
-        `COARSE` for the network alone; "search" or "track" for fixes of its bundle.
+        `COARSE` for the network alone, otherwise that of fixes of its bundle, such as "search".
     names : ndarray of str, shape (N,)
         Frames, each once.
     poses : Poses
@@ -89,7 +89,7 @@ class Pictures:
 
     Attributes
     ----------
-    estimates : tuple of PoseEstimates
+    estimates : tuple of RunEstimates
     worst : tuple of WorstFrame
         Of these estimates.
     thumbnails : mapping of str to bytes
@@ -100,7 +100,7 @@ class Pictures:
         What is missing, and why.
     """
 
-    estimates: tuple[PoseEstimates, ...] = ()
+    estimates: tuple[RunEstimates, ...] = ()
     worst: tuple[WorstFrame, ...] = ()
     thumbnails: Mapping[str, bytes] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
@@ -112,15 +112,13 @@ def with_image(frames: FrameTable) -> np.ndarray:
     return ~frames.tracked & (frames.tried | (frames.status == "chosen"))
 
 
-def worst_frames(
-    frames: FrameTable, estimates: tuple[PoseEstimates, ...]
-) -> tuple[WorstFrame, ...]:
+def worst_frames(frames: FrameTable, estimates: tuple[RunEstimates, ...]) -> tuple[WorstFrame, ...]:
     """Return the frames of each flight with the largest errors of each network, the worst first.
 
     Parameters
     ----------
     frames : FrameTable
-    estimates : tuple of PoseEstimates
+    estimates : tuple of RunEstimates
         Only those of networks alone count.
 
     Returns
@@ -148,7 +146,7 @@ def worst_frames(
 
 
 def _worst(
-    frames: FrameTable, training: np.ndarray, one: PoseEstimates, k: int, i: int
+    frames: FrameTable, training: np.ndarray, one: RunEstimates, k: int, i: int
 ) -> WorstFrame:
     """Describe frame i, of which k is the estimate."""
     both = Poses.concatenate([frames.poses[i : i + 1], one.poses[k : k + 1]])

@@ -15,7 +15,7 @@ from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
-from spn_data.report.pictures import COARSE, Pictures, PoseEstimates, worst_frames
+from spn_data.report.pictures import COARSE, Pictures, RunEstimates, worst_frames
 from spn_data.split import audit
 from spn_data.split.groups import Split, SplitOptions
 from spn_data.storage.stage_record import StageRecord
@@ -169,7 +169,7 @@ def pictures(data: ReportData, off_m: float = 5.0) -> Pictures:
         np.where(missing[:, None], np.nan, test.poses.quats_wxyz),
     )
     estimates = (
-        PoseEstimates(
+        RunEstimates(
             run="first",
             method=COARSE,
             names=test.names,
@@ -178,7 +178,7 @@ def pictures(data: ReportData, off_m: float = 5.0) -> Pictures:
             error_deg=np.zeros(n),
             reasons=np.full(n, ""),
         ),
-        PoseEstimates(
+        RunEstimates(
             run="first",
             method="search",
             names=test.names,

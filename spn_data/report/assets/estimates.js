@@ -1,9 +1,10 @@
 // Estimated poses of each run, and which of them are shown.
 const WAYS = {coarse: "network alone", search: "fixes, each image alone", track: "fixes, tracked"};
+const wayOf = method => WAYS[method] || `fixes, ${method}`;
 const estimates = report.estimates.map(one => {
   const row = unpack(one.row), center = unpack(one.center), error = unpack(one.error), error_deg = unpack(one.error_deg);
   const which = unpack(one.reason.which), of = new Map(Array.from(row, (i, k) => [i, k]));
-  return {row, center, quat: unpack(one.quat), error, error_deg, of, label: `${one.run}: ${WAYS[one.method] || one.method}`,
+  return {row, center, quat: unpack(one.quat), error, error_deg, of, label: `${one.run}: ${wayOf(one.method)}`,
     reason: k => one.reason.texts[which[k]], located: k => Number.isFinite(center[3 * k])};
 });
 

@@ -34,7 +34,7 @@ function makeFrame(onPick) {
   }
 
   function facts(i) {
-    const lines = [`${frames.status(i)}${frames.reason(i) ? `: ${frames.reason(i)}` : ""}`, `${frames.time_s[i].toFixed(2)} s`];
+    const lines = [`${frames.status(i)}${frames.reason(i) ? `: ${frames.reason(i)}` : ""}`, `at ${frames.time_s[i].toFixed(2)} s`];
     if (hasPose(i)) {
       lines.push(`${[0, 1, 2].map(k => figure(frames.center[3 * i + k], 2)).join(", ")} ${unit}`);
       if (Number.isFinite(frames.sigma_m[i])) lines.push(`sigma ${figure(frames.sigma_m[i], 3)} ${unit}`);

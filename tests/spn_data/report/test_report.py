@@ -223,7 +223,7 @@ def test_options_are_documented_with_their_defaults():
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \| ([^|]+) \|", text, re.MULTILINE))
     assert sorted(rows) == sorted(p.opts[0] for p in report.params)
     for parameter in report.params:
-        if isinstance(parameter.default, int):
+        if type(parameter.default) is int:
             assert int(rows[parameter.opts[0]]) == parameter.default
 
 

@@ -395,7 +395,8 @@ def test_a_click_anywhere_shows_the_image(tmp_path):
         found.row = told();
         document.dispatchEvent(new KeyboardEvent("keydown", {key: "Escape", bubbles: true}));
         found.after = told();
-        found.pictures = [...document.querySelectorAll("#worst img, #failed img")].map(i => i.src.slice(0, 15));
+        found.pictures = [...document.querySelectorAll("#worst img, #failed img")]
+          .map(i => i.src.slice(0, 15));
         const fetched = performance.getEntriesByType("resource").map(entry => entry.name);
         found.fetched = fetched.filter(name => !name.startsWith("data:"));
         """,
