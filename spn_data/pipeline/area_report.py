@@ -45,7 +45,7 @@ from spn_data.pipeline.area_audit import read_audit
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
 from spn_data.report.next_step import next_step
-from spn_data.report.pictures import Pictures, worst_frames
+from spn_data.report.pictures import Pictures, fits_labels, worst_frames
 from spn_data.report.verdict import AreaVerdict, VerdictReason, verdict
 from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
@@ -110,7 +110,15 @@ def write_report(
 
 def _pictures(area: Area, data: ReportData) -> Pictures:
     """Read estimates and images; worst frames, and training frames beside them, come before others."""
-    estimates, notes = read_estimates(area, data.runs)
+    found, notes = read_estimates(area, data.runs)
+    fitting = [fits_labels(data.frames, one) for one in found]
+    estimates = tuple(one for one, fits in zip(found, fitting, strict=True) if fits)
+    moved = dict.fromkeys(one.run for one, fits in zip(found, fitting, strict=True) if not fits)
+    notes += tuple(
+        f"estimates of {run} are of other labels than those of the area, and not shown; run spn-data split, "
+        f"then spn-model evaluate --run {run}"
+        for run in moved
+    )
     worst = worst_frames(data.frames, estimates)
     wanted = {name for one in worst for name in (one.name, one.nearest, one.taken_for)}
     images = read_thumbnails(area, data.frames, wanted)

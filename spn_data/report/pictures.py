@@ -16,6 +16,7 @@ from spn_data.report.pack import pack, pack_texts
 from spn_data.split.groups import TRAIN
 
 COARSE = "coarse"  # the network alone
+_SAME = 1e-3  # in the world's unit: cells are rounded to a tenth of it
 _WORST = 3  # frames of each flight and network
 # Without limits, the nearest frame is the one with the smallest sum of distance and angle.
 _NEAREST = CoverageOptions(high_m=np.inf, high_deg=np.inf, medium_m=np.inf, medium_deg=np.inf)
@@ -112,6 +113,18 @@ def with_image(frames: FrameTable) -> np.ndarray:
     return ~frames.tracked & (frames.tried | (frames.status == "chosen"))
 
 
+def fits_labels(frames: FrameTable, one: RunEstimates) -> bool:
+    """Return whether errors against the labels are those that the evaluation found: of the same map."""
+    row = {name: k for k, name in enumerate(frames.names.tolist())}
+    both = [(k, row[name]) for k, name in enumerate(one.names.tolist()) if name in row]
+    if not both:
+        return False
+    k, i = np.array(both).T
+    distance = np.linalg.norm(one.poses.centers[k] - frames.poses.centers[i], axis=1)
+    off = np.abs(distance - one.error[k])
+    return not bool((off[np.isfinite(off)] > _SAME).any())
+
+
 def worst_frames(frames: FrameTable, estimates: tuple[RunEstimates, ...]) -> tuple[WorstFrame, ...]:
     """Return the frames of each flight with the largest errors of each network, the worst first.
 
@@ -171,15 +184,15 @@ def pack_pictures(pictures: Pictures, frames: FrameTable) -> dict[str, Any]:
     is_training = frames.group == TRAIN
     packed = []
     for one in pictures.estimates:
-        pairs = [(k, rows[n]) for k, n in enumerate(one.names.tolist()) if n in rows]
-        keep = [k for k, row in pairs if not is_training[row]]
-        if not keep:
+        row_of = np.array([rows.get(name, -1) for name in one.names.tolist()])
+        keep = (row_of >= 0) & ~is_training[row_of]
+        if not keep.any():
             continue
         packed.append(
             {
                 "run": one.run,
                 "method": one.method,
-                "row": pack(np.array([row for _, row in pairs if not is_training[row]]), "i4"),
+                "row": pack(row_of[keep], "i4"),
                 "center": pack(one.poses.centers[keep], "f4"),
                 "quat": pack(one.poses.quats_wxyz[keep], "f4"),
                 "error": pack(one.error[keep], "f4"),

@@ -291,10 +291,14 @@ def test_a_large_area_loads_in_three_seconds(tmp_path):
 
 def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
     """At a width of 390 pixels, only tables in their own frames are wider than the screen."""
+    data = area()
     seen = visit(
         tmp_path,
-        render(area()),
+        render(data, pictures(data)),
         """
+        document.querySelector("#worst figure").click();
+        const panel = document.getElementById("picked").getBoundingClientRect();
+        found.panel = [panel.left, panel.right];
         found.window = window.innerWidth;
         found.wide = document.documentElement.scrollWidth;
         found.view = pixels(document.getElementById("view"));
@@ -304,6 +308,7 @@ def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
     assert seen.console == []
     assert seen.found["window"] == 390
     assert seen.found["wide"] <= 390
+    assert 0 <= seen.found["panel"][0] < seen.found["panel"][1] <= 390
     assert seen.found["view"]["drawn"] > 0.02
 
 

@@ -20,7 +20,7 @@ from spn_data.inputs.run_estimates import read_estimates
 from spn_data.inputs.thumbnails import read_thumbnails
 from spn_data.report.data import RunFacts
 from spn_data.report.html import render
-from spn_data.report.pictures import COARSE, worst_frames
+from spn_data.report.pictures import COARSE, fits_labels, worst_frames
 from tests.worlds.report_data import area, flight, pictures
 
 HEADER = "method,group,name,error,error_deg,x,y,z,qw,qx,qy,qz"
@@ -88,6 +88,19 @@ def test_a_damaged_table_of_estimates_is_named(run, monkeypatch, text, words):
     assert note.startswith(str(run / "errors.csv"))
     assert note.endswith("; run spn-model evaluate --run first again")
     assert len(note) < 500
+
+
+def test_estimates_of_another_map_are_found():
+    """Where the labels moved by a centimetre since the evaluation, estimates do not belong to them."""
+    data = area()
+    coarse, fixes = pictures(data).estimates
+    assert fits_labels(data.frames, coarse)
+    assert fits_labels(data.frames, fixes)
+    poses = replace(data.frames.poses, centers=data.frames.poses.centers + np.array([0, 0, 0.01]))
+    moved = replace(data.frames, poses=poses)
+    assert not fits_labels(moved, coarse)
+    assert not fits_labels(moved, fixes)
+    assert not fits_labels(data.frames, replace(coarse, names=np.char.add(coarse.names, "x")))
 
 
 def test_worst_frames_stand_beside_what_they_were_taken_for():
