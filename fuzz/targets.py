@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from spn_data.ground_control.coordinates import surveyed_positions
 from spn_data.inputs.area_labels import read_written_world
 from spn_data.inputs.expected_plans import read_expected_plans
 from spn_data.inputs.network_runs import read_runs
+from spn_data.inputs.run_estimates import read_estimates
 from spn_data.labels.labels import read_label_observations, read_labels
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.pipeline.area_coverage import read_coverage
@@ -195,7 +196,9 @@ def _area(path: Path) -> None:
 
 
 def _run(path: Path) -> None:
-    read_runs(Area(_root(path)))
+    area = Area(_root(path))
+    runs, _ = read_runs(area)
+    read_estimates(area, [replace(run, is_current=True, is_outdated=False) for run in runs])
     _ = read_run(path.parent).errors
     run = RunFiles(path.parent)
     if run.fixes.is_file():

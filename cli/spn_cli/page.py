@@ -60,6 +60,14 @@ def complete_cards(verdict: AreaVerdict | None, folders: Mapping[str, Path]) -> 
                 console.note(f"the model card of {run} was not completed: {error}")
 
 
+def open_in_browser(path: Path) -> None:
+    """Open a page in the default browser; say so if none can be started."""
+    import webbrowser
+
+    if not webbrowser.open(path.resolve().as_uri()):
+        console.note(f"no browser could be started; open {path.resolve()} in one")
+
+
 def show_judgement(area: Area) -> None:
     """Print the verdict and the next step of an area with frames; say why if they are not known."""
     from spn_data.pipeline.area_report import judge_area

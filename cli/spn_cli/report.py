@@ -25,7 +25,8 @@ from spn_cli import options, page
     show_default=True,
     help="Maximum number of frames in the page; failed and chosen ones are always kept.",
 )
-def report(area_folder: Path, max_points: int, max_frames: int) -> None:
+@click.option("--open", "open_it", is_flag=True, help="Open the page in a browser.")
+def report(area_folder: Path, max_points: int, max_frames: int, open_it: bool) -> None:
     """Write report.html, which shows whether the area is ready for training, and why.
 
     \b
@@ -40,3 +41,5 @@ def report(area_folder: Path, max_points: int, max_frames: int) -> None:
             area, ReportOptions(max_points=max_points, max_frames=max_frames)
         )
     page.show_verdict(verdict, area, path)
+    if open_it:
+        page.open_in_browser(path)

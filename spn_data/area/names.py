@@ -37,6 +37,7 @@ SCRATCH: dict[str, tuple[str, ...]] = {
 # Next to the stages: files that each run replaces.
 COVERAGE, PLANNED_COVERAGE = "coverage", "coverage-waypoints"
 REPORT = "report.html"
+THUMBNAILS = ".thumbnails.json"  # cache of the small images in the report
 
 # Trained networks, a folder each; made by spn-model.
 RUNS = "runs"

@@ -143,6 +143,18 @@ def _decode_gray(path: Path, max_width: int) -> np.ndarray:
         return np.asarray(_to_8_bits(_upright(image), path).convert("L"))
 
 
+def decode_reduced(path: Path, *, max_width: int) -> np.ndarray:
+    """Decode a stored image as it is (h, w, 3) uint8 BGR, at most `max_width` wide; JPEGs decoded reduced."""
+    with _open_image(path) as image:
+        image.draft("RGB", (max_width, max_width * image.height // max(image.width, 1)))
+        bgr = np.ascontiguousarray(np.asarray(_to_8_bits(image, path).convert("RGB"))[:, :, ::-1])
+    scale = max_width / bgr.shape[1]
+    if scale >= 1:
+        return bgr
+    size = (max_width, max(1, round(bgr.shape[0] * scale)))
+    return cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
+
+
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
     """Load a mask of usable pixels.
 

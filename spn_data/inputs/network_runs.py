@@ -23,9 +23,9 @@ from spn_data.area.names import (
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError
 from spn_data.inputs.frame_errors import read_frame_errors
-from spn_data.report.data import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.network_state import NetworkState
+from spn_data.report.run_facts import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.storage.fingerprints import content_fingerprint
 from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,20 @@ import numpy as np
 from spn_data.area.area import Area, command_of
 from spn_data.area.names import (
     AUDIT,
+    BUNDLE,
     CAMERA,
+    CHECKPOINT,
     COVERAGE,
     EVALUATION,
     FRAMES,
     FRAMES_TABLE,
     GEO,
     GEO_FIT,
+    METRICS,
     MODEL,
     PLANNED_COVERAGE,
     REPORT,
+    RUNS,
     SPLIT,
     SPLIT_FILE,
 )
@@ -40,6 +44,7 @@ from spn_data.labels.labels import Labels, pose_sigmas
 from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.pipeline.area_photogrammetry import photogrammetry_of
+from spn_data.pipeline.area_pictures import pictures_of
 from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
@@ -48,6 +53,13 @@ from spn_data.split.split_file import read_split
 from spn_data.storage.files import write_atomically
 from spn_data.storage.json_files import DAMAGE, read_json, reporting_damage
 from spn_data.storage.stage_record import versions
+
+# Written after the stages: their records do not say when.
+_CHANGED_LATER = (
+    *(f"{folder}/*.json" for folder in (COVERAGE, PLANNED_COVERAGE)),
+    f"{SPLIT}/{AUDIT}",
+    *(f"{RUNS}/*/{file}" for file in (CHECKPOINT, METRICS, f"{BUNDLE}/*")),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +97,13 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
     options = options or ReportOptions()
     path, data = area.root / REPORT, report_data(area)
     judged = judge(data)
-    html = render(data, judged, max_points=options.max_points, max_frames=options.max_frames)
+    html = render(
+        data,
+        judged,
+        pictures=pictures_of(area, data),
+        max_points=options.max_points,
+        max_frames=options.max_frames,
+    )
     write_atomically(path, html)
     return path, judged
 
@@ -111,8 +129,13 @@ class _FreshStages(Area):
         return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
 
 
-def _utc(iso: str) -> str:
-    return datetime.fromisoformat(iso).strftime("%Y-%m-%d %H:%M UTC")
+def _last_change(area: Area, stages: tuple[StageFacts, ...]) -> str:
+    """Return when a stage was finished last, or a file was written that the page shows too."""
+    times = [datetime.fromisoformat(stage.record.finished) for stage in stages]
+    for pattern in _CHANGED_LATER:
+        for path in area.root.glob(pattern):
+            times.append(datetime.fromtimestamp(path.stat().st_mtime, UTC))
+    return max(times).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def report_data(area: Area) -> ReportData:
@@ -146,7 +169,7 @@ def report_data(area: Area) -> ReportData:
         title=area.root.resolve().name,
         path=str(area.root.resolve()),
         # Not the time of writing, so that the page of an unchanged area does not change.
-        made=_utc(max(stage.record.finished for stage in stages)),
+        made=_last_change(area, stages),
         version=versions()["squeezeposenet-toolkit"],
         units="m" if geo is not None else "model",
         stages=stages,

@@ -6,8 +6,9 @@ import base64
 from collections.abc import Iterable
 from html import escape
 
-from spn_data.report.data import MethodErrors, NetworkFacts, ReportData, RunFacts
+from spn_data.report.data import ReportData
 from spn_data.report.fix_facts import FixFigures
+from spn_data.report.run_facts import MethodErrors, NetworkFacts, RunFacts
 from spn_data.report.run_verdict import SHORT_IMAGES
 
 _ROLES = {"test": "test frames", "validation": "validation frames", "train": "training images"}

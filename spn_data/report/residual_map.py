@@ -53,7 +53,8 @@ def residual_map(frames: FrameTable) -> str:
         e, n, u = arrows[k]
         up = f", {u:+.2f} m up" if math.isfinite(u) else ""
         parts.append(
-            f'<g class="{kind}"><title>{escape(str(frames.names[row]))}: '
+            f'<g class="{kind}" data-frame="{escape(str(frames.names[row]), quote=True)}">'
+            f"<title>{escape(str(frames.names[row]))}: "
             f"{e:+.2f} m east, {n:+.2f} m north{up}</title>"
             f'<path d="M{_xy(plan[k])}L{_xy(tips[k])}"/>'
             f'<circle cx="{tips[k, 0]:.1f}" cy="{tips[k, 1]:.1f}" r="2.5"/></g>'

@@ -6,9 +6,9 @@ import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from spn_data.report.data import MethodErrors, RunFacts
 from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.network_state import NetworkState
+from spn_data.report.run_facts import MethodErrors, RunFacts
 from spn_data.report.verdict import Level, VerdictReason, count_of
 
 # A training with fewer images is called short: two cores process several times as many in 30 minutes.

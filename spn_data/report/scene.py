@@ -10,6 +10,7 @@ import numpy as np
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import FrameTable, ReportData
 from spn_data.report.pack import pack, pack_texts
+from spn_data.report.pictures import Pictures, pack_pictures
 
 _STEPS = 32767  # of int16
 
@@ -116,7 +117,9 @@ def pack_frames(frames: FrameTable) -> dict[str, Any]:
     }
 
 
-def pack_scene(data: ReportData, frames: FrameTable, max_points: int) -> dict[str, Any]:
+def pack_scene(
+    data: ReportData, frames: FrameTable, pictures: Pictures, max_points: int
+) -> dict[str, Any]:
     """Pack everything that the page's script needs."""
     display = display_of(data.frames, data.points, has_up=data.units == "m")
     again = [p for facts in (data.coverage, data.plan) if facts for p in facts.fly_again]
@@ -129,6 +132,7 @@ def pack_scene(data: ReportData, frames: FrameTable, max_points: int) -> dict[st
         },
         "fov": {name: list(tangents) for name, tangents in data.fov_tan.items()},
         "frames": pack_frames(frames),
+        **pack_pictures(pictures, frames),
         "points": None if data.points is None else pack_points(data.points, display, max_points),
         "again": [[*place.east_north_up_m, place.heading_deg, place.pitch_deg] for place in again],
     }

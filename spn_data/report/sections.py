@@ -37,7 +37,7 @@ def heading(data: ReportData) -> str:
     unit = "" if data.units == "m" else ' <span class="unit">units: model</span>'
     return (
         f"<h1>{escape(data.title)}{unit}</h1>"
-        f'<p class="note">{escape(data.path)} &middot; as of {escape(data.made)}, by spn-data '
+        f'<p class="note">{escape(data.path)} &middot; last change {escape(data.made)}, by spn-data '
         f"{escape(data.version)}</p>"
     )
 
@@ -81,8 +81,8 @@ def _what_to_do(finding: VerdictReason, area: Path) -> str:
     return f"{escape(finding.do)}{': ' if finding.do and code else '.' if finding.do else ''}{code}"
 
 
-def view(data: ReportData, max_points: int) -> str:
-    """Return the container of the 3D view, which the script draws."""
+def view(data: ReportData, max_points: int, notes: str) -> str:
+    """Return the container of the 3D view, which the script draws, with notes (HTML) below it."""
     thinned = ""
     if data.points is not None and len(data.points) > max_points:
         thinned = f" {max_points:,} of {len(data.points):,} points are shown."
@@ -92,12 +92,12 @@ def view(data: ReportData, max_points: int) -> str:
         else "Grid in model units; up is estimated from the cameras, north is unknown."
     )
     return (
-        '<section><h2>Map</h2><div class="view"><canvas id="view" tabindex="0" '
+        '<section id="map"><h2>Map</h2><div class="view"><canvas id="view" tabindex="0" '
         'aria-label="3D view of the map"></canvas><div id="north" hidden>N</div>'
-        '<details id="legend"></details><div id="picked"></div></div>'
+        '<details id="legend"></details></div><p class="note" id="estimated"></p>'
         f'<p class="note">Drag to rotate, use the right button or two fingers to pan, the wheel (after a '
-        f"click) or pinch to zoom; click a camera for details. {frame}{thinned}"
-        '<span id="fallback"></span></p></section>'
+        f"click) or pinch to zoom; click a camera to see its image. {frame}{thinned}"
+        f'<span id="fallback"></span></p>{notes}</section>'
     )
 
 
@@ -116,7 +116,7 @@ def residuals(data: ReportData) -> str:
             f"{format_value(held_out.horizontal_rmse_m, '.2f')} m horizontal, "
             f"{format_value(held_out.vertical_rmse_m, '.2f')} m vertical (RMSE).</p>"
         )
-    return f"<section><h2>GNSS residuals in plan view</h2>{drawn}{extra}</section>"
+    return f'<section id="residuals"><h2>GNSS residuals in plan view</h2>{drawn}{extra}</section>'
 
 
 def control(data: ReportData) -> str:
@@ -134,7 +134,7 @@ def control(data: ReportData) -> str:
         rows.append((point.name, role, f"{point.marks}", *metres, pixels))
     header = ("point", "role", "marks", "east m", "north m", "up m", "px")
     return (
-        "<section><h2>Ground control</h2>"
+        '<section id="control"><h2>Ground control</h2>'
         f"{_table(header, rows, 'control')}"
         '<p class="note">Surveyed minus mapped, with the stated standard deviation in brackets. Check points '
         "are not fitted: their residuals are errors of the map.</p></section>"
@@ -160,7 +160,7 @@ def timeline(data: ReportData, left_out: dict[str, int]) -> str:
         else '<p class="note">All attempted frames have a pose.</p>'
     )
     return (
-        '<section><h2>Frames over time</h2><div id="timeline"></div>'
+        '<section id="time"><h2>Frames over time</h2><div id="timeline"></div>'
         f"{_left_out(left_out)}{failures}</section>"
     )
 
@@ -175,12 +175,15 @@ def _left_out(left_out: dict[str, int]) -> str:
 def coverage(data: ReportData) -> str:
     """Return strata as bars and the places to fly again, for evaluation sequences and planned waypoints."""
     parts = []
-    for title, facts in (("Coverage", data.coverage), ("Coverage of planned waypoints", data.plan)):
+    for anchor, title, facts in (
+        ("coverage", "Coverage", data.coverage),
+        ("planned", "Coverage of planned waypoints", data.plan),
+    ):
         if facts is None:
             continue
         bars = "".join(_strata_bar(name, counts) for name, counts in sorted(facts.strata.items()))
         parts.append(
-            f"<section><h2>{title}</h2>{bars}"
+            f'<section id="{anchor}"><h2>{title}</h2>{bars}'
             f'<p class="note">{escape(facts.limits)}</p>{_fly_again(facts.fly_again)}</section>'
         )
     return "".join(parts)
@@ -239,7 +242,7 @@ def split(data: ReportData) -> str:
     left_out = int((data.split.group == LEFT_OUT).sum())
     rows = [*data.split.counts().items(), *([("left out", left_out)] if left_out else [])]
     parts = [
-        "<section><h2>Split and audit</h2>",
+        '<section id="split"><h2>Split and audit</h2>',
         _table(("group", "frames"), [(group, f"{n:,}") for group, n in rows], "groups"),
     ]
     notes = (*data.split.notes, *limitations(data.split))
@@ -271,14 +274,14 @@ def table(frames: FrameTable) -> str:
     """Return the container of the table of all frames, which the script fills."""
     failed = int((frames.status == FAILED).sum())
     return (
-        f'<section><h2>All frames</h2><div id="table" data-frames="{len(frames)}" '
+        f'<section id="frames"><h2>All frames</h2><div id="table" data-frames="{len(frames)}" '
         f'data-failed="{failed}"></div></section>'
     )
 
 
 def stages(data: ReportData) -> str:
     """Return options, versions and inputs of each stage, collapsed."""
-    parts = ["<section><h2>How it was made</h2>"]
+    parts = ['<section id="stages"><h2>How it was made</h2>']
     for stage in data.stages:
         record = stage.record
         state = f'<span class="warn">stale: {escape(stage.stale)}</span>' if stage.stale else ""

@@ -18,11 +18,13 @@ from spn_model.evaluation.fixes import (
     FlightFixes,
     JudgedImage,
 )
+from spn_model.evaluation.tables import POSE_COLUMNS, pose_cells
 
 FIX_COLUMNS = (
     *("flight", "method", "name", "time_s", "usable", "state", "source", "reason"),
     *("error", "error_deg", "error_horizontal", "error_vertical"),
     *("protection_horizontal", "protection_vertical", "nees", "misleading"),
+    *POSE_COLUMNS,
 )
 
 
@@ -98,6 +100,7 @@ def _cells(one: FlightFixes, image: JudgedImage) -> tuple[str, ...]:
         *errors[:4],
         *(number_cell(level) for level in image.protection_m),
         *errors[4:],
+        *(pose_cells(image.pose)[0] if image.pose is not None else ("",) * len(POSE_COLUMNS)),
     )
 
 

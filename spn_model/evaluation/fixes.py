@@ -73,6 +73,8 @@ class JudgedImage:
         Protection levels, horizontal and vertical; NaN without a usable fix, and for coarse poses.
     error : FixError or None
         None without a usable fix, or without a label to compare it with.
+    pose : Poses or None
+        The usable fix, one pose; None without.
     """
 
     name: str
@@ -83,6 +85,7 @@ class JudgedImage:
     reason: str = ""
     protection_m: tuple[float, float] = (math.nan, math.nan)
     error: FixError | None = None
+    pose: Poses | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,9 +183,12 @@ class FlightFixes:
 
 def fix_error(fix: Fix, truth: Poses) -> FixError:
     """Return the error of a fix against one true pose."""
-    pose = Poses(fix.center[None], fix.quat_wxyz[None])
     levels = (fix.horizontal_protection_m, fix.vertical_protection_m)
-    return _error(pose, fix.covariance, levels, truth)
+    return _error(_pose(fix), fix.covariance, levels, truth)
+
+
+def _pose(fix: Fix) -> Poses:
+    return Poses(fix.center[None], fix.quat_wxyz[None])
 
 
 def largest_share(events: int, of: int, confidence: float = CONFIDENCE) -> float:
@@ -269,6 +275,7 @@ def coarse_each(
                 error=None
                 if found.reason
                 else _error(found.poses, found.covariance, (math.inf, math.inf), truth),
+                pose=None if found.reason else found.poses,
             )
         )
         done()
@@ -357,6 +364,7 @@ def _judged(item: Fix | NoFix, flight: EvaluationFlight, row: int) -> JudgedImag
         source=item.source.value,
         protection_m=(item.horizontal_protection_m, item.vertical_protection_m),
         error=fix_error(item, labels.poses[row : row + 1]) if labels.registered[row] else None,
+        pose=_pose(item),
     )
 
 

@@ -196,6 +196,8 @@ class Evaluation:
         Name of the method.
     frames : EvaluationFrames
         The evaluated frames.
+    poses : Poses
+        Their estimated poses; NaN where there is none.
     errors : FrameErrors
         Errors of each frame.
     summary : Summary
@@ -210,6 +212,7 @@ class Evaluation:
 
     method: str
     frames: EvaluationFrames
+    poses: Poses
     errors: FrameErrors
     summary: Summary
     strata: dict[str, Summary]
@@ -264,6 +267,7 @@ def evaluate(
     return Evaluation(
         method=estimates.method,
         frames=frames,
+        poses=estimates.poses,
         errors=errors,
         summary=_summary(errors, everything, frames.axes, options),
         strata={

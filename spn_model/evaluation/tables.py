@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from spn_data.geometry.pose import Poses
 from spn_data.storage.files import write_csv
 from spn_data.storage.json_files import finite, write_json
 from spn_model.evaluation.baselines import PAPER_SOURCE, PAPER_TABLE_1
 from spn_model.evaluation.metrics import Evaluation, Summary
 
 VERSION = 1
+POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")  # of the estimated pose, as in poses.csv
 HEADER = (
     *("method", "frames", "located", "position median", "mean", "p95"),
     *("rotation median", "mean", "p95"),
@@ -85,6 +87,7 @@ def write_errors(path: Path, evaluations: Sequence[Evaluation]) -> None:
             "sigma": _cells(errors.sigma_m, 4),
             "sigma_deg": _cells(errors.sigma_deg, 4),
             "distance_sq": _cells(errors.nees, 4),
+            **dict(zip(POSE_COLUMNS, zip(*pose_cells(one.poses), strict=True), strict=True)),
         }
         for name, cells in parts.items():
             columns.setdefault(name, []).extend(cells)
@@ -145,6 +148,14 @@ def _text(value: float, digits: int, sign: str = "") -> str:
     if math.isnan(value):
         return ""
     return "none" if math.isinf(value) else f"{value:{sign}.{digits}f}"
+
+
+def pose_cells(poses: Poses) -> list[tuple[str, ...]]:
+    """Return the cells of `POSE_COLUMNS` for each pose; empty where it is unknown."""
+    digits = (4, 4, 4, 6, 6, 6, 6)
+    values = np.hstack([poses.centers, poses.quats_wxyz])
+    columns = [_cells(values[:, k], digit) for k, digit in enumerate(digits)]
+    return list(zip(*columns, strict=True))
 
 
 def _cells(values: np.ndarray, digits: int) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -61,6 +62,38 @@ def test_the_page_holds_what_the_area_holds(area):
     np.testing.assert_allclose(
         [residuals[name] for name in geo["frames"]], geo["residuals_m"], atol=1e-5
     )
+
+
+def test_the_page_holds_the_stored_images(finished_area, tmp_path):
+    """Each frame that was tried has an image in the page, and a link to the full one."""
+    area = tmp_path / "area"
+    shutil.copytree(finished_area, area, ignore=shutil.ignore_patterns("*.db"))
+    ran = run(area)
+    assert ran.exit_code == 0, ran.output
+    data = given(area / "report.html")
+    rows = sorted(map(int, data["images"]))
+    names = [data["frames"]["name"][row] for row in rows]
+    stored = {
+        path.relative_to(area / "1-frames").as_posix() for path in area.glob("1-frames/*/*.jpg")
+    }
+    assert set(names) == stored
+    assert all((area / data["files"][str(row)]).is_file() for row in rows)
+    assert (area / ".thumbnails.json").is_file()
+
+
+def test_the_head_has_the_time_of_the_last_change(area):
+    """An evaluation after the last stage counts; writing the page again does not."""
+    run(area)
+    told = re.compile(r"last change ([-:\d ]+) UTC")
+    (before,) = told.findall((area / "report.html").read_text("ascii"))
+    finished = [json.loads(path.read_text())["finished"] for path in area.glob("*/stage.json")]
+    assert before == max(finished)[:16].replace("T", " ")
+    metrics = area / "runs" / "first" / "metrics.json"
+    metrics.parent.mkdir(parents=True)
+    metrics.write_text("{}")
+    os.utime(metrics, (1_900_000_000, 1_900_000_000))
+    run(area)
+    assert told.findall((area / "report.html").read_text("ascii")) == ["2030-03-17 17:46"]
 
 
 def test_the_command_tells_the_verdict(area):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 
+import cv2
 import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
@@ -14,6 +15,7 @@ from spn_data.georegistration.result import FitSummary, GeoFit
 from spn_data.georegistration.uncertainty import Uncertainty
 from spn_data.labels.map_points import MapPoints
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
+from spn_data.report.pictures import COARSE, Pictures, RunEstimates, worst_frames
 from spn_data.split import audit
 from spn_data.split.groups import Split, SplitOptions
 from spn_data.storage.stage_record import StageRecord
@@ -112,6 +114,7 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
     mapping = flight("flight1", cameras, radius_m=30, height_m=10)
     test = flight("medium", 40, radius_m=25, height_m=14, failed=2)
     frames = FrameTable.concatenate([mapping, test])
+    frames.group[5:12] = "validation"
     stages = (
         record("1-frames", candidates=cameras, chosen=cameras, sequences=1),
         record("2-model", frames=cameras, registered=cameras, points=map_points, mean_error_px=0.4),
@@ -120,8 +123,6 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
         record("5-split"),
     )
     commands = ("reconstruct VIDEO", "reconstruct VIDEO", "georegister", "register VIDEO", "split")
-    group = frames.group.copy()
-    group[5:12] = "validation"
     return ReportData(
         title="north",
         path="/data/north",
@@ -141,13 +142,58 @@ def area(cameras: int = 150, map_points: int = 3000) -> ReportData:
             (PlaceToFly((1.0, 2.0, 14.0), (49.000018, 8.4000137), 90.0, -30.0, 4),),
             "high: near; medium: less near; low: farther.",
         ),
-        split=Split(frames.names, group, frames.reason, SplitOptions()),
+        split=Split(frames.names, frames.group, frames.reason, SplitOptions()),
         audit=(
             audit.AuditFinding(
                 "no evaluation frame in the map", audit.AuditVerdict.PASS, "none is"
             ),
             audit.AuditFinding("guard gap", audit.AuditVerdict.PASS, "kept"),
         ),
+    )
+
+
+def pictures(data: ReportData, off_m: float = 5.0) -> Pictures:
+    """Return images of all frames but three, poses of a network that are off upwards, and fixes.
+
+    The first fix is missing; the network's worst frame is the fifth of the flight, twice as far off.
+    """
+    frames = data.frames
+    test = frames.select(frames.evaluation & frames.registered)
+    n = len(test)
+    off = np.full(n, off_m)
+    off[4] *= 2
+    up = np.array([0.0, 0.0, 1.0])
+    missing = np.arange(n) == 0
+    fixes = Poses(
+        np.where(missing[:, None], np.nan, test.poses.centers),
+        np.where(missing[:, None], np.nan, test.poses.quats_wxyz),
+    )
+    estimates = (
+        RunEstimates(
+            run="first",
+            method=COARSE,
+            names=test.names,
+            poses=Poses(test.poses.centers + off[:, None] * up, test.poses.quats_wxyz),
+            error=off,
+            error_deg=np.zeros(n),
+            reasons=np.full(n, ""),
+        ),
+        RunEstimates(
+            run="first",
+            method="search",
+            names=test.names,
+            poses=fixes,
+            error=np.where(missing, np.nan, 0.0),
+            error_deg=np.where(missing, np.nan, 0.0),
+            reasons=np.where(missing, "too few landmarks agree", ""),
+        ),
+    )
+    _, jpeg = cv2.imencode(".jpg", np.full((90, 160, 3), 128, np.uint8))
+    return Pictures(
+        estimates=estimates,
+        worst=worst_frames(frames, estimates),
+        thumbnails={name: jpeg.tobytes() for name in frames.names[3:].tolist()},
+        files={name: f"1-frames/{name}" for name in frames.names.tolist()},
     )
 
 

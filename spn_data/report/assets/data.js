@@ -28,16 +28,18 @@ function rotated(x, y, z) {
 function shown(x, y, z) { return rotated(x - middle[0], y - middle[1], z - middle[2]); }
 
 const hasPose = i => frames.status(i) === "registered";
-const centerOf = i => shown(frames.center[3 * i], frames.center[3 * i + 1], frames.center[3 * i + 2]);
+const centerIn = (centers, k) => shown(centers[3 * k], centers[3 * k + 1], centers[3 * k + 2]);
+const centerOf = i => centerIn(frames.center, i);
 
 // Rotation from camera axes (x right, y down, z forward) to the shown world, from a quaternion w, x, y, z.
-function axesOf(i) {
-  const [w, x, y, z] = frames.quat.subarray(4 * i, 4 * i + 4);
+function axesIn(quats, k) {
+  const [w, x, y, z] = quats.subarray(4 * k, 4 * k + 4);
   const rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                 [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                 [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]];
   return rows.map(row => rotated(...row));
 }
+const axesOf = i => axesIn(frames.quat, i);
 
 // The same for a camera with a heading and pitch in degrees, in an East-North-Up world.
 function axesOfAngles(heading, pitch) {

@@ -42,6 +42,7 @@ function glDrawing(canvas) {
       gl.clearColor(back[0] / 255, back[1] / 255, back[2] / 255, 1);
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       gl.enable(gl.DEPTH_TEST);
+      gl.depthFunc(gl.LEQUAL);  // a later layer is seen where it coincides: exact estimates on the truth
       gl.useProgram(program);
       gl.uniformMatrix4fv(uniforms.matrix, false, matrix);
       for (const layer of layers) {

@@ -21,6 +21,8 @@ function makeTable(onPick) {
     number("error, px", "RMS reprojection error", 100, i => frames.error_px[i], 2),
     number("GNSS h, m", "horizontal distance between GNSS fix and pose", 110, horizontal, 2),
     number("GNSS v, m", "height of the GNSS fix above the pose", 110, i => frames.gnss_m[3 * i + 2], 2),
+    ...(estimates.length ? [number(`estimate off, ${unit}`, "position error of the estimates chosen in the map", 120, i => estimateError("error", i), 2),
+      number("estimate off, deg", "rotation error of the estimates chosen in the map", 130, i => estimateError("error_deg", i), 2)] : []),
     text("coverage", "coverage stratum", 85, frames.stratum),
     text("split", "group of the split", 100, frames.group),
     text("reason", "why the frame has no pose or was not chosen", 260, frames.reason),
@@ -111,6 +113,7 @@ function makeTable(onPick) {
   for (const part of [search, bySequence, byStatus, byKind]) part.addEventListener("input", update);
   update();
   return {
+    update,
     pick(i, scroll) {
       marked = i;
       const at = listed.indexOf(i);

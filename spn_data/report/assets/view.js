@@ -1,129 +1,5 @@
 // The 3D view: layers of the map, and a camera that orbits a target.
 
-// Lines of one camera: its pyramid, with a small mark at the upper edge of the image.
-function frustum(out, center, axes, tangents, size) {
-  const at = (x, y, z) => [0, 1, 2].map(k => center[k] + size * (axes[0][k] * x + axes[1][k] * y + axes[2][k] * z));
-  const [tx, ty] = tangents;
-  const corners = [at(-tx, -ty, 1), at(tx, -ty, 1), at(tx, ty, 1), at(-tx, ty, 1)];
-  for (let k = 0; k < 4; k++) out.push(...center, ...corners[k], ...corners[k], ...corners[(k + 1) % 4]);
-  const top = at(0, -1.5 * ty, 1);
-  out.push(...corners[0], ...top, ...top, ...corners[1]);
-}
-
-// Thin lines through the frames of each sequence, interrupted at frames without a pose.
-function path(out, wanted) {
-  let before = -1;
-  for (let i = 0; i < frames.count; i++) {
-    if (!wanted(i)) continue;
-    if (before >= 0 && frames.sequence(before) === frames.sequence(i) && hasPose(before) && hasPose(i))
-      out.push(...centerOf(before), ...centerOf(i));
-    before = i;
-  }
-}
-
-const rows = Array.from({length: frames.count}, (_, i) => i);
-const posed = rows.filter(hasPose);
-const stills = posed.filter(i => !frames.tracked[i]);
-
-// Size of a camera's pyramid: slightly less than the typical distance between neighbours.
-function usualSize() {
-  const steps = [];
-  for (let k = 1; k < stills.length; k++) {
-    const a = centerOf(stills[k - 1]), b = centerOf(stills[k]);
-    steps.push(Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]));
-  }
-  steps.sort((a, b) => a - b);
-  const step = steps.length ? steps[steps.length >> 1] : 0;
-  return Math.min(Math.max(0.8 * step, 0.008 * radius), 0.04 * radius);
-}
-
-const EVALUATION_COLORS = ["--evaluation", "--evaluation2", "--evaluation3"];
-
-function makeLayers(size) {
-  const made = [];
-  const add = (label, color, layer) => {
-    if (layer.xyz.length) made.push({label, color, on: true, ...layer});
-  };
-  const tangents = i => report.fov[frames.camera(i)] || [0.6, 0.4];
-  const cameras = (label, color, wanted) => {
-    const xyz = [];
-    for (const i of stills) if (wanted(i)) frustum(xyz, centerOf(i), axesOf(i), tangents(i), size);
-    add(label, color, {lines: true, xyz: new Float32Array(xyz), rgb: color});
-  };
-  if (report.points) {
-    const points = report.points;
-    add("points", null, {xyz: unpack(points.xyz), step: points.step, rgb: unpack(points.rgb), size: innerWidth < 600 ? 1.4 : 2});
-  }
-  cameras("mapping cameras", "--mapping", i => !frames.evaluation[i]);
-  const sequences = [...new Set(rows.filter(i => frames.evaluation[i]).map(i => frames.sequence(i)))];
-  sequences.forEach((name, k) => cameras(`evaluation: ${name}`, EVALUATION_COLORS[k % EVALUATION_COLORS.length],
-    i => frames.evaluation[i] && frames.sequence(i) === name));
-  const track = (label, color, evaluation) => {
-    const xyz = [];
-    path(xyz, i => (frames.tracked[i] || hasPose(i)) && !!frames.evaluation[i] === evaluation && tried(i));
-    if (rows.some(i => frames.tracked[i] && hasPose(i) && !!frames.evaluation[i] === evaluation))
-      add(label, color, {lines: true, xyz: new Float32Array(xyz), rgb: color});
-  };
-  track("tracked, mapping", "--tracked", false);
-  track("tracked, evaluation", "--evaluation", true);
-  const fixes = [], arm = 0.25 * size;
-  for (const i of posed) {
-    const g = frames.gnss_m.subarray(3 * i, 3 * i + 3);
-    if (!Number.isFinite(g[0])) continue;
-    const c = centerOf(i), d = rotated(g[0], g[1], Number.isFinite(g[2]) ? g[2] : 0);
-    const f = [c[0] + d[0], c[1] + d[1], c[2] + d[2]];
-    fixes.push(...c, ...f);
-    for (let k = 0; k < 3; k++) {
-      const e = [0, 0, 0];
-      e[k] = arm;
-      fixes.push(f[0] - e[0], f[1] - e[1], f[2] - e[2], f[0] + e[0], f[1] + e[1], f[2] + e[2]);
-    }
-  }
-  add("GNSS fixes", "--gnss", {lines: true, xyz: new Float32Array(fixes), rgb: "--gnss"});
-  const again = [];
-  for (const [e, n, u, heading, pitch] of report.again) {
-    const c = shown(e, n, u);
-    frustum(again, c, axesOfAngles(heading, pitch), [0.6, 0.4], 1.6 * size);
-    again.push(...c, c[0], c[1], floor);
-  }
-  add("fly again", "--again", {lines: true, xyz: new Float32Array(again), rgb: "--again"});
-  const grid = gridLines();
-  add(`grid, ${grid.spacing} ${unit}`, "--skipped", {lines: true, xyz: grid.xyz, rgb: "--line"});
-  if (report.units === "m") add("north", "--text", {lines: true, xyz: northLines(), rgb: "--text", });
-  return made;
-}
-
-const tried = i => hasPose(i) || frames.status(i) === "failed";
-
-// Height of the ground: a low percentile of the points.
-const floor = (() => {
-  if (!report.points || !report.points.shown) return posed.length ? Math.min(...stills.map(i => centerOf(i)[2])) : 0;
-  const xyz = unpack(report.points.xyz), z = [];
-  const every = 3 * Math.max(1, Math.floor(xyz.length / 3 / 5000));
-  for (let k = 2; k < xyz.length; k += every) z.push(xyz[k] * report.points.step);
-  z.sort((a, b) => a - b);
-  return z[Math.floor(0.03 * z.length)];
-})();
-
-const half = radius / 1.5;  // half extent of the bulk of the map
-
-function gridLines() {
-  const spacing = roundDown(half / 4), n = Math.ceil(half / spacing), out = [];
-  for (let k = -n; k <= n; k++) {
-    const a = k * spacing, b = n * spacing;
-    out.push(a, -b, floor, a, b, floor, -b, a, floor, b, a, floor);
-  }
-  return {spacing: Number(spacing.toPrecision(3)), xyz: new Float32Array(out)};
-}
-
-// An arrow beyond the northern edge of the grid; the letter N is a label at its tip.
-const northTip = [0, half * 1.4, floor];
-
-function northLines() {
-  const s = half * 0.05, [x, y, z] = northTip;
-  return new Float32Array([x, half * 1.1, z, ...northTip, ...northTip, x - s, y - 2 * s, z, ...northTip, x + s, y - 2 * s, z]);
-}
-
 function multiply(a, b) {
   const out = new Float32Array(16);
   for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++)
@@ -131,7 +7,7 @@ function multiply(a, b) {
   return out;
 }
 
-function makeView(onPick) {
+function makeView(onPick, onEstimates) {
   const canvas = document.getElementById("view");
   const drawing = glDrawing(canvas) || flatDrawing(canvas);
   if (drawing.kind === "2d")
@@ -139,7 +15,9 @@ function makeView(onPick) {
   const FOV = 45 * Math.PI / 180;
   const home = () => ({yaw: 0.45, pitch: 0.6, target: [0, 0, floor / 2], distance: fit()});
   const eye = {};
-  let size = usualSize(), layers = makeLayers(size), marked = -1, mark = null, waiting = false;
+  let size = usualSize(), layers = makeLayers(size), guessed = estimateLayers(chosenEstimates, size);
+  let marked = -1, mark = null, waiting = false;
+  const all = () => [...layers, ...guessed.layers];
 
   function fit() {
     const aspect = canvas.clientWidth / canvas.clientHeight;
@@ -171,7 +49,7 @@ function makeView(onPick) {
     const w = Math.max(1, Math.round(canvas.clientWidth * scale)), h = Math.max(1, Math.round(canvas.clientHeight * scale));
     if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
     const m = matrix();
-    drawing.draw(m, [...layers.filter(l => l.on), ...(mark ? [mark] : [])], scale);
+    drawing.draw(m, [...all().filter(l => l.on), ...(mark ? [mark] : [])], scale);
     const [x, y, depth] = onScreen(m, ...northTip), label = document.getElementById("north");
     label.hidden = depth <= 0 || x < 0 || y < 0 || x > canvas.clientWidth || y > canvas.clientHeight
       || !layers.some(l => l.label === "north" && l.on);
@@ -182,12 +60,14 @@ function makeView(onPick) {
   function legend() {
     const box = document.getElementById("legend");
     box.replaceChildren(element("summary", {}, "Layers"));
-    for (const layer of layers) {
+    if (estimates.length) box.append(choice());
+    for (const layer of all()) {
       const tick = element("input", {type: "checkbox"});
       tick.checked = layer.on;
       tick.onchange = () => { layer.on = tick.checked; redraw(); };
       const swatch = layer.color ? [element("i", {style: `background:var(${layer.color})`})] : [];
-      box.append(element("label", {}, tick, ...swatch, layer.label));
+      const count = layer.count === undefined ? [] : [element("small", {}, ` (${layer.count.toLocaleString("en")})`)];
+      box.append(element("label", {}, tick, ...swatch, element("span", {}, layer.label, ...count)));
     }
     const button = (text, title, act) => {
       const made = element("button", {type: "button", title}, text);
@@ -199,21 +79,55 @@ function makeView(onPick) {
       button("\u2212", "Smaller cameras", () => resize(0.7)), " ", button("+", "Larger cameras", () => resize(1.4))));
   }
 
+  // The choice of a run and of the network alone or fixes.
+  function choice() {
+    const select = element("select", {id: "estimates", "aria-label": "Estimates"});
+    estimates.forEach((one, k) => select.append(element("option", {value: k}, one.label)));
+    select.append(element("option", {value: -1}, "no estimates"));
+    select.value = estimates.indexOf(chosenEstimates);
+    select.onchange = () => {
+      chosenEstimates = estimates[select.value] || null;
+      build();
+      onEstimates();
+    };
+    return select;
+  }
+
   function resize(factor) {
-    const on = new Map(layers.map(l => [l.label, l.on]));
     size *= factor;
+    build();
+  }
+
+  function build() {
+    const on = new Map(all().map(l => [l.label, l.on]));
     layers = makeLayers(size);
-    for (const layer of layers) layer.on = on.get(layer.label);
+    guessed = estimateLayers(chosenEstimates, size);
+    for (const layer of all()) if (on.has(layer.label)) layer.on = on.get(layer.label);
     pick(marked, false);
     legend();
+    told();
+  }
+
+  function told() {
+    if (!chosenEstimates) { document.getElementById("estimated").textContent = ""; return; }
+    const n = chosenEstimates.row.length, none = n - guessed.shown - guessed.far;
+    document.getElementById("estimated").textContent = `${chosenEstimates.label}: ${guessed.shown} estimates of ${n} frames are drawn`
+      + (none ? `; frames without an estimate: ${none}` : "")
+      + (guessed.far ? `; farther out than the view: ${guessed.far}` : "")
+      + ". Estimates are red, and joined to where the frame was. Those of training images are left out.";
   }
 
   function pick(i, center) {
     marked = i;
     mark = null;
     if (i >= 0 && hasPose(i)) {
-      const xyz = [];
-      frustum(xyz, centerOf(i), axesOf(i), report.fov[frames.camera(i)] || [0.6, 0.4], 2 * size);
+      const xyz = [], k = chosenEstimates ? chosenEstimates.of.get(i) : undefined;
+      frustum(xyz, centerOf(i), axesOf(i), tangentsOf(i), 2 * size);
+      if (k !== undefined && chosenEstimates.located(k)) {
+        const center = centerIn(chosenEstimates.center, k);
+        frustum(xyz, center, axesIn(chosenEstimates.quat, k), tangentsOf(i), 2 * size);
+        xyz.push(...center, ...centerOf(i));
+      }
       mark = {lines: true, xyz: new Float32Array(xyz), rgb: "--picked"};
       if (center) eye.target = centerOf(i);
     }
@@ -229,12 +143,13 @@ function makeView(onPick) {
   function nearest(x, y) {
     const m = matrix();
     let best = -1, least = 16;
-    for (const i of posed) {
-      const [px, py, w] = onScreen(m, ...centerOf(i));
-      if (w <= 0) continue;
-      const far = Math.hypot(px - x, py - y) + (frames.tracked[i] ? 4 : 0);
-      if (far < least) { least = far; best = i; }
-    }
+    const ask = (i, center, more) => {
+      const [px, py, w] = onScreen(m, ...center), far = Math.hypot(px - x, py - y) + more;
+      if (w > 0 && far < least) { least = far; best = i; }
+    };
+    for (const i of posed) ask(i, centerOf(i), frames.tracked[i] ? 4 : 0);
+    if (chosenEstimates)
+      chosenEstimates.row.forEach((i, k) => { if (chosenEstimates.located(k)) ask(i, centerIn(chosenEstimates.center, k), 2); });
     return best;
   }
 
@@ -291,6 +206,12 @@ function makeView(onPick) {
   reset();
   document.getElementById("legend").open = canvas.clientWidth > 500;  // it would hide the map on a phone
   legend();
+  told();
   draw();
-  return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas};
+  // Where a frame and its estimate are on the canvas, for tests.
+  function placeOf(name) {
+    const i = rows.find(k => frames.name(k) === name), m = matrix(), k = chosenEstimates && chosenEstimates.of.get(i);
+    return {truth: onScreen(m, ...centerOf(i)), estimate: chosenEstimates && onScreen(m, ...centerIn(chosenEstimates.center, k))};
+  }
+  return {draw, redraw, pick, kind: drawing.kind, turnBy, canvas, placeOf};
 }

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spn_data.inputs.thumbnails import MAX_BYTES
 from spn_data.report.html import render
-from tests.worlds.report_data import area
+from tests.worlds.report_data import area, pictures
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -143,10 +144,11 @@ def test_the_page_draws_and_says_nothing(tmp_path):
     assert seen.found["turned"]
     assert seen.found["layers"] == [
         "points",
-        "mapping cameras",
-        "evaluation: medium",
+        "training (143)",
+        "validation (7)",
+        "truth: medium (38)",
         "GNSS fixes",
-        "fly again",
+        "fly again (1)",
         "grid, 10 m",
         "north",
     ]
@@ -265,8 +267,12 @@ def test_without_webgl_a_plain_canvas_draws(tmp_path):
 
 
 def test_a_large_area_loads_in_three_seconds(tmp_path):
-    """1,000 cameras and 100,000 points appear within 3 s of opening the file, in the better of two visits."""
-    page = render(area(cameras=1000, map_points=100_000))
+    """1,000 cameras with images and 100,000 points are below 8 MB, and appear within 3 s (best of two)."""
+    data = area(cameras=1000, map_points=100_000)
+    shown = pictures(data)
+    most = MAX_BYTES // len(shown.thumbnails)  # a JPEG file may be longer than its content
+    full = {name: image.ljust(most, b"\0") for name, image in shown.thumbnails.items()}
+    page = render(data, pictures=replace(shown, thumbnails=full))
     visits = [
         visit(
             tmp_path,
@@ -280,15 +286,19 @@ def test_a_large_area_loads_in_three_seconds(tmp_path):
     ]
     assert all(seen.console == [] and seen.found["view"]["drawn"] > 0.02 for seen in visits)
     assert min(seen.found["milliseconds"] for seen in visits) < 3000
-    assert len(page) < 4_000_000
+    assert len(page) < 7_000_000  # 1 MB more for the figures of a run
 
 
 def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
     """At a width of 390 pixels, only tables in their own frames are wider than the screen."""
+    data = area()
     seen = visit(
         tmp_path,
-        render(area()),
+        render(data, pictures=pictures(data)),
         """
+        document.querySelector("#worst figure").click();
+        const panel = document.getElementById("picked").getBoundingClientRect();
+        found.panel = [panel.left, panel.right];
         found.window = window.innerWidth;
         found.wide = document.documentElement.scrollWidth;
         found.view = pixels(document.getElementById("view"));
@@ -298,4 +308,125 @@ def test_a_phone_shows_it_without_scrolling_sideways(tmp_path):
     assert seen.console == []
     assert seen.found["window"] == 390
     assert seen.found["wide"] <= 390
+    assert 0 <= seen.found["panel"][0] < seen.found["panel"][1] <= 390
     assert seen.found["view"]["drawn"] > 0.02
+
+
+def test_estimates_are_drawn_joined_to_the_truth(tmp_path):
+    """Estimates of the chosen run are red pyramids and lines; none are left with "no estimates"."""
+    data = area()
+    seen = visit(
+        tmp_path,
+        render(data, pictures=pictures(data)),
+        """
+        const select = document.getElementById("estimates");
+        found.choices = [...select.options].map(option => option.textContent);
+        found.layers = [...document.querySelectorAll("#legend label")]
+          .filter(l => l.querySelector("input").checked).map(l => l.textContent);
+        const red = () => {
+          window.spnReport.view.draw();
+          const view = document.getElementById("view"), flat = document.createElement("canvas");
+          flat.width = view.width; flat.height = view.height;
+          flat.getContext("2d").drawImage(view, 0, 0);
+          const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+          let n = 0;
+          for (let k = 0; k < data.length; k += 4) n += data[k] === 0xd1 && data[k + 1] === 0x22;
+          return n;
+        };
+        const choose = value => { select.value = value; select.dispatchEvent(new Event("change")); };
+        const off = () => column(heads().findIndex(h => h.textContent.startsWith("estimate off, m")));
+        const search = document.querySelector("#table input");
+        search.value = "medium/00000";
+        search.dispatchEvent(new Event("input"));
+        found.coarse = [red(), document.getElementById("estimated").textContent, off()];
+        choose("1");
+        found.fixes = [red(), document.getElementById("estimated").textContent, off()];
+        document.querySelector("#estimates").value = "-1";
+        document.querySelector("#estimates").dispatchEvent(new Event("change"));
+        found.none = [red(), document.getElementById("estimated").textContent];
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["choices"] == [
+        "first: network alone",
+        "first: fixes, each image alone",
+        "no estimates",
+    ]
+    assert "estimates (38)" in seen.found["layers"]
+    assert not {"GNSS fixes", "fly again (1)"} & set(seen.found["layers"])
+    assert seen.found["coarse"][0] > 300
+    assert seen.found["coarse"][1].startswith(
+        "first: network alone: 38 estimates of 38 frames are drawn."
+    )
+    assert seen.found["coarse"][2][:5] == ["5.00"] * 4 + ["10.00"]
+    assert seen.found["fixes"][0] > 300
+    assert (
+        "37 estimates of 38 frames are drawn; frames without an estimate: 1."
+        in seen.found["fixes"][1]
+    )
+    assert seen.found["fixes"][2][:2] == ["\N{EN DASH}", "0.00"]
+    assert seen.found["none"] == [0, ""]
+
+
+def test_a_click_anywhere_shows_the_image(tmp_path):
+    """A camera, an estimate, a residual, a row and a picture show the frame; nothing is fetched for it."""
+    data = area()
+    seen = visit(
+        tmp_path,
+        render(data, pictures=pictures(data)),
+        """
+        const box = document.getElementById("picked"), one = query => document.querySelector(query);
+        const told = () => ({hidden: box.hidden, text: box.textContent,
+          image: box.querySelector("img") && box.querySelector("img").src.slice(0, 26),
+          link: box.querySelector("a") && box.querySelector("a").getAttribute("href")});
+        found.before = told();
+        const view = document.getElementById("view"), corner = view.getBoundingClientRect();
+        view.setPointerCapture = () => {};
+        const press = ([x, y]) => { for (const type of ["pointerdown", "pointerup"]) view.dispatchEvent(
+          new PointerEvent(type, {pointerId: 1, clientX: corner.left + x, clientY: corner.top + y})); };
+        press(window.spnReport.view.placeOf("medium/000010.jpg").truth);
+        found.camera = told();
+        press(window.spnReport.view.placeOf("medium/000020.jpg").estimate);
+        found.estimate = told();
+        one('svg [data-frame="flight1/000050.jpg"]').dispatchEvent(new MouseEvent("click", {bubbles: true}));
+        found.residual = told();
+        one("#worst figure").click();
+        found.worst = told();
+        one('[title="Next frame"]').click();
+        found.next = told();
+        one("#table input").value = "flight1/000000";
+        one("#table input").dispatchEvent(new Event("input"));
+        one("#table tbody tr[data-row]").click();
+        found.row = told();
+        document.dispatchEvent(new KeyboardEvent("keydown", {key: "Escape", bubbles: true}));
+        found.after = told();
+        found.pictures = [...document.querySelectorAll("#worst img, #failed img")]
+          .map(i => i.src.slice(0, 15));
+        const fetched = performance.getEntriesByType("resource").map(entry => entry.name);
+        found.fetched = fetched.filter(name => !name.startsWith("data:"));
+        """,
+        when_loaded=True,
+    )
+    assert seen.console == []
+    assert seen.found["fetched"] == []
+    assert seen.found["before"]["hidden"]
+    shown = {"hidden": False, "image": "data:image/jpeg;base64,/9j"}
+    for name, frame in (
+        ("camera", "medium/000010.jpg"),
+        ("estimate", "medium/000020.jpg"),
+        ("residual", "flight1/000050.jpg"),
+        ("worst", "medium/000004.jpg"),
+        ("next", "medium/000005.jpg"),
+    ):
+        told = seen.found[name]
+        assert told["text"].startswith(frame)
+        assert {key: told[key] for key in shown} == shown
+        assert told["link"] == f"./1-frames/{frame}"
+    assert (
+        "first: network alone: off by 10.00 m, 0.00\N{DEGREE SIGN}" in seen.found["worst"]["text"]
+    )
+    # The first frames have no image: the nearest one of the flight is shown under its own name.
+    words = "No image of this frame is on this page: flight1/000003.jpg, 1.50 s later."
+    assert words in seen.found["row"]["text"]
+    assert seen.found["after"]["hidden"]
+    assert set(seen.found["pictures"]) == {"data:image/jpeg"}

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from spn_data.report.area_verdict import judge
-from spn_data.report.data import MethodErrors, NetworkFacts, RunFacts
 from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.html import render
 from spn_data.report.network_state import NetworkState
+from spn_data.report.run_facts import MethodErrors, NetworkFacts, RunFacts
 from spn_data.report.run_verdict import RunVerdict, judge_run
 from spn_data.report.verdict import Level
 from tests.worlds.report_data import area
