@@ -16,7 +16,7 @@ from spn_data.geometry.rotations import rotation_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
 from spn_model.evaluation.flight_attitude import FlightAttitude, attitude_of_flight
 from spn_model.integrity.fix import Fix, FixSource, NoFix
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.onboard.flight_report import longest_outage
 from spn_model.onboard.localizer import Localizer
 from spn_model.onboard.pilot import Pilot, PilotOptions

@@ -9,7 +9,7 @@ import numpy as np
 from spn_data.errors import InputError
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_data.inputs.evaluation_flights import EvaluationFlight
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.onboard.attitude import GIMBAL, GimbalMounting, read_attitude
 
 SIMULATED_DEG = 1.0  # standard deviation of a simulated attitude along each of two axes

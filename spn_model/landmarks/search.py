@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from spn_model.integrity.judgement import Witness
+from spn_model.landmarks.aids import KnownHeight, KnownVertical, height_sigmas, tilt_sigmas
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import (
     STRONGEST,
@@ -20,17 +21,7 @@ from spn_model.landmarks.matching import (
     match_near,
     projected,
 )
-from spn_model.landmarks.solver import (
-    KnownHeight,
-    KnownVertical,
-    Sightings,
-    SolvedPose,
-    first_pose,
-    fit_focal_length,
-    height_sigmas,
-    solve,
-    tilt_sigmas,
-)
+from spn_model.landmarks.solver import Sightings, SolvedPose, first_pose, fit_focal_length, solve
 
 FIRST_PX = 4.0  # of RANSAC
 SEARCH_PX = 12.0  # around a projection, once there is a pose

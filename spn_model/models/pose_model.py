@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from spn_data.geometry.pose import Poses
 from spn_model.examples.held_out_views import HeldOutViews
 from spn_model.examples.training_set import TrainingSet
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 
 Batch = dict[str, Tensor]
 UNKNOWN_COUNT = 10**12  # number of images of a stage, if not known in advance

@@ -13,7 +13,7 @@ from torch import Tensor
 from spn_data.errors import GeometryError, InputError
 from spn_data.geometry.pose import Poses
 from spn_model.examples.training_set import TrainingSet
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, PoseModel
 from spn_model.models.regression_examples import (
     FeatureCache,

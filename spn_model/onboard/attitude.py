@@ -16,7 +16,7 @@ from spn_data.geometry.json_values import bounded, numbers
 from spn_data.geometry.rotations import rotations_from_angles, rotations_from_vectors
 from spn_model.autopilot.frames import Mounting
 from spn_model.autopilot.received_attitude import ReceivedAttitude
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.onboard.telemetry_file import MAX_TIME_S, between, read_columns
 from spn_model.onboard.view import View
 

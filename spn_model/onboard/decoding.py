@@ -10,14 +10,14 @@ from spn_data.errors import GeometryError
 from spn_data.geometry.pinhole import residuals_and_jacobian
 from spn_data.geometry.pose import Poses, to_camera
 from spn_data.geometry.rotations import rotations_from_vectors
-from spn_model.landmarks.solver import (
+from spn_model.landmarks.aids import (
     KnownHeight,
     KnownVertical,
     aid_terms,
     height_sigmas,
-    pose_by_ransac,
     tilt_sigmas,
 )
+from spn_model.landmarks.solver import pose_by_ransac
 
 # Width of the robust weight in each iteration, relative to the final one: an initial pose that is off by a
 # few pixels still converges.

@@ -17,7 +17,7 @@ from spn_data.geometry.image_texture import missing_texture
 from spn_data.geometry.pose import Poses
 from spn_data.geometry.rendering import PinholeRenderer
 from spn_data.geometry.rotations import canonical_quats
-from spn_model.landmarks.solver import KnownHeight, KnownVertical
+from spn_model.landmarks.aids import KnownHeight, KnownVertical
 from spn_model.onboard.bundle import (
     FLOAT32,
     INPUT,

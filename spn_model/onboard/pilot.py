@@ -20,6 +20,7 @@ from spn_model.integrity.agreement import Agreement, MotionLimits
 from spn_model.integrity.fix import Fix, FixSource, FixState, NoFix
 from spn_model.integrity.height import HeightErrors, HeightZero
 from spn_model.integrity.judgement import IntegrityLimits, Judgement, Witness, judge
+from spn_model.landmarks.aids import KnownHeight, KnownVertical
 from spn_model.landmarks.anchor import LandmarkAnchor
 from spn_model.landmarks.landmark_map import LandmarkMap
 from spn_model.landmarks.matching import ImageFeatures
@@ -33,7 +34,6 @@ from spn_model.landmarks.search import (
     witness_of,
 )
 from spn_model.landmarks.sift import Sift
-from spn_model.landmarks.solver import KnownHeight, KnownVertical
 from spn_model.onboard.bundle import verified_landmarks
 from spn_model.onboard.localizer import Localizer
 

@@ -13,7 +13,7 @@ from spn_data.geometry.geodesy import GeoOrigin
 from spn_data.geometry.rotations import rotations_from_quats
 from spn_model.integrity.fix import Fix
 from spn_model.integrity.height import HeightZero
-from spn_model.landmarks.solver import KnownVertical, tilt_sigmas
+from spn_model.landmarks.aids import KnownVertical, tilt_sigmas
 from spn_model.onboard.flight_report import kind_of_reason
 from spn_model.onboard.pilot import Pilot
 from spn_model.onboard.replay import FlownImage

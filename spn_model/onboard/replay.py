@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from spn_model.autopilot.link import unix_us
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 
 _LATE_US = 100_000  # after which an image is left out, as by a camera whose images are not fetched
 

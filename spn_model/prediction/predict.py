@@ -17,7 +17,7 @@ from spn_data.geometry.pose import position_text
 from spn_data.storage.files import replace_folder, write_atomically
 from spn_data.storage.json_files import write_json
 from spn_data.work.timing import Progress
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.models.checkpoint import Checkpoint
 from spn_model.onboard.attitude import Attitude
 from spn_model.prediction.flights import Flight, FlightFrame, FrameFilter, ViewRenderers, frames

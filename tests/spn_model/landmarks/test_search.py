@@ -9,9 +9,10 @@ import pytest
 
 from spn_data.geometry.rotations import rotation_vectors
 from spn_model.integrity.judgement import IntegrityLimits, judge
+from spn_model.landmarks.aids import KnownHeight, KnownVertical
 from spn_model.landmarks.matching import ImageFeatures
 from spn_model.landmarks.search import Hypothesis, follow, search, witness_of
-from spn_model.landmarks.solver import KnownHeight, KnownVertical, fit_focal_length
+from spn_model.landmarks.solver import fit_focal_length
 from tests.worlds.landmark_world import CAMERA, OPTIONS, pose, room, seen_from
 
 ROOM = room()

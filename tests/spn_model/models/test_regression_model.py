@@ -17,7 +17,7 @@ from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.evaluation.calibration import calibrate
 from spn_model.evaluation.dropout import dropout_estimates
 from spn_model.examples.training_set import TrainingSet
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.models.registry import make
 from spn_model.models.regression import RegressionModel
 from spn_model.models.regression_examples import augmented_example

@@ -16,7 +16,7 @@ from spn_data.geometry.camera import Camera
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotations_from_vectors
 from spn_model.examples.training_set import TrainingSet
-from spn_model.landmarks.solver import KnownVertical
+from spn_model.landmarks.aids import KnownVertical
 from spn_model.models.pose_model import PoseEstimates
 from spn_model.models.scene_coordinates import SceneCoordinatesModel
 from spn_model.models.scene_examples import SceneStageOptions

@@ -13,7 +13,7 @@ import pytest
 from spn_data.errors import GeometryError
 from spn_data.geometry.pose import Poses, pose_errors
 from spn_data.geometry.rotations import rotation_vectors, rotations_from_vectors
-from spn_model.landmarks.solver import KnownHeight, KnownVertical
+from spn_model.landmarks.aids import KnownHeight, KnownVertical
 from spn_model.onboard.decoding import DecodingOptions, decode, with_aids
 
 MATRIX = np.array([[328.0, 0, 240.0], [0, 328.0, 135.0], [0, 0, 1.0]])
