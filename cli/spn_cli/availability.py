@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 
 if TYPE_CHECKING:
     from spn_model.evaluation.availability import ExpectedFix
@@ -21,7 +21,13 @@ _UNKNOWN = (
 
 @click.command()
 @options.area
-@click.option("--run", "name", required=True, help="Run whose bundle will fly.")
+@click.option(
+    "--run",
+    "name",
+    required=True,
+    shell_complete=completion.runs,
+    help="Run whose bundle will fly.",
+)
 @click.option(
     "--waypoints",
     type=click.Path(path_type=Path),
@@ -99,16 +105,17 @@ def availability(
         hashed = map_hash(map_folder(area))
         parts = expect_fixes(run, dataset, hashed, list(queries.values()), progress)
     found = dict(zip(queries, parts, strict=True))
+    told.figures(expected=found)
     if waypoints is not None:
         _show_plan(found)
     else:
         _show_comparison(found, measured)
-    console.note(_UNKNOWN)
     if waypoints is not None:
         keep_plan(run, waypoints.name, parts[0])
     if target is not None:
         write_expected(target, [one for part in parts for one in part])
-        console.out.print(f"{target}: {sum(map(len, parts))} rows.")
+        console.say(f"{target}: {sum(map(len, parts))} rows.")
+    console.note(_UNKNOWN)
     if waypoints is not None:
         page.refresh_if_free(area)
 
@@ -117,7 +124,7 @@ def _show_plan(found: dict[str, list[ExpectedFix]]) -> None:
     """Print how many waypoints have a fix to be expected, and those that have none."""
     for name, part in found.items():
         lacking = [one for one in part if one.reason]
-        console.out.print(
+        console.say(
             f"{name}: a fix is to be expected at {len(part) - len(lacking)} of {len(part)} waypoints."
         )
         if not lacking:
@@ -136,7 +143,7 @@ def _show_plan(found: dict[str, list[ExpectedFix]]) -> None:
         header = ("waypoint", "fix", "landmarks", "spread", "shown", "reason")
         console.table(f"{name}: waypoints without a fix in the rendered view", rows, header)
         if len(lacking) > _SHOWN:
-            console.out.print(f"... and {len(lacking) - _SHOWN} more; --to writes all.\n")
+            console.say(f"... and {len(lacking) - _SHOWN} more; --to writes all.\n")
 
 
 def _show_comparison(found: dict[str, list[ExpectedFix]], measured: dict[str, bool]) -> None:
@@ -149,6 +156,8 @@ def _show_comparison(found: dict[str, list[ExpectedFix]], measured: dict[str, bo
             for said in ("yes", "perhaps", "no")
         ]
         rows.append((name, *counts))
+        pairs = {one.name: measured[one.name] for one in part if one.name in measured}
+        told.current().figures.setdefault("measured_usable", {})[name] = pairs
     console.table(
         "Frames that had a fix, by what was expected of the rendered view",
         rows,

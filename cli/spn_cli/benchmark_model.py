@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 from spn_data.area.names import DATASET, SPLIT
 
 if TYPE_CHECKING:
@@ -20,7 +19,12 @@ _STEPS = ("preprocessing", "graph", "decoding", "total")
 @click.command()
 @click.argument("bundle", required=False, type=click.Path(path_type=Path))
 @options.area
-@click.option("--run", "name", help="Run whose bundle is benchmarked, instead of BUNDLE.")
+@click.option(
+    "--run",
+    "name",
+    shell_complete=completion.runs,
+    help="Run whose bundle is benchmarked, instead of BUNDLE.",
+)
 @click.option(
     "--frame",
     "frames",
@@ -48,7 +52,6 @@ _STEPS = ("preprocessing", "graph", "decoding", "total")
     show_default=True,
     help="Number of threads of the network.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def benchmark(
     bundle: Path | None,
     area_folder: Path,
@@ -58,7 +61,6 @@ def benchmark(
     camera_file: Path | None,
     poses: int,
     threads: int,
-    as_json: bool,
 ) -> None:
     """Measure latency of each step, file size and memory of the onboard program on this machine.
 
@@ -84,14 +86,13 @@ def benchmark(
     folder = bundle if name is None else RunFiles(area.run_folder(name)).bundle
     assert folder is not None
     wanted = BenchmarkOptions(poses=poses, threads=threads)
-    if camera_file is None:
-        costs = benchmark_on_dataset(folder, area.folder(SPLIT) / DATASET, wanted)
-    else:
-        costs = benchmark_on_frames(folder, frames, camera_file, wanted)
-    if as_json:
-        plain = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in costs}
-        click.echo(json.dumps(plain, indent=1, sort_keys=True))
-        return
+    with console.working(f"Timing {poses} poses with each graph"):
+        if camera_file is None:
+            costs = benchmark_on_dataset(folder, area.folder(SPLIT) / DATASET, wanted)
+        else:
+            costs = benchmark_on_frames(folder, frames, camera_file, wanted)
+    graphs = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in costs}
+    told.figures(graphs=graphs)
     _show(costs)
 
 
@@ -117,7 +118,7 @@ def _show(costs: tuple[BundleCost, ...]) -> None:
         rows,
         ("graph", *_STEPS, "of bare", "file", "memory", "with a pose"),
     )
-    console.out.print(
+    console.say(
         "of bare: CPU time of our onnxruntime call relative to a bare call on the same tensor. "
         "memory: peak of the onboard process."
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spn_cli import console, options, page
+from spn_cli import console, options, page, told
 
 if TYPE_CHECKING:
     from spn_data.coverage.sequence_table import Coverage
@@ -85,7 +85,12 @@ def coverage(
     from spn_data.coverage.nearest_frame import Stratum
     from spn_data.coverage.refly import ReflyOptions
     from spn_data.geometry.camera_file import read_camera
-    from spn_data.pipeline.area_coverage import CoverageStageOptions, check_output_file, cover_area
+    from spn_data.pipeline.area_coverage import (
+        CoverageStageOptions,
+        check_output_file,
+        cover_area,
+        read_coverage,
+    )
     from spn_data.storage.files import write_csv
 
     if waypoints is None and (camera_file is not None or fov_deg is not None):
@@ -106,20 +111,22 @@ def coverage(
     with area.locked():
         with console.progress() as progress:
             found = cover_area(area, wanted, progress, waypoints=waypoints)
+        for name, each in found.by_name.items():
+            _show(name, each, found)
+        _show_stops(found, chosen["wanted"])
+        told.figures(coverage=read_coverage(area, found.folder.name))
+        console.say(f"Results of each frame: {found.folder}.")
+        if fly_again is not None and found.fly_again is not None:
+            write_csv(fly_again, found.stops)
+            console.say(
+                f"{fly_again}: fly these, then spn-data reconstruct VIDEO --add --area {area_folder}",
+                wrap=False,
+            )
+        for note in found.notes:
+            console.note(note)
+        if fly_again is not None and found.fly_again is None:
+            console.note(f"{fly_again} is not written: waypoints need a georegistered map.")
         page.refresh(area)
-    for name, each in found.by_name.items():
-        _show(name, each, found)
-    for note in found.notes:
-        console.note(note)
-    _show_stops(found, chosen["wanted"])
-    console.out.print(f"Results of each frame: {found.folder}.")
-    if fly_again is not None and found.fly_again is None:
-        console.note(f"{fly_again} is not written: waypoints need a georegistered map.")
-    elif fly_again is not None:
-        write_csv(fly_again, found.stops)
-        console.out.print(
-            f"{fly_again}: fly these, then spn-data reconstruct VIDEO --add --area {area_folder}"
-        )
 
 
 def _strata(high: tuple[float, float] | None, medium: tuple[float, float] | None) -> Any:
@@ -185,7 +192,7 @@ def _show_stops(found: AreaCoverage, wanted: str) -> None:
         return
     count = len(found.fly_again)
     if count == 0:
-        console.out.print(f"Every frame with a pose has {wanted} coverage.\n")
+        console.say(f"Every frame with a pose has {wanted} coverage.\n")
         return
     columns = found.stops
     height = "height_takeoff_m" if "height_takeoff_m" in columns else "z_m"
@@ -198,4 +205,4 @@ def _show_stops(found: AreaCoverage, wanted: str) -> None:
         tuple(name.replace("_deg", "").replace("_m", " m").replace("_", " ") for name in shown),
     )
     if count > _SHOWN_STOPS:
-        console.out.print(f"... and {count - _SHOWN_STOPS} more; --fly-again writes all.\n")
+        console.say(f"... and {count - _SHOWN_STOPS} more; --fly-again writes all.\n")

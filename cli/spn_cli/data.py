@@ -10,9 +10,9 @@ import click
 from spn_cli import options
 from spn_cli.audit import audit
 from spn_cli.check_points import check_points
-from spn_cli.console import Group
 from spn_cli.coverage import coverage
 from spn_cli.export import export
+from spn_cli.group import Group
 from spn_cli.import_ import import_
 from spn_cli.register import register
 from spn_cli.report import report
@@ -22,8 +22,7 @@ from spn_cli.telemetry import telemetry
 
 @click.group(cls=Group)
 @click.version_option(package_name="squeezeposenet-toolkit")
-@click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
-def main(verbose: bool) -> None:
+def main() -> None:
     """Prepare an area for image-based localization of UAVs."""
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
 
 
@@ -17,6 +17,7 @@ from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
     "--run",
     "names",
     multiple=True,
+    shell_complete=completion.runs,
     required=True,
     help="Run whose network is evaluated; may be repeated to compare several.",
 )
@@ -112,6 +113,7 @@ def evaluate(
     from spn_cli import page, show_networks
     from spn_data.charts.convert import convert_figures, require_matplotlib
     from spn_data.inputs.evaluation_flights import read_evaluation_flights
+    from spn_data.storage.json_files import load_json
     from spn_model.evaluation.evaluate import EvaluateOptions
     from spn_model.evaluation.fix_files import RunFixes
     from spn_model.runs.run_evaluation import evaluate_runs, write_evaluation
@@ -150,13 +152,15 @@ def evaluate(
     show_networks.comparison(evaluated.comparison)
     show_networks.fixes(evaluated)
     written = write_evaluation(evaluated, error_limits)
-    for note in written.notes:
-        console.note(note)
+    told.figures(runs={folder.name: load_json(folder / METRICS) for folder in written.folders})
     for folder in written.folders:
         if formats:
             convert_figures(folder / FIGURES, dict.fromkeys(formats))
         has_fixes = (folder / FIXES).is_file()
-        console.out.print(
+        console.say(
             f"{folder}: {METRICS}, {ERRORS}, {f'{FIXES}, ' if has_fixes else ''}{FIGURES}/."
         )
+    show_networks.notes(evaluated)
+    for note in written.notes:
+        console.note(note)
     page.complete_cards(page.refresh_if_free(area), {run.name: run.bundle for run in runs})

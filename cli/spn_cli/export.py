@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 
 FORMATS = (
     "tum",
@@ -36,6 +36,7 @@ FORMATS = (
     "--sequence",
     "sequences",
     multiple=True,
+    shell_complete=completion.sequences,
     help="Sequence to export; may be repeated.  [default: all]",
 )
 @click.option(
@@ -62,20 +63,23 @@ def export(
     Example:
         spn-data export nerfstudio --to north-nerf --area fields/north
     """
+    from dataclasses import asdict
+
     from spn_data.pipeline import area_export as stage
 
     area = options.open_area(area_folder)
     chosen = stage.LabelExportOptions(
         sequences=sequences, all_frames=all_frames, images=not no_images
     )
-    with area.locked():
+    with area.locked(), console.working(f"Writing {target}"):
         done = stage.export(area, stage.Format(format_name), target, chosen, overwrite=overwrite)
+    told.figures(written=target, **asdict(done))
     rows = [(name, str(count)) for name, count in done.frames.items()]
     console.table("Poses", rows, ("sequence", "frames"))
-    console.out.print(f"Written to {target}: {', '.join(done.formats)}.")
+    console.say(f"Written to {target}: {', '.join(done.formats)}.")
     if done.units != "m":
-        console.out.print("The map is not georegistered: lengths are in model units, not metres.")
+        console.note("the map is not georegistered: lengths are in model units, not metres.")
     for note in done.notes:
-        console.out.print(note)
+        console.note(note)
     for name, reason in done.left_out.items():
-        console.out.print(f"{name} is left out: {reason}.")
+        console.note(f"{name} is left out: {reason}.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 from spn_data.area.names import DATASET, GEO, SPLIT
 
 _DEFAULT_MB = 10.0  # of landmarks
@@ -20,7 +20,13 @@ if TYPE_CHECKING:
 @click.command("export")
 @click.argument("dataset", required=False, type=click.Path(path_type=Path))
 @options.area
-@click.option("--run", "name", required=True, help="Run whose network is exported.")
+@click.option(
+    "--run",
+    "name",
+    required=True,
+    shell_complete=completion.runs,
+    help="Run whose network is exported.",
+)
 @click.option(
     "--to",
     "target",
@@ -89,10 +95,9 @@ def export(
             target=target,
             overwrite=overwrite,
         )
-    for note in exported.notes:
-        console.note(note)
+    told.figures(folder=exported.folder, bundle=exported.bundle)
     if exported.bundle is None:
-        console.out.print(f"{exported.folder}: unchanged, made from the same network and options.")
+        console.say(f"{exported.folder}: unchanged, made from the same network and options.")
     else:
         _show(exported.bundle)
         if not exported.is_evaluated:
@@ -100,20 +105,22 @@ def export(
                 f"the run was not evaluated, so its model card contains neither errors nor fixes: run "
                 f"spn-model evaluate --run {name}, which completes it."
             )
+    for note in exported.notes:
+        console.note(note)
     verdict = page.refresh_if_free(area)
     if target is None:
         page.complete_cards(verdict, {name: run.bundle})
 
 
 def _show(made: ExportedBundle) -> None:
-    from spn_model.export.model_card import int8_error_increase
+    from spn_model.export.model_card import int8_error_increase, percent_text
     from spn_model.onboard.bundle import CARD, DOCUMENT
 
     unit = "m" if made.units == "m" else "units"
     rows = []
     for one in made.errors:
         percent = int8_error_increase(made.errors, one.group) if one.precision == "int8" else None
-        change = ("", "") if percent is None else (_percent(percent[0]), _percent(percent[1]))
+        change = ("", "") if percent is None else tuple(map(percent_text, percent))
         rows.append(
             (
                 one.group,
@@ -130,22 +137,18 @@ def _show(made: ExportedBundle) -> None:
     console.table("Errors of the exported graphs", rows, header)
     if made.landmarks is not None:
         found = made.landmarks
-        console.out.print(
+        console.say(
             f"Landmarks: {found.landmarks} with {found.descriptors} descriptors, from "
             f"{found.training_frames} training frames."
         )
-        console.out.print(f"Attitude: {made.gimbal}.")
+        console.say(f"Attitude: {made.gimbal}.")
     parity = made.parity
-    console.out.print(
+    console.say(
         f"Difference from PyTorch on {parity.images} images: outputs {parity.output:.1e} of their largest "
         f"value, poses {parity.position:.1e} {unit} and {parity.rotation_deg:.1e} deg (median)."
     )
-    console.out.print(f"{made.folder}: {DOCUMENT}, graphs, {CARD}.")
+    console.say(f"{made.folder}: {DOCUMENT}, graphs, {CARD}.")
 
 
 def _figure(value: float, unit: str) -> str:
     return f"{value:.3f} {unit}" if math.isfinite(value) else "none"
-
-
-def _percent(value: float) -> str:
-    return f"{value:+.1f} %" if math.isfinite(value) else ""

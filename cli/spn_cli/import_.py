@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console, options
+from spn_cli import console, options, told
 
 
 @click.command(name="import")
@@ -72,8 +72,9 @@ def import_(
     )
     with console.progress() as progress:
         done = import_cambridge(folder, target, wanted, progress, overwrite=overwrite)
-    for note in done.notes:
-        console.note(note)
+    told.figures(written=target, frames=done.counts, with_focal=done.with_focal)
     frames = ", ".join(f"{name} {count}" for name, count in done.counts.items())
     what = "images" if done.has_images else "poses without images"
-    console.out.print(f"{target}: {what}: {frames}; {done.with_focal} with a known focal length.")
+    console.say(f"{target}: {what}: {frames}; {done.with_focal} with a known focal length.")
+    for note in done.notes:
+        console.note(note)

@@ -6,9 +6,9 @@ import click
 
 from spn_cli.availability import availability
 from spn_cli.benchmark_model import benchmark
-from spn_cli.console import Group
 from spn_cli.evaluate import evaluate
 from spn_cli.export_model import export
+from spn_cli.group import Group
 from spn_cli.predict import predict
 from spn_cli.train import train
 from spn_cli.weights import weights
@@ -16,8 +16,7 @@ from spn_cli.weights import weights
 
 @click.group(cls=Group)
 @click.version_option(package_name="squeezeposenet-toolkit")
-@click.option("-v", "--verbose", is_flag=True, help="Show log messages and tracebacks.")
-def main(verbose: bool) -> None:
+def main() -> None:
     """Train and use networks that estimate camera poses in an area prepared by `spn-data`."""
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from spn_cli import completion
 from spn_data.area.area import Area
 from spn_data.area.names import DATASET, SPLIT
 
@@ -19,6 +20,7 @@ area = click.option(
     "area_folder",
     type=click.Path(path_type=Path),
     default=Path(),
+    shell_complete=completion.areas,
     help="Folder of the area.  [default: the current folder]",
 )
 overwrite = click.option(

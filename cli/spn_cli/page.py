@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spn_cli import console
+from spn_cli import console, told
 from spn_data.area.area import Area
 from spn_data.area.names import FRAMES, REPORT
 from spn_data.errors import InUseError, SpnError
@@ -21,7 +21,8 @@ def refresh(area: Area) -> AreaVerdict | None:
     from spn_data.pipeline.area_report import write_report
 
     try:
-        path, verdict = write_report(area)
+        with console.working(f"Writing {REPORT}"):
+            path, verdict = write_report(area)
     except SpnError as error:
         console.note(f"{REPORT} could not be written: {error}")
         return None
@@ -75,7 +76,8 @@ def show_judgement(area: Area) -> None:
     if not area.has(FRAMES):
         return
     try:
-        verdict = judge_area(area)
+        with console.working("Judging the area"):
+            verdict = judge_area(area)
     except SpnError as error:
         console.note(f"there is no verdict: {error}")
         return
@@ -86,11 +88,14 @@ def show_verdict(verdict: AreaVerdict, area: Area, path: Path | None = None) -> 
     """Print the verdict, the page with its reasons if it was written, and the next step."""
     from spn_data.report.area_verdict import DATA
 
+    told.figures(verdict={name: _sentence(said, area) for name, said in verdict.parts()})
+    if path is not None:
+        told.figures(report=path)
     for name, said in verdict.parts():
         text = _sentence(said, area)
         if path is not None and name == DATA:
             text = f"{text.removesuffix('.')}: see {path}."
-        console.out.print(f"{name}: {text}", soft_wrap=True)
+        console.say(f"{name}: {text}", wrap=False)
     show_next(verdict.next, area)
 
 
@@ -105,7 +110,8 @@ def show_next(step: VerdictReason, area: Area) -> None:
     """Print the next step: one line that can be typed in the current folder."""
     command = _command(step.command, area)
     words = f"Next: {step.do}{': ' if step.do and command else ''}{command}"
-    console.out.print(words, soft_wrap=True)
+    told.figures(next={"do": step.do, "command": command})
+    console.say(words, wrap=False)
 
 
 def _command(command: str, area: Area) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options, told
 
 if TYPE_CHECKING:
     from spn_model.prediction.predict import Predicted
@@ -21,7 +21,13 @@ _VIEW_SEEN = 0.98  # share of the network's view below which a note is shown
     "inputs", metavar="SOURCES...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
 @options.area
-@click.option("--run", "name", required=True, help="Run whose network estimates the poses.")
+@click.option(
+    "--run",
+    "name",
+    required=True,
+    shell_complete=completion.runs,
+    help="Run whose network estimates the poses.",
+)
 @click.option(
     "--camera",
     "camera_file",
@@ -159,12 +165,10 @@ def predict(
         context.exit(130)
     _show(found)
     if prediction.attitude is not None:
-        console.out.print(
-            prediction.attitude.coverage(found.with_attitude, sum(found.counts.values()))
-        )
+        console.say(prediction.attitude.coverage(found.with_attitude, sum(found.counts.values())))
     view = prediction.network.view
     if "wgs84" in formats and view.origin is not None:
-        console.out.print(f"Heights in {WGS84} are above: {view.origin.height_reference.value}.")
+        console.say(f"Heights in {WGS84} are above: {view.origin.height_reference.value}.")
     if view.units != "m":
         console.note("lengths are in model units, not metres.")
 
@@ -172,7 +176,15 @@ def predict(
 def _show(found: Predicted) -> None:
     counts = found.counts
     total = sum(counts.values())
-    console.out.print(
+    told.figures(
+        written=found.folder,
+        frames=counts,
+        without_pose=dict(found.reasons),
+        network_seconds=found.seconds,
+        view_seen=found.seen,
+        is_complete=found.complete,
+    )
+    console.say(
         f"{found.folder}: {counts['estimated']} of {total} frames have a pose; the network took "
         f"{1000 * found.seconds / max(1, total - counts['unreadable']):.0f} ms per image."
     )

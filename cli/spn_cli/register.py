@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spn_cli import options
+from spn_cli import completion, options
 
 if TYPE_CHECKING:
     from spn_cli.show import Live
@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("video", required=False, type=click.Path(path_type=Path))
 @options.area
-@click.option("--name", help="Name of the sequence.  [default: that of the video]")
+@click.option(
+    "--name",
+    shell_complete=completion.sequences,
+    help="Name of the sequence.  [default: that of the video]",
+)
 @click.option(
     "--all-frames",
     is_flag=True,

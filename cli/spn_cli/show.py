@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-from spn_cli import console, show_labels
+from spn_cli import console, show_labels, told
 from spn_data.area.area import Area
 from spn_data.area.names import (
     CHECKPOINT,
@@ -75,7 +75,7 @@ class Live:
         cost = found.cost
         seconds, disk_bytes = model_cost
         choosing, mapping = console.duration(cost.seconds), console.duration(seconds)
-        console.out.print(
+        console.say(
             f"Expected: about {cost.chosen} frames of {cost.candidates} images; {choosing} for "
             f"frame selection and {mapping} for the model; "
             f"{(cost.disk_bytes + disk_bytes) / 1e6:.0f} MB on disk.\n"
@@ -93,7 +93,7 @@ class Live:
         ]
         rate = f"{summary.rate_hz:.3g} fixes/s" if math.isfinite(summary.rate_hz) else "no rate"
         gaps = f"{len(summary.gaps)} gaps" if summary.gaps else "no gaps"
-        console.out.print(
+        console.say(
             f"{sequence}: {summary.kind}, {summary.with_fix} of {summary.records} records with a fix, "
             f"{rate}, {gaps}; heights {' and '.join(heights) or 'unknown'}; "
             f"gimbal {'known' if summary.has_gimbal else 'unknown'}."
@@ -104,6 +104,7 @@ class Live:
     def stage(self, record: StageRecord) -> None:
         """Show the table of a finished stage."""
         self._close()
+        show_labels.add_stage(record)
         group = record.stage.partition("/")[0]
         if group == EVALUATION:
             show_labels.evaluation(record, self.unit)
@@ -123,9 +124,8 @@ class Live:
     def unchanged(self, record: StageRecord) -> None:
         """Show that a stage was up to date."""
         self._close()
-        console.out.print(
-            f"{record.stage}: unchanged since {record.finished} ({_summary(record)})."
-        )
+        show_labels.add_stage(record)
+        console.say(f"{record.stage}: unchanged since {record.finished} ({_summary(record)}).")
 
 
 def frames(record: StageRecord) -> None:
@@ -201,6 +201,7 @@ def georegistration(record: StageRecord) -> None:
 
 def surveyed(points: Sequence[Mapping[str, Any]]) -> None:
     """Print the residuals of surveyed points, and their RMSE beside what is stated."""
+    told.figures(points=points)
     rows = []
     for point in points:
         role = f"{point['role']} (left out)" if point["is_outlier"] else point["role"]
@@ -213,7 +214,7 @@ def surveyed(points: Sequence[Mapping[str, Any]]) -> None:
     for role in ("control", "check"):
         mine = [p for p in points if p["role"] == role and not p["is_outlier"]]
         if mine:
-            console.out.print(f"{len(mine)} {role} points: {', '.join(_rmse(mine))}.")
+            console.say(f"{len(mine)} {role} points: {', '.join(_rmse(mine))}.")
 
 
 def _rmse(points: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -259,10 +260,12 @@ def status(area: Area) -> None:
             f"{area.root.resolve()} is not an area; create one with spn-data reconstruct VIDEO --area AREA"
         )
     rows = []
+    stages = told.current().figures.setdefault("stages", {})
     for stage in (*STAGES, *(s for s in area.stages() if s not in STAGES)):
         if not area.has(stage):
             state = _UNFINISHED if area.partial(stage).exists() else "missing"
             rows.append((stage, state, "", ""))
+            stages[stage] = {"state": state}
             continue
         record = area.record(stage)
         with reporting_damage(area.folder(stage)):
@@ -272,7 +275,10 @@ def status(area: Area) -> None:
         if area.partial(stage).exists():
             state += "; redoing it is unfinished"
         rows.append((stage, state, holds, record.finished))
-    rows += [_run(area, name) for name in area.sequences(RUNS)]
+        show_labels.add_stage(record, state=state)
+    runs = [_run(area, name) for name in area.sequences(RUNS)]
+    told.figures(area=area.root.resolve(), runs={name: state for name, state, _, _ in runs})
+    rows += runs
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
     if area.has_unfinished_addition():
         console.note("an addition is unfinished; the same command with --add resumes it.")
@@ -282,7 +288,7 @@ def status(area: Area) -> None:
 def verdict(area: Area) -> None:
     """Print how many frames have a pose, and the uncertainty of the georegistration."""
     if not area.has(MODEL):
-        console.out.print("There is no model yet; run spn-data reconstruct.")
+        console.say("There is no model yet; run spn-data reconstruct.")
         return
     counts = area.record(MODEL).counts
     with reporting_damage(area.folder(MODEL)):
@@ -301,7 +307,7 @@ def verdict(area: Area) -> None:
             sentence += f", vertical {vertical}."
     else:
         sentence += f" in {area.folder(MODEL)}, in model units, not metres."
-    console.out.print(sentence)
+    console.say(sentence)
 
 
 def _summary(record: StageRecord) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from spn_cli import console
+from spn_cli import console, told
 from spn_data.area.names import EVALUATION, SPLIT, TRACKED
 from spn_data.storage.stage_record import StageRecord
 
@@ -59,6 +59,18 @@ def summary(record: StageRecord) -> str:
         return f"{_share(c['registered'], c['frames'])} frames"
     assert group == SPLIT, group
     return ", ".join(f"{name} {n}" for name, n in c["groups"].items())
+
+
+def add_stage(record: StageRecord, **more: Any) -> None:
+    """Add a stage to the object of `--json`."""
+    known = told.current().figures.setdefault("stages", {})
+    known[record.stage] = {
+        **more,
+        "counts": record.counts,
+        "seconds": record.seconds,
+        "cpu_seconds": record.cpu_seconds,
+        "finished": record.finished,
+    }
 
 
 def notes(record: StageRecord) -> None:

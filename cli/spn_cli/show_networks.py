@@ -22,7 +22,7 @@ _WHAT = {
 
 
 def comparison(found: NetworkComparison) -> None:
-    """Print the tables of each group, the cost of the networks, and notes."""
+    """Print the tables of each group and the cost of the networks."""
     unit = "m" if found.units == "m" else "units"
     for group in found.groups:
         _errors(group, unit)
@@ -44,10 +44,6 @@ def comparison(found: NetworkComparison) -> None:
         rows,
         ("network", "wall", "CPU", "device", "measured on"),
     )
-    if found.units != "m":
-        console.note("lengths are in model units, not metres.")
-    for note in found.notes:
-        console.note(note)
 
 
 def fixes(evaluated: EvaluatedRuns) -> None:
@@ -57,7 +53,14 @@ def fixes(evaluated: EvaluatedRuns) -> None:
         if rows:
             console.table(f"{name}: fixes of its bundle on evaluation flights", rows, FIX_HEADER)
         for text in found.attitudes:
-            console.out.print(text)
+            console.say(text)
+
+
+def notes(evaluated: EvaluatedRuns) -> None:
+    """Print the notes on an evaluation."""
+    if evaluated.comparison.units != "m":
+        console.note("lengths are in model units, not metres.")
+    for found in (evaluated.comparison, *evaluated.fixes.values()):
         for note in found.notes:
             console.note(note)
 
@@ -91,7 +94,7 @@ def _errors(group: EvaluatedGroup, unit: str) -> None:
         ("method", "poses", "median", "mean", "p95"),
     )
     if published:
-        console.out.print(
+        console.say(
             "* on another courtyard, with other cameras; the paper does not state whether these are means or "
             "medians.\n"
         )

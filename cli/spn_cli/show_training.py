@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from spn_cli import console
+from spn_cli import console, told
 
 if TYPE_CHECKING:
     from spn_model.training.recipe import Recipe
@@ -44,14 +44,16 @@ class TrainingDisplay:
         self._validated: list[tuple[str, ...]] = []
         self._status = "Preparing the training images."
         self._printed = -_PLAIN_EVERY_S
-        live = self._shows and console.out.is_terminal
-        self._live = Live(console=console.out, refresh_per_second=4) if live else None
+        live = self._shows and console.err.is_terminal and not told.current().quiet
+        self._live = Live(console=console.err, refresh_per_second=4) if live else None
 
     @contextmanager
     def training(self, unit: str, *, resumes: bool) -> Iterator[None]:
         """Show the training within the block, and let Ctrl-C request a stop."""
         self._unit = unit
         with _stop_signals(self.stop), self._live_table():
+            if self._live is None:
+                self.say(self._status)
             if resumes:
                 self.say("Resuming the interrupted training.")
             yield
@@ -61,6 +63,7 @@ class TrainingDisplay:
         if self._live is None:
             yield
             return
+        told.current().has_shown = True
         self._live.start()
         self._live.update(self._table())
         try:
@@ -89,7 +92,7 @@ class TrainingDisplay:
     def say(self, text: str) -> None:
         """Print a line."""
         if self._shows:
-            console.out.print(Text(text), soft_wrap=True)
+            console.tell(text)
 
     def row(self, values: Mapping[str, Any]) -> None:
         """Show a row of the log, see `spn_model.training.training_record.Watch`."""
@@ -140,6 +143,7 @@ class TrainingDisplay:
 
 def errors_table(facts: Mapping[str, Any], unit: str) -> None:
     """Print errors of the kept checkpoint and of the last network, and the time of the training."""
+    told.figures(units=unit, training=facts)
     rows = []
     for title, found in (("kept", facts["kept"]), ("at the end", facts["latest"])):
         for event, name in _NAMES.items():
@@ -147,7 +151,7 @@ def errors_table(facts: Mapping[str, Any], unit: str) -> None:
                 rows.append((f"{name}, {title}", *_errors(found[event])))
     header = ("", f"median {unit}", "°", f"95 % {unit}", "°", "poses")
     console.table("Errors", rows, header)
-    console.out.print(
+    console.say(
         f"Trained for {console.duration(facts['train_s'])} "
         f"({facts['images_shown']:,} images, {facts['precision']}, {facts['threads']} threads, "
         f"{facts['device']}), plus {console.duration(facts['validate_s'])} of validation."
@@ -156,7 +160,7 @@ def errors_table(facts: Mapping[str, Any], unit: str) -> None:
 
 def _errors(values: Mapping[str, Any]) -> tuple[str, ...]:
     figures = [
-        "inf" if values[name] is None else f"{values[name]:.{digits}f}"
+        "none" if values[name] is None else f"{values[name]:.{digits}f}"
         for name, digits in (("median_m", 2), ("median_deg", 1), ("p95_m", 2), ("p95_deg", 1))
     ]
     return (*figures, f"{values['located']} of {values['frames']}")

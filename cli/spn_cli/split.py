@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spn_cli import console, options, page
-from spn_cli.audit import show_findings
+from spn_cli.audit import fail_if_failed, show_findings
 
 if TYPE_CHECKING:
     from spn_data.pipeline.split_stage import SplitStageOptions
@@ -142,10 +142,15 @@ def split(area_folder: Path, overwrite: bool, video_folder: Path | None, **chose
                 overwrite=overwrite,
             )
         if record == before:
-            console.out.print(f"{SPLIT}: unchanged since {record.finished}.")
+            console.say(f"{SPLIT}: unchanged since {record.finished}.")
         _show(record)
+        findings = read_audit(area.folder(SPLIT) / AUDIT)
+        show_findings(findings)
+        for note in record.notes:
+            if not note.startswith("audit:"):  # printed with the other findings
+                console.note(note)
         page.refresh(area)
-    show_findings(read_audit(area.folder(SPLIT) / AUDIT))
+    fail_if_failed(findings)
 
 
 def _options(
@@ -178,6 +183,4 @@ def _show(record: StageRecord) -> None:
             show_labels.time_row(record),
         ],
     )
-    for note in record.notes:
-        if not note.startswith("audit:"):  # printed with the other findings
-            console.note(note)
+    show_labels.add_stage(record)

@@ -28,17 +28,25 @@ def telemetry(file: Path, target: Path) -> None:
     """
     import numpy as np
 
-    from spn_cli import console
+    from spn_cli import console, told
     from spn_data.errors import InputError
     from spn_data.telemetry.read import read_telemetry
     from spn_data.telemetry.table import write_track
 
     if target.exists():
         raise InputError("already exists; choose another file", path=target)
-    track = read_telemetry(file)
+    with console.working(f"Reading {file}"):
+        track = read_telemetry(file)
     write_track(target, track)
     angles = int(np.isfinite(track.gimbal_deg[:, 1:]).all(axis=1).sum())
-    console.out.print(
+    told.figures(
+        kind=track.kind,
+        records=len(track),
+        with_position=track.has_fix.sum(),
+        with_attitude=angles,
+        written=target,
+    )
+    console.say(
         f"{target}: {len(track)} records ({track.kind}), {int(track.has_fix.sum())} with a position, "
         f"{angles} with pitch and roll of the camera."
     )

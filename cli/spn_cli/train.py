@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console, options
+from spn_cli import completion, console, options
 
 
 @click.command()
@@ -17,10 +17,14 @@ from spn_cli import console, options
     "--recipe",
     default="default",
     show_default=True,
+    shell_complete=completion.recipes,
     help="Recipe to train by: one of the package, or a TOML file.",
 )
 @click.option(
-    "--run", "run_name", help="Name of the folder in runs/.  [default: the recipe's name]"
+    "--run",
+    "run_name",
+    shell_complete=completion.runs,
+    help="Name of the folder in runs/.  [default: the recipe's name]",
 )
 @click.option(
     "--pretrain",
@@ -116,13 +120,10 @@ def train(
     if trained is None:
         return
     if not trained.is_new:
-        console.out.print(f"{run.folder} is already trained.", soft_wrap=True)
+        console.say(f"{run.folder} is already trained.", wrap=False)
     errors_table(trained.facts, trained.unit)
     if trained.is_new:
-        console.out.print(
-            f"{run.folder}: {run.checkpoint.name}, {run.log.name}.",
-            soft_wrap=True,
-        )
+        console.say(f"{run.folder}: {run.checkpoint.name}, {run.log.name}.", wrap=False)
     if not area.has(FRAMES):  # the data set is of another area, or imported
         words = ["spn-model", "evaluate", *([str(dataset)] if dataset else []), "--run", run.name]
         do = "Evaluate the network on frames that it was not trained on"

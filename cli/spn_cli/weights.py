@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from spn_cli import console
+from spn_cli import console, told
 
 
 @click.group(invoke_without_command=True)
@@ -19,14 +19,20 @@ def weights(context: click.Context) -> None:
     """
     if context.invoked_subcommand is not None:
         return
+    from dataclasses import asdict
+
     from spn_model.pretrained.weights import CATALOGUE, cache_folder, state
 
     rows = []
+    told.figures(
+        weights=[{**asdict(entry), "state": state(entry)} for entry in CATALOGUE],
+        folder=cache_folder(),
+    )
     for entry in CATALOGUE:
         size = f"{entry.size_bytes / 1e6:.1f} MB"
         rows.append((entry.name, entry.holds, state(entry), entry.origin, size, entry.sha256[:8]))
     console.table("Weights", rows, ("name", "holds", "here", "from", "size", "SHA-256"))
-    console.out.print(f"Downloaded files are stored in {cache_folder()}.")
+    console.say(f"Downloaded files are stored in {cache_folder()}.")
     if any("damaged" in row for row in rows):
         console.note("damaged files are not used; spn-model weights fetch NAME replaces them.")
 
@@ -46,4 +52,5 @@ def fetch(name: str) -> None:
     entry = by_name(name)
     with console.progress() as progress:
         path = download(entry, progress)
-    console.out.print(f"{path}: {entry.holds}; {entry.licence}.")
+    told.figures(written=path)
+    console.say(f"{path}: {entry.holds}; {entry.licence}.")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from spn_data.geometry.pose import Poses
+
 IMAGES, POINTS = "images.bin", "points3D.bin"
 CAMERAS, RIGS, FRAMES = "cameras.bin", "rigs.bin", "frames.bin"
 _POINT = np.dtype(
@@ -79,6 +81,15 @@ def read_keypoints(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         block = np.frombuffer(data, _KEYPOINT, count, start)
         keypoints[name] = (block["xy"].copy(), block["point_id"].copy())
     return keypoints
+
+
+def read_centers(folder: Path) -> np.ndarray:
+    """Read the camera centres of images.bin in the model's frame, (N, 3); raises as `read_keypoints` does."""
+    data = (folder / IMAGES).read_bytes()
+    names_at = [start - 9 - len(name.encode()) for name, start, _ in _image_blocks(data)]
+    poses = [np.frombuffer(data, "<f8", 7, at - _POSE_BYTES + 4) for at in names_at]
+    values = np.array(poses).reshape(-1, 7)
+    return Poses.from_cam_from_world(values[:, [1, 2, 3, 0]], values[:, 4:]).centers
 
 
 def count_images(folder: Path) -> int:

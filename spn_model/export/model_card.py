@@ -227,7 +227,7 @@ def _bundle_errors(errors: Sequence[GroupErrors], unit: str) -> str:
     rows = []
     for one in errors:
         percent = int8_error_increase(errors, one.group) if one.precision == INT8 else None
-        increase = "" if percent is None else f"{percent[0]:+.1f} %, {percent[1]:+.1f} %"
+        increase = "" if percent is None else ", ".join(map(percent_text, percent))
         rows.append(
             (
                 one.group,
@@ -256,6 +256,11 @@ def _licence(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> str:
     except InputError:
         return f"Training started from a user-supplied file, {name}: its licence applies."
     return f"{known.holds} ({known.name}): {known.licence}."
+
+
+def percent_text(value: float) -> str:
+    """Format a change by percent; NaN means that one of both errors has no median."""
+    return f"{value:+.1f} %" if math.isfinite(value) else "not known"
 
 
 def _number(value: float | None) -> str:

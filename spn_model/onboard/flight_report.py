@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -29,15 +30,26 @@ class StepTimes:
         """Return the median time of an image; NaN without images."""
         return float(np.median(self._seconds.get("image", [math.nan])))
 
-    def lines(self) -> list[str]:
-        """Return a table: images with the step, and its time at 50 and 95 % of them."""
+    def to_json(self) -> dict[str, dict[str, float]]:
+        """Return the images with each step, and its time at 50 and 95 % of them."""
         wholes = sorted(name for name in self._seconds if name.startswith("image"))
-        found = [f"{'step':28} images  p50 ms  p95 ms"]
+        found = {}
         for name in (*STEPS, *wholes[::-1]):
             if name in self._seconds:
                 p50, p95 = 1e3 * np.percentile(self._seconds[name], [50, 95])
-                found.append(f"{name:28} {len(self._seconds[name]):6} {p50:7.1f} {p95:7.1f}")
+                images = len(self._seconds[name])
+                found[name] = {"images": images, "p50_ms": float(p50), "p95_ms": float(p95)}
         return found
+
+    def lines(self) -> list[str]:
+        """Return a table: images with the step, and its time at 50 and 95 % of them."""
+        return [
+            f"{'step':28} images  p50 ms  p95 ms",
+            *(
+                f"{name:28} {step['images']:6} {step['p50_ms']:7.1f} {step['p95_ms']:7.1f}"
+                for name, step in self.to_json().items()
+            ),
+        ]
 
 
 def kind_of_reason(reason: str) -> str:
@@ -84,6 +96,20 @@ class FlightReport:
     def longest_outage_s(self) -> float:
         """Longest time between usable fixes, begin and end of the flight included."""
         return 1e-6 * longest_outage(self._times_us, self._usable)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report as plain values; protection levels are medians, None without a usable fix."""
+        levels = np.median(self._levels_m, axis=0).tolist() if self._levels_m else (None, None)
+        return {
+            "images": len(self._usable),
+            "usable": sum(self._usable),
+            "longest_outage_s": self.longest_outage_s,
+            "protection_horizontal_m": levels[0],
+            "protection_vertical_m": levels[1],
+            "sources": dict(self._sources),
+            "reasons": dict(self._reasons),
+            "steps": self._times.to_json(),
+        }
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""

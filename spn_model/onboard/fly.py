@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,6 +40,7 @@ from spn_model.onboard.flight_report import FlightReport
 from spn_model.onboard.height import BarometerHeights, add_height_options, heights_of
 from spn_model.onboard.pilot import Pilot, PilotOptions
 from spn_model.onboard.pre_arm import StatedPosition, pre_arm
+from spn_model.onboard.progress import FlightProgress
 from spn_model.onboard.replay import FlownImage, RealTime
 from spn_model.onboard.sources import check_sources, frames
 
@@ -70,6 +73,7 @@ def fly(arguments: list[str]) -> None:
     stated = None
     if given.at is not None:
         stated = StatedPosition(lat_deg=given.at[0], lon_deg=given.at[1], sigma_m=given.at_sigma)
+    progress = FlightProgress(quiet=given.quiet)
     pilot = _pilot(given)
     view, gimbal = pilot.localizer.bundle.view, pilot.localizer.bundle.gimbal
     datum = _datum(given, view.origin)
@@ -82,9 +86,7 @@ def fly(arguments: list[str]) -> None:
     heights = heights_of(given, view)
     images = _images(given, attitude, heights)
     if given.pre_arm:
-        for line in pre_arm(pilot, images, stated):
-            sys.stdout.write(line + "\n")
-        sys.stdout.write("Ready.\n")
+        _tell(given, [*pre_arm(pilot, images, stated), "Ready."], {"ready": True})
         return
     report, count, known, with_height, clock = FlightReport(), 0, 0, 0, RealTime()
     with ExitStack() as stack:
@@ -115,9 +117,10 @@ def fly(arguments: list[str]) -> None:
             with_height += height_m is not None
             item: Fix | NoFix = pilot.fix(image, time_us, vertical, height_m)
             report.add(item, pilot.steps_s)
+            progress.image()
             for sink in sinks:
                 sink.send(item)
-    lines = report.lines()
+    lines: list[str] = []
     if clock.late:
         lines.append(
             f"{clock.late} images were left out: the recording is replayed in real time, and they were late."
@@ -130,6 +133,14 @@ def fly(arguments: list[str]) -> None:
             f"Height: known for {with_height} of {count} images; its zero is {zero.zero_m:+.2f} m from the "
             f"stated one, known to {math.sqrt(zero.variance):.2f} m."
         )
+    _tell(given, [*report.lines(), *lines], {**report.to_json(), "notes": lines})
+
+
+def _tell(given: argparse.Namespace, lines: list[str], figures: dict[str, Any]) -> None:
+    """Write what was found, as lines or as one JSON object."""
+    if given.json:
+        figures = {"command": "spn-onboard fly", **figures}
+        lines = [json.dumps(figures, indent=1, allow_nan=False)]
     for line in lines:
         sys.stdout.write(line + "\n")
 
@@ -289,5 +300,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--fps", type=float, default=10.0, help="where images state no time")
     parser.add_argument("--no-network", action="store_true", help="search by landmarks alone")
     parser.add_argument("--int8", action="store_true", help="use the 8-bit graph")
+    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print no progress")
     parser.add_argument("--threads", type=int, choices=range(1, 257), default=1, metavar="N")
     return parser

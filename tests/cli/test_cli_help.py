@@ -18,6 +18,7 @@ from spn_cli.model import main as model_main
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 COMMANDS = sorted(main.commands)
+OF_EVERY_COMMAND = {"--verbose", "--quiet", "--json"}
 GEO_PARAMETERS = set(inspect.signature(options.geo_options).parameters)
 
 
@@ -250,7 +251,7 @@ def test_every_option_is_documented(name):
     text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(--[a-z-]+)` \|([^|]*)\|", text, re.MULTILINE))
     for parameter in main.commands[name].params:
-        if not isinstance(parameter, click.Option):
+        if not isinstance(parameter, click.Option) or parameter.opts[-1] in OF_EVERY_COMMAND:
             continue
         flag = parameter.opts[-1]
         assert flag in rows
@@ -268,9 +269,8 @@ def test_no_option_is_documented_that_is_not_there():
     """docs/reconstruct.md lists no option that `reconstruct` lacks."""
     text = (ROOT / "docs" / "reconstruct.md").read_text(encoding="utf-8")
     rows = set(re.findall(r"^\| `(--[a-z-]+)` ", text, re.MULTILINE))
-    assert rows == {
-        flag for p in main.commands["reconstruct"].params for flag in p.opts if flag[:2] == "--"
-    }
+    known = {f for p in main.commands["reconstruct"].params for f in p.opts if f[:2] == "--"}
+    assert rows == known - OF_EVERY_COMMAND
 
 
 def test_every_option_of_simulate_is_documented():
@@ -281,4 +281,14 @@ def test_every_option_of_simulate_is_documented():
         for parameter in main.commands["simulate"].params
         if isinstance(parameter, click.Option) and f"`{parameter.opts[-1]}" not in text
     ]
-    assert missing == []
+    assert set(missing) <= OF_EVERY_COMMAND
+
+
+@pytest.mark.parametrize(
+    "command", [main, model_main, *main.commands.values(), *model_commands().values()]
+)
+def test_every_command_takes_the_options_of_every_command(command):
+    """-v, --quiet and --json are options of both programs and of each command, and are documented."""
+    assert {p.opts[-1] for p in command.params} >= OF_EVERY_COMMAND
+    text = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
+    assert all(f"`{flag}`" in text for flag in OF_EVERY_COMMAND)

@@ -49,7 +49,7 @@ def split_area(registered_area: Path, tmp_path_factory: pytest.TempPathFactory) 
     area = Path(shutil.copytree(registered_area, tmp_path_factory.mktemp("split") / "area"))
     result = run("split", "--area", area)
     assert result.exit_code == 0, result.output
-    assert "Audit passed." in result.output
+    assert "Audit passed: " in result.output
     return area
 
 
