@@ -45,7 +45,6 @@ CHECKPOINT, LOG, METRICS = "checkpoint.safetensors", "log.csv", "metrics.json"
 ERRORS, FIXES, FIGURES, BUNDLE = "errors.csv", "fixes.csv", "figures", "bundle"
 BUNDLE_FACTS = "bundle.json"  # in BUNDLE
 CONFIG, LAST, STATE = "config.json", "last.safetensors", "state.safetensors"
-BUNDLE_FILE = "bundle.json"  # in a bundle
 EXPECTED = "expected.json"  # what is expected of planned waypoints with the bundle
 RETRIEVAL = ".retrieval.json"  # in RUNS: cache of the retrieval baselines
 COMPARED = "compared"  # in RUNS: several runs evaluated together

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from spn_data.area.area import Area
-from spn_data.area.names import BUNDLE, BUNDLE_FILE, EXPECTED, RUNS
+from spn_data.area.names import BUNDLE, BUNDLE_FACTS, EXPECTED, RUNS
 from spn_data.errors import FormatError
+from spn_data.inputs.network_runs import bundle_facts
 from spn_data.report.expected import ExpectedPlan
-from spn_data.storage.json_files import load_json, read_json, reporting_damage
+from spn_data.storage.json_files import read_json, reporting_damage
 
 _MAX_RUNS, _MAX_ROWS, _MAX_TEXT, _MAX_COUNT = 50, 200, 300, 10**9
 
@@ -43,7 +44,8 @@ def read_expected_plans(area: Area) -> tuple[tuple[ExpectedPlan, ...], tuple[str
 def _read(path: Path, run: str) -> ExpectedPlan:
     table = read_json(path)
     with reporting_damage(path):
-        counts = table["counts"]
+        counts, judged_by = table["counts"], table["bundle"]
+        present = bundle_facts(path.parent / BUNDLE / BUNDLE_FACTS)
         return ExpectedPlan(
             run=run,
             plan=_text(table["plan"]),
@@ -59,21 +61,8 @@ def _read(path: Path, run: str) -> ExpectedPlan:
                 )
                 for one in table["lacking"][:_MAX_ROWS]
             ),
-            is_current=table["bundle"] == _present_bundle(path.parent / BUNDLE / BUNDLE_FILE),
+            is_current=all(present.get(p) == judged_by[p] for p in ("network", "landmarks")),
         )
-
-
-def _present_bundle(path: Path) -> dict[str, Any] | None:
-    """Return the hashes of network and landmarks of a bundle; None if there is none that states them."""
-    try:
-        document = load_json(path)
-        with reporting_damage(path):
-            return {
-                "network": _text(document["graphs"]["float32"]["sha256"]),
-                "landmarks": _text(document["landmarks"]["sha256"]),
-            }
-    except FormatError:
-        return None
 
 
 def _text(value: Any) -> str:

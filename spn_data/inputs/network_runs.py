@@ -87,7 +87,7 @@ def trained_runs(area: Area, runs: Sequence[RunFacts]) -> tuple[NetworkState, ..
         checkpoint, bundle = folder / CHECKPOINT, folder / BUNDLE
         if not checkpoint.is_file() or name == COMPARED:
             continue
-        facts = _bundle(bundle / BUNDLE_FACTS)
+        facts = bundle_facts(bundle / BUNDLE_FACTS)
         state = NetworkState(
             name,
             f"{RUNS}/{name}/{BUNDLE}",
@@ -105,7 +105,7 @@ def trained_runs(area: Area, runs: Sequence[RunFacts]) -> tuple[NetworkState, ..
     return tuple(run for _, run in sorted(found, key=lambda one: (-one[0], one[1].name)))
 
 
-def _bundle(path: Path) -> dict[str, str]:
+def bundle_facts(path: Path) -> dict[str, str]:
     """Return the fingerprint of the `checkpoint` of a bundle, and SHA-256 of its `network` and `landmarks`.
 
     Empty if there is none, or a damaged one, which every command that uses it refuses.

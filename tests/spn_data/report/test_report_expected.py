@@ -28,7 +28,11 @@ def area(tmp_path):
     """Return an area with a run that has a bundle and a judged plan."""
     run = tmp_path / "runs" / "first"
     (run / "bundle").mkdir(parents=True)
-    document = {"graphs": {"float32": {"sha256": "aa"}}, "landmarks": {"sha256": "bb"}}
+    document = {
+        "run": {"checkpoint": "c"},
+        "graphs": {"float32": {"sha256": "aa"}},
+        "landmarks": {"sha256": "bb"},
+    }
     (run / "bundle" / "bundle.json").write_text(json.dumps(document))
     (run / "expected.json").write_text(json.dumps(PLAN))
     return Area(tmp_path)

@@ -238,7 +238,7 @@ def test_a_frame_without_a_pose_has_a_reason_and_no_numbers(network, photos, tmp
     (photos / "003.png").write_bytes((photos / "003.png").read_bytes()[:60])
     real = network.model.estimate
 
-    def lost(images, intrinsics):
+    def lost(images, intrinsics, verticals=None):
         found = real(images, intrinsics)
         found.poses.centers[0] = found.poses.quats_wxyz[5] = np.nan
         found.poses.quats_wxyz[1:] *= -1  # the same rotations
@@ -315,7 +315,7 @@ def test_stopped_work_keeps_whole_rows_and_says_so(network, photos, tmp_path):
 def test_a_failure_leaves_nothing(network, photos, tmp_path, monkeypatch):
     """An error while predicting leaves neither the output folder nor a partial one."""
 
-    def broken(images, intrinsics):
+    def broken(images, intrinsics, verticals=None):
         raise StageError("poses.csv cannot be written: No space left on device")
 
     monkeypatch.setattr(network.model, "estimate", broken)
