@@ -95,7 +95,7 @@ def write_report(area: Area, options: ReportOptions | None = None) -> tuple[Path
         If a file is damaged.
     """
     options = options or ReportOptions()
-    path, data = area.root / REPORT, report_data(area)
+    path, data = area.root / REPORT, report_data(area, photogrammetry=True)
     judged = judge(data)
     html = render(
         data,
@@ -138,8 +138,11 @@ def _last_change(area: Area, stages: tuple[StageFacts, ...]) -> str:
     return max(times).strftime("%Y-%m-%d %H:%M UTC")
 
 
-def report_data(area: Area) -> ReportData:
-    """Collect the contents of the report; raises the same errors as `write_report`."""
+def report_data(area: Area, *, photogrammetry: bool = False) -> ReportData:
+    """Collect the contents of the report; raises the same errors as `write_report`.
+
+    photogrammetry : whether to collect what only the section on photogrammetry shows.
+    """
     if not area.has(FRAMES):
         raise StageError(f"{area.root} contains no frames; run {command_of(FRAMES)} first")
     stages = tuple(
@@ -192,7 +195,7 @@ def report_data(area: Area) -> ReportData:
         trained=trained_runs(area, runs),
         expect_low=frozenset(area.facts.expect_low),
         recorded=_recorded_flight(area),
-        photogrammetry=None if labelled is None else photogrammetry_of(fresh, labelled),
+        photogrammetry=photogrammetry_of(fresh, labelled) if photogrammetry and labelled else None,
     )
 
 
