@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import chain
 
 from spn_cli import console
 from spn_data.dataset.hdf5_schema import Role
@@ -60,9 +61,9 @@ def notes(evaluated: EvaluatedRuns) -> None:
     """Print the notes on an evaluation."""
     if evaluated.comparison.units != "m":
         console.note("lengths are in model units, not metres.")
-    for found in (evaluated.comparison, *evaluated.fixes.values()):
-        for note in found.notes:
-            console.note(note)
+    of_fixes = [found.notes for found in evaluated.fixes.values()]
+    for note in chain(evaluated.comparison.notes, *of_fixes):
+        console.note(note)
 
 
 def _errors(group: EvaluatedGroup, unit: str) -> None:
