@@ -38,6 +38,7 @@ SCRATCH: dict[str, tuple[str, ...]] = {
 COVERAGE, PLANNED_COVERAGE = "coverage", "coverage-waypoints"
 REPORT = "report.html"
 THUMBNAILS = ".thumbnails.json"  # cache of the small images in the report
+GROUND = ".ground.json"  # cache of the image of the ground in the report
 
 # Trained networks, a folder each; made by spn-model.
 RUNS = "runs"

@@ -23,6 +23,7 @@ from spn_data.labels.labels import Labels
 from spn_data.orthophoto.ground import GroundRaster, fit_ground
 from spn_data.orthophoto.mosaic import OrthophotoFrames, mosaic
 from spn_data.orthophoto.views import GroundViews, ground_views
+from spn_data.report.ground_texture import GroundTexture
 
 _FINEST_M = 0.01
 _TEXTURE_PX = 1024
@@ -32,26 +33,6 @@ _TEXTURE_QUALITY = 70
 
 class NoOrthophotoError(StageError):
     """No selected frame shows the ground."""
-
-
-@dataclass(frozen=True, eq=False)
-class GroundTexture:
-    """Orthophoto for the 3D view.
-
-    Attributes
-    ----------
-    low, high : tuple of float
-        East and north of the south-western and north-eastern corners, in metres.
-    up_m : float
-        Median height of the ground.
-    webp : bytes
-        Image with transparency, north up.
-    """
-
-    low: tuple[float, float]
-    high: tuple[float, float]
-    up_m: float
-    webp: bytes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from spn_data.area.area import Area
 from spn_data.inputs.run_estimates import read_estimates
 from spn_data.inputs.thumbnails import read_thumbnails
+from spn_data.pipeline.area_ground import ground_of
+from spn_data.pipeline.fresh_stages import FreshStages
 from spn_data.report.data import ReportData
 from spn_data.report.pictures import Pictures, fits_labels, worst_frames
 
@@ -23,10 +25,12 @@ def pictures_of(area: Area, data: ReportData) -> Pictures:
     worst = worst_frames(data.frames, estimates)
     wanted = {name for one in worst for name in (one.name, one.nearest, one.taken_for)}
     images = read_thumbnails(area, data.frames, wanted)
+    ground, ground_note = ground_of(FreshStages(area))
     return Pictures(
         estimates=estimates,
         worst=worst,
         thumbnails=images.images,
         files=images.files,
-        notes=(*notes, *images.notes),
+        ground=ground,
+        notes=(*notes, *images.notes, *filter(None, [ground_note])),
     )

@@ -45,6 +45,7 @@ from spn_data.pipeline import area_coverage as coverage_stage
 from spn_data.pipeline.area_audit import read_audit
 from spn_data.pipeline.area_photogrammetry import photogrammetry_of
 from spn_data.pipeline.area_pictures import pictures_of
+from spn_data.pipeline.fresh_stages import FreshStages
 from spn_data.report.area_verdict import AreaVerdict, judge
 from spn_data.report.data import CoverageFacts, FrameTable, PlaceToFly, ReportData, StageFacts
 from spn_data.report.html import render
@@ -113,22 +114,6 @@ def judge_area(area: Area) -> AreaVerdict:
     return judge(report_data(area))
 
 
-class _FreshStages(Area):
-    """View of an area without its stale stages."""
-
-    def __init__(self, area: Area):
-        self._fresh = {stage for stage in area.stages() if area.stale_because(stage) is None}
-        super().__init__(area.root)
-
-    def has(self, stage: str) -> bool:
-        """Return whether a stage is complete and not stale."""
-        return stage in self._fresh
-
-    def sequences(self, group: str) -> tuple[str, ...]:
-        """Return the names of the stages of a group that are not stale."""
-        return tuple(n for n in super().sequences(group) if self.has(f"{group}/{n}"))
-
-
 def _last_change(area: Area, stages: tuple[StageFacts, ...]) -> str:
     """Return when a stage was finished last, or a file was written that the page shows too."""
     times = [datetime.fromisoformat(stage.record.finished) for stage in stages]
@@ -149,7 +134,7 @@ def report_data(area: Area, *, photogrammetry: bool = False) -> ReportData:
         StageFacts(area.record(stage), area.stale_because(stage), _command_of(area, stage))
         for stage in area.stages()
     )
-    fresh = _FreshStages(area)
+    fresh = FreshStages(area)
     labelled = read_labelled_area(fresh) if fresh.has(MODEL) else None
     geo, residuals = None, {}
     if fresh.has(GEO):

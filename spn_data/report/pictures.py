@@ -12,6 +12,7 @@ import numpy as np
 from spn_data.coverage.nearest_frame import CoverageOptions, nearest_frames
 from spn_data.geometry.pose import Poses
 from spn_data.report.data import FrameTable
+from spn_data.report.ground_texture import GroundTexture
 from spn_data.report.pack import pack, pack_texts
 from spn_data.split.groups import TRAIN
 
@@ -97,6 +98,7 @@ class Pictures:
         JPEG files by frame.
     files : mapping of str to str
         Full images by frame: paths relative to the page.
+    ground : GroundTexture or None
     notes : tuple of str
         What is missing, and why.
     """
@@ -105,6 +107,7 @@ class Pictures:
     worst: tuple[WorstFrame, ...] = ()
     thumbnails: Mapping[str, bytes] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    ground: GroundTexture | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -203,6 +206,7 @@ def pack_pictures(pictures: Pictures, frames: FrameTable) -> dict[str, Any]:
     images = {name: image for name, image in pictures.thumbnails.items() if name in rows}
     return {
         "estimates": packed,
+        "ground": None if pictures.ground is None else pictures.ground.to_json(),
         "images": {rows[n]: base64.b64encode(i).decode("ascii") for n, i in images.items()},
         "files": {rows[n]: path for n, path in pictures.files.items() if n in rows},
     }

@@ -48,6 +48,10 @@ function purpose(i) {
   return !group ? "mapping" : `truth: ${group}`;
 }
 
+// Image of the ground; the view draws it once it is decoded.
+const groundImage = new Image();
+if (report.ground) groundImage.src = "data:image/webp;base64," + report.ground.webp;
+
 const tangentsOf = i => report.fov[frames.camera(i)] || [0.6, 0.4];
 
 function makeLayers(size) {
@@ -55,6 +59,11 @@ function makeLayers(size) {
   const add = (label, color, layer, on = true) => {
     if (layer.xyz.length) made.push({label, color, on, ...layer});
   };
+  if (report.ground) {
+    const {low: [west, south], high: [east, north], up} = report.ground;
+    const [a, b, c, d] = [[west, north], [east, north], [east, south], [west, south]].map(([x, y]) => shown(x, y, up));
+    add("ground", null, {image: groundImage, xyz: new Float32Array([...a, ...b, ...c, ...a, ...c, ...d])});
+  }
   if (report.points) {
     const points = report.points;
     add("points", null, {xyz: unpack(points.xyz), step: points.step, rgb: unpack(points.rgb), size: innerWidth < 600 ? 1.4 : 2});

@@ -203,6 +203,7 @@ function makeView(onPick, onEstimates) {
     redraw();
   });
   new ResizeObserver(redraw).observe(canvas);
+  groundImage.onload = redraw;
   reset();
   document.getElementById("legend").open = canvas.clientWidth > 500;  // it would hide the map on a phone
   legend();

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,14 @@ import pytest
 from PIL import Image
 
 from spn_data.area.area import Area
+from spn_data.area.names import GROUND
 from spn_data.errors import GeometryError, InputError, StageError
 from spn_data.exports.exported_frames import ExportedFrames
 from spn_data.inputs.area_labels import LabelledArea, read_labelled_area
 from spn_data.labels.map_points import MapPoints
+from spn_data.pipeline import area_ground
 from spn_data.pipeline.area_export import select_frames
+from spn_data.pipeline.area_ground import ground_of
 from spn_data.pipeline.area_orthophoto import NoOrthophotoError, ground_texture, write_orthophoto
 
 
@@ -69,6 +73,25 @@ def test_the_texture_is_small_and_lies_on_the_ground(
     assert width / height == pytest.approx((east - west) / (north - south), rel=0.01)
     assert 0.05 < (image[..., 3] > 127).mean() < 1
     assert texture.up_m == pytest.approx(float(labelled.points.xyz[0, 2]), abs=0.01)
+
+
+def test_the_ground_of_the_page_is_drawn_once(
+    finished_area: Path, tmp_path: Path, labelled: LabelledArea, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken from the cache until that is damaged; a place without ground has a note instead."""
+    area = shutil.copytree(finished_area, tmp_path / "area")
+    (area / GROUND).unlink(missing_ok=True)
+    monkeypatch.setattr(area_ground, "read_labelled_area", lambda _: labelled)
+    first, note = ground_of(Area(area))
+    assert first is not None
+    assert note == ""
+    monkeypatch.setattr(area_ground, "ground_texture", lambda *_: None)
+    again, _ = ground_of(Area(area))
+    assert again is not None
+    assert again.to_json() == first.to_json()
+    (area / GROUND).write_text((area / GROUND).read_text().replace('"UklGR', '"AAAAA'))
+    for _ in range(2):
+        assert ground_of(Area(area)) == (None, "The ground is not drawn: no frame shows it.")
 
 
 def test_what_has_no_orthophoto_is_refused(

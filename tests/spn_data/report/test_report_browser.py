@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from spn_data.inputs.thumbnails import MAX_BYTES
+from spn_data.report.ground_texture import GroundTexture
 from spn_data.report.html import render
 from tests.worlds.report_data import area, pictures
 
@@ -366,6 +368,38 @@ def test_estimates_are_drawn_joined_to_the_truth(tmp_path):
     )
     assert seen.found["fixes"][2][:2] == ["\N{EN DASH}", "0.00"]
     assert seen.found["none"] == [0, ""]
+
+
+def test_the_ground_is_drawn_below_the_map(tmp_path):
+    """An image of the ground, green and at the height of the cameras, is seen until its layer is off."""
+    data = area()
+    green = np.full((8, 8, 3), (0, 255, 0), np.uint8)
+    webp = cv2.imencode(".webp", green, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+    low, high = (data.frames.poses.centers[data.frames.registered][:, :2] + s for s in (-9, 9))
+    ground = GroundTexture(tuple(low.min(axis=0)), tuple(high.max(axis=0)), 0.0, webp)
+    seen = visit(
+        tmp_path,
+        render(data, pictures=replace(pictures(data), ground=ground)),
+        """
+        const green = () => {
+          window.spnReport.view.draw();
+          const view = document.getElementById("view"), flat = document.createElement("canvas");
+          flat.width = view.width; flat.height = view.height;
+          flat.getContext("2d").drawImage(view, 0, 0);
+          const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+          let n = 0;
+          for (let k = 0; k < data.length; k += 4) n += data[k] < 9 && data[k + 1] > 246 && data[k + 2] < 9;
+          return n;
+        };
+        found.on = green();
+        const label = [...document.querySelectorAll("#legend label")].find(l => l.textContent === "ground");
+        label.querySelector("input").click();
+        found.off = green();
+        """,
+    )
+    assert seen.console == []
+    assert seen.found["on"] > 3000
+    assert seen.found["off"] == 0
 
 
 def test_a_click_anywhere_shows_the_image(tmp_path):
