@@ -80,7 +80,7 @@ _DATA: tuple[Command, ...] = (
         "georegister",
         ("spn-data", "georegister", *AREA, "--gnss-sigma", "1", "2", "--overwrite"),
         "reconstruct",
-        ("area/3-geo", "area/report.html"),
+        ("area/3-geo", "area/report.html", "area/area.toml"),
     ),
     Command(
         "register",

@@ -22,7 +22,6 @@ from spn_data.area.names import (
 )
 from spn_data.capture.sources import safe_name
 from spn_data.errors import FormatError, InputError
-from spn_data.inputs.frame_errors import read_frame_errors
 from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.network_state import NetworkState
 from spn_data.report.run_facts import Figure, MethodErrors, NetworkFacts, RunFacts
@@ -177,7 +176,6 @@ def _read(folder: Path, current: str, budget: int) -> RunFacts:
             figures=figures,
             left_out=left_out,
             fixes=_fixes(table["fixes"]) if "fixes" in table else BundleFixes(),
-            frame_errors=read_frame_errors(folder, *networks) if len(networks) == 1 else (),
         )
     except (*DAMAGE, OSError, FormatError, InputError) as error:
         raise FormatError(

@@ -108,7 +108,10 @@ def _row(cells: dict[str, str]) -> _Row:
     else:
         raise ValueError("position and unit quaternion expected")
     reason = cells.get("reason", "")[:_MAX_TEXT]
-    return pose, _number(cells["error"]), _number(cells["error_deg"]), reason
+    errors = _number(cells["error"]), _number(cells["error_deg"])
+    if any(value < 0 for value in errors):
+        raise ValueError("a negative error")
+    return pose, *errors, reason
 
 
 def _number(cell: str) -> float:

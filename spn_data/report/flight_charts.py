@@ -11,7 +11,7 @@ from spn_data.charts.svg import COLOURS, INK, MARKERS, Panel
 from spn_data.georegistration.control import PointResidual
 from spn_data.report.chart_page import chart
 from spn_data.report.data import FrameTable
-from spn_data.report.frame_errors import FlightErrors
+from spn_data.report.pictures import COARSE, RunEstimates
 
 _LEFT, _TOP, _WIDE, _HIGH = 52.0, 30.0, 410.0, 200.0
 _MOST_DRAWN = 600  # frames of one series; more are thinned evenly
@@ -114,11 +114,11 @@ def _series(
 
 
 def errors_over_time(
-    frames: FrameTable, flight: str, methods: Sequence[FlightErrors], unit: str
+    frames: FrameTable, flight: str, methods: Sequence[RunEstimates], unit: str
 ) -> list[str]:
     """Draw the errors of each network and its fixes over the time of a flight, on logarithmic axes."""
     rows = np.flatnonzero(frames.sequences == flight)
-    asked = [one.at(frames.names[rows]) for one in methods]
+    asked = [_errors_of(one, frames.names[rows]) for one in methods]
     drawn = []
     for which, label, title in (
         (1, f"position error ({unit})", f"Position errors along {flight}"),
@@ -153,10 +153,20 @@ def errors_over_time(
             )
             median = f", median {np.median(values[np.isfinite(values)]):.3g}" if count else ""
             none = f", {missing} without a pose" if missing else ""
-            entries.append((f"{one.method}: {count} frames{median}{none}", colour))
+            name = one.run if one.method == COARSE else f"{one.run}, fixes"
+            entries.append((f"{name}: {count} frames{median}{none}", colour))
             markers.append(marker)
         drawn.append(_with_legend(title, parts, entries, markers))
     return drawn
+
+
+def _errors_of(one: RunEstimates, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether frames (M,) were asked, with their errors and angles; NaN if not."""
+    row = {name: k for k, name in enumerate(one.names.tolist())}
+    index = np.array([row.get(name, -1) for name in names.tolist()], dtype=np.int64)
+    asked = index >= 0
+    error = np.where(asked, one.error[index], np.nan)
+    return asked, error, np.where(asked, one.error_deg[index], np.nan)
 
 
 def _line(

@@ -64,7 +64,7 @@ def render(
         "worst": picture_sections.worst(pictures, data.units),
         "coverage": sections.coverage(data),
         "residuals": sections.residuals(data) + sections.control(data),
-        "photogrammetry": photogrammetry(data),
+        "photogrammetry": photogrammetry(data, pictures.estimates),
         "split": sections.split(data),
         "timeline": sections.timeline(data, left_out),
         "failed": picture_sections.failed(frames, pictures),

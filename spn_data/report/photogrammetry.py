@@ -24,12 +24,13 @@ from spn_data.report.photogrammetry_charts import (
     track_histogram,
 )
 from spn_data.report.photogrammetry_facts import LensFacts
+from spn_data.report.pictures import COARSE, TRACK, RunEstimates
 
 _STRONG = 0.9  # correlation that is set in bold
 
 
-def photogrammetry(data: ReportData) -> str:
-    """Return the section; empty without a model."""
+def photogrammetry(data: ReportData, estimates: Sequence[RunEstimates] = ()) -> str:
+    """Return the section, with the errors of estimates along the flights; empty without a model."""
     facts = data.photogrammetry
     if facts is None:
         return ""
@@ -52,13 +53,13 @@ def photogrammetry(data: ReportData) -> str:
     return (
         '<section id="photogrammetry"><h2>Photogrammetry</h2><h3>Calibration</h3>'
         f"{''.join(map(_calibration, facts.lenses))}{_explained(facts.lenses)}"
-        f"{side_by_side(of_map)}{reason}{side_by_side(along)}{_networks(data, unit)}</section>"
+        f"{side_by_side(of_map)}{reason}{side_by_side(along)}{_networks(data, estimates, unit)}</section>"
     )
 
 
-def _networks(data: ReportData, unit: str) -> str:
-    """Return the errors of all runs along each evaluation flight."""
-    methods = [one for run in data.runs if not run.is_outdated for one in run.frame_errors]
+def _networks(data: ReportData, estimates: Sequence[RunEstimates], unit: str) -> str:
+    """Return the errors of networks alone and of tracked fixes along each evaluation flight."""
+    methods = [one for one in estimates if one.method in (COARSE, TRACK)]
     charts = [
         drawn
         for flight in data.evaluation_sequences

@@ -17,6 +17,7 @@ from spn_data.report.pack import pack, pack_texts
 from spn_data.split.groups import TRAIN
 
 COARSE = "coarse"  # the network alone
+TRACK = "track"  # the way of fixing that a flight uses: image after image
 _SAME = 1e-3  # in the world's unit: cells are rounded to a tenth of it
 _WORST = 3  # frames of each flight and network
 # Without limits, the nearest frame is the one with the smallest sum of distance and angle.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from spn_data.report.fix_facts import BundleFixes
-from spn_data.report.frame_errors import FlightErrors
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,6 @@ class RunFacts:
         Number of figures not shown.
     fixes : BundleFixes
         Without rows in an evaluation of several runs.
-    frame_errors : tuple of FlightErrors
     """
 
     name: str
@@ -124,4 +122,3 @@ class RunFacts:
     figures: tuple[Figure, ...]
     left_out: int = 0
     fixes: BundleFixes = field(default_factory=BundleFixes)
-    frame_errors: tuple[FlightErrors, ...] = ()

@@ -123,6 +123,8 @@ def test_wrong_points_leave_the_area_as_it_was(area: Path, tmp_path: Path) -> No
     result = run("georegister", "--area", area, *every, *OPTIONS)
     assert result.exit_code == 1
     assert "all of its 6 points that can be used are check points" in result.stderr
+    facts = (area / "area.toml").read_text(encoding="utf-8")
+    (area / "area.toml").write_text(facts.partition("[options]")[0], encoding="utf-8")
     result = run("georegister", "--area", area, "--check-points", "2")
     assert result.exit_code == 2
     assert "--check-points needs --gcp" in result.stderr

@@ -119,7 +119,7 @@ def test_add_extends_an_area_and_keeps_what_it_had(
     before = read_frames(old.folder(FRAMES) / "frames.csv")
     assert names.names[: len(before)].tolist() == before.names.tolist()
     assert set(names.sequences.tolist()) == {"flight1", "flight2"}
-    first_told = next(s for s in result.stdout.splitlines() if s.startswith("features: "))
+    first_told = next(s for s in result.stderr.splitlines() if s.startswith("features: "))
     kept = int(before.chosen.sum())
     assert int(first_told.split()[1]) == kept + 1, "only frames of the new flight are worked on"
     databases = [one.folder(MODEL) / "database.db" for one in (old, new)]

@@ -317,7 +317,9 @@ def test_every_option_of_import_is_documented():
     """docs/dataset.md lists every option with its default, and every pose list."""
     text = (Path(__file__).resolve().parents[3] / "docs" / "dataset.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^- `(--[a-z-]+)` \(([^)]*)\)", text, re.MULTILINE))
-    options = {p.opts[-1]: p for p in import_.params if p.opts[-1].startswith("--")}
+    options = {
+        p.opts[-1]: p for p in import_.params if p.opts[-1].startswith("--") and p.expose_value
+    }
     assert set(rows) == set(options)
     for flag, option in options.items():
         if option.show_default is True:

@@ -13,14 +13,14 @@ import pytest
 
 from spn_data.area.area import Area
 from spn_data.colmap.model import read_map
-from spn_data.errors import FormatError, InputError
+from spn_data.errors import FormatError
+from spn_data.geometry.pose import Poses
 from spn_data.inputs.area_labels import read_labelled_area
-from spn_data.inputs.frame_errors import read_frame_errors
 from spn_data.pipeline.area_photogrammetry import photogrammetry_of
 from spn_data.report.flight_charts import control_residuals, errors_over_time
-from spn_data.report.frame_errors import FlightErrors
 from spn_data.report.photogrammetry import photogrammetry
 from spn_data.report.photogrammetry_facts import Photogrammetry
+from spn_data.report.pictures import COARSE, TRACK, RunEstimates
 from tests.worlds import report_data
 
 
@@ -121,10 +121,14 @@ def test_runs_are_compared_over_the_time_of_a_flight() -> None:
     names = frames.names[frames.sequences == "medium"]
     errors = np.linspace(1, 3, len(names))
     lost = np.where(np.arange(len(names)) < 3, np.nan, 0.01)
-    methods = [FlightErrors("one", names, errors, errors), FlightErrors("two", names, lost, lost)]
+    poses, reasons = Poses.unknown(len(names)), np.full(len(names), "")
+    methods = [
+        RunEstimates("one", COARSE, names, poses, errors, errors, reasons),
+        RunEstimates("two", TRACK, names, poses, lost, lost, reasons),
+    ]
     position, rotation = errors_over_time(frames, "medium", methods, "m")
     assert f"one: {len(names)} frames, median 2" in position
-    assert f"two: {len(names) - 3} frames, median 0.01, 3 without a pose" in position
+    assert f"two, fixes: {len(names) - 3} frames, median 0.01, 3 without a pose" in position
     assert "rotation error (deg)" in rotation
     assert errors_over_time(frames, "flight1", methods, "m") == []
 
@@ -142,18 +146,3 @@ def test_surveyed_points_without_a_height_are_not_drawn() -> None:
     assert "1 control points: RMSE 0.020 m" in drawn
     assert "1 check points: RMSE 0.050 m" in drawn
     assert control_residuals(points[2:]) == ""
-
-
-def test_errors_of_frames_are_read_and_checked(tmp_path: Path) -> None:
-    """Rows of other methods are left out, unknown errors are NaN, and damage is named with its line."""
-    path = tmp_path / "errors.csv"
-    path.write_text("method,name,error,error_deg\nnet,a,1.5,3\nother,a,9,9\nnet,b,,\n")
-    (found,) = read_frame_errors(tmp_path, "net")
-    assert found.names.tolist() == ["a", "b"]
-    np.testing.assert_array_equal(found.error, [1.5, np.nan])
-    path.write_text("method,name,error,error_deg\nnet,a,-1,3\n")
-    with pytest.raises(InputError, match=r"errors\.csv:2: '-1' is not an error"):
-        read_frame_errors(tmp_path, "net")
-    path.write_text("method,name\nnet,a\n")
-    with pytest.raises(InputError, match="has no column 'error'"):
-        read_frame_errors(tmp_path, "net")
