@@ -11,6 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from spn_data.area.names import GROUND, THUMBNAILS
+
+_LEFT_OUT = (".lock", THUMBNAILS, GROUND)
 _TIMES = re.compile(
     r"(^|_)(seconds|started|finished|versions|threads|created)$"
     r"|^(train_s|validate_s|wait_s|ms_an_image|images_per_s|load_s|run_s|written|size_bytes)$"
@@ -21,11 +24,14 @@ _TEXT_TIMES = re.compile(
 
 
 def contents(folder: Path, skip: Callable[[str], bool] = lambda _: False) -> dict[str, str]:
-    """Return a digest for each file and folder below `folder` except lock files and `skip`, by its path."""
+    """Return a digest for each file and folder below `folder`, by its path.
+
+    Lock files, `skip` and pictures of the last report are left out: its page has them too.
+    """
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.name == ".lock" or skip(name):
+        if path.name in _LEFT_OUT or skip(name):
             continue
         found[name] = "folder" if path.is_dir() else _digest(path, folder)
     return found
