@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import console, options, told
+from spn_cli import console, options, output
 
 if TYPE_CHECKING:
     from spn_data.split.audit import AuditFinding
@@ -40,8 +40,8 @@ def show_findings(findings: tuple[AuditFinding, ...], *, shown: int | None = _SH
     """Print what the checks found, with its evidence, and how many passed."""
     from spn_data.split.audit import AuditVerdict, has_failed
 
-    told.figures(audit=findings)
-    all_shown = told.current().verbose
+    output.figures(audit=findings)
+    all_shown = output.current().verbose
     rows = []
     for finding in findings:
         if finding.verdict is AuditVerdict.PASS and not all_shown:

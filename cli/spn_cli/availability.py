@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 
 if TYPE_CHECKING:
     from spn_model.evaluation.availability import ExpectedFix
@@ -105,7 +105,7 @@ def availability(
         hashed = map_hash(map_folder(area))
         parts = expect_fixes(run, dataset, hashed, list(queries.values()), progress)
     found = dict(zip(queries, parts, strict=True))
-    told.figures(expected=found)
+    output.figures(expected=found)
     if waypoints is not None:
         _show_plan(found)
     else:
@@ -157,7 +157,7 @@ def _show_comparison(found: dict[str, list[ExpectedFix]], measured: dict[str, bo
         ]
         rows.append((name, *counts))
         pairs = {one.name: measured[one.name] for one in part if one.name in measured}
-        told.current().figures.setdefault("measured_usable", {})[name] = pairs
+        output.current().figures.setdefault("measured_usable", {})[name] = pairs
     console.table(
         "Frames that had a fix, by what was expected of the rendered view",
         rows,

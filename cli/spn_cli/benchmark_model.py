@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 from spn_data.area.names import DATASET, SPLIT
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def benchmark(
         else:
             costs = benchmark_on_frames(folder, frames, camera_file, wanted)
     graphs = {one.precision: {"file_mb": one.bytes / 1e6, **one.found} for one in costs}
-    told.figures(graphs=graphs)
+    output.figures(graphs=graphs)
     _show(costs)
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import click
 
-from spn_cli import told
+from spn_cli import output
 
 
 def add_common(command: click.Command) -> None:
@@ -37,7 +37,7 @@ def _options() -> list[click.Option]:
 
 def _ask(context: click.Context, option: click.Parameter, given: bool) -> None:
     """Note an option where it was given, before or after the name of the command."""
-    now = told.current()
+    now = output.current()
     assert option.name is not None
     if not given or getattr(now, option.name):
         return

@@ -23,7 +23,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 from rich.text import Text
 
-from spn_cli import told
+from spn_cli import output
 from spn_cli.group import raise_if_stopped
 from spn_data.work.timing import Progress
 
@@ -36,19 +36,19 @@ _SIGN_AFTER_S = 2.0  # without a terminal; what is over sooner needs no line in 
 
 def say(text: str, *, wrap: bool = True) -> None:
     """Print a sentence of the results; without `wrap`, in one line on a narrow terminal too."""
-    if not told.current().is_silent:
+    if not output.current().is_silent:
         _print(out, text, wrap=wrap)
 
 
-def tell(text: str) -> None:
+def step(text: str) -> None:
     """Print a line about the progress."""
-    if not told.current().quiet:
+    if not output.current().quiet:
         _print(err, text)
 
 
 def note(text: str) -> None:
     """Print a note, which `--quiet` leaves."""
-    asked = told.current()
+    asked = output.current()
     asked.notes.append(text)
     if not (asked.quiet and asked.as_json):
         console = err if asked.as_json else out
@@ -56,13 +56,13 @@ def note(text: str) -> None:
 
 
 def _print(console: Console, text: str | Text, *, wrap: bool = True) -> None:
-    told.current().has_shown = True
+    output.current().has_shown = True
     console.print(text, soft_wrap=not (wrap and console.is_terminal))
 
 
 def table(title: str, rows: Sequence[tuple[str, ...]], header: tuple[str, ...] = ()) -> None:
     """Print a table of texts; on a terminal, the first column is bold."""
-    if told.current().is_silent:
+    if output.current().is_silent:
         return
     if not out.is_terminal:
         _plain_table(title, [*([header] if header else []), *rows])
@@ -94,10 +94,10 @@ def _plain_table(title: str, rows: Sequence[tuple[str, ...]]) -> None:
 @contextmanager
 def working(what: str) -> Iterator[None]:
     """Show within the block that something is being done whose length is not known."""
-    if told.current().quiet:
+    if output.current().quiet:
         yield
     elif err.is_terminal:
-        told.current().has_shown = True
+        output.current().has_shown = True
         with err.status(Text(f"{what} ...")):
             yield
     else:
@@ -113,7 +113,7 @@ def working(what: str) -> Iterator[None]:
 @contextmanager
 def progress() -> Iterator[Progress]:
     """Show a bar with the remaining time for each step on a terminal, otherwise a line from time to time."""
-    if told.current().quiet:
+    if output.current().quiet:
         yield lambda *_: raise_if_stopped()
         return
     if not err.is_terminal:
@@ -127,7 +127,7 @@ def progress() -> Iterator[Progress]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    told.current().has_shown = True
+    output.current().has_shown = True
     with RichProgress(*columns, console=err, transient=False) as bars:
         tasks: dict[str, object] = {}
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spn_cli import console, options, page, told
+from spn_cli import console, options, output, page
 
 if TYPE_CHECKING:
     from spn_data.coverage.sequence_table import Coverage
@@ -114,7 +114,7 @@ def coverage(
         for name, each in found.by_name.items():
             _show(name, each, found)
         _show_stops(found, chosen["wanted"])
-        told.figures(coverage=read_coverage(area, found.folder.name))
+        output.figures(coverage=read_coverage(area, found.folder.name))
         console.say(f"Results of each frame: {found.folder}.")
         if fly_again is not None and found.fly_again is not None:
             write_csv(fly_again, found.stops)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 from spn_data.area.names import ERRORS, FIGURES, FIXES, METRICS
 
 
@@ -152,7 +152,7 @@ def evaluate(
     show_networks.comparison(evaluated.comparison)
     show_networks.fixes(evaluated)
     written = write_evaluation(evaluated, error_limits)
-    told.figures(runs={folder.name: load_json(folder / METRICS) for folder in written.folders})
+    output.figures(runs={folder.name: load_json(folder / METRICS) for folder in written.folders})
     for folder in written.folders:
         if formats:
             convert_figures(folder / FIGURES, dict.fromkeys(formats))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 
 FORMATS = (
     "tum",
@@ -73,7 +73,7 @@ def export(
     )
     with area.locked(), console.working(f"Writing {target}"):
         done = stage.export(area, stage.Format(format_name), target, chosen, overwrite=overwrite)
-    told.figures(written=target, **asdict(done))
+    output.figures(written=target, **asdict(done))
     rows = [(name, str(count)) for name, count in done.frames.items()]
     console.table("Poses", rows, ("sequence", "frames"))
     console.say(f"Written to {target}: {', '.join(done.formats)}.")

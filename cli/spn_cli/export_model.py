@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 from spn_data.area.names import DATASET, GEO, SPLIT
 
 _DEFAULT_MB = 10.0  # of landmarks
@@ -95,7 +95,7 @@ def export(
             target=target,
             overwrite=overwrite,
         )
-    told.figures(folder=exported.folder, bundle=exported.bundle)
+    output.figures(folder=exported.folder, bundle=exported.bundle)
     if exported.bundle is None:
         console.say(f"{exported.folder}: unchanged, made from the same network and options.")
     else:

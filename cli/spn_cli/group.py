@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from spn_cli import told
+from spn_cli import output
 from spn_cli.common_options import add_common
 from spn_cli.entry import STOPPED
 from spn_data.errors import SpnError
@@ -46,7 +46,7 @@ class Group(click.Group):
         except click.UsageError:
             raise
         except (click.ClickException, SpnError) as error:
-            told.figures(error=str(error))
+            output.figures(error=str(error))
             _print_json(ctx)
             raise
         except click.exceptions.Exit as ended:
@@ -62,17 +62,17 @@ class Group(click.Group):
             with _interruptible(), _first_sign(ctx):
                 return super().invoke(ctx)
         except SpnError as error:
-            if told.current().verbose:
+            if output.current().verbose:
                 raise
             is_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
             raise click.ClickException(f"{error}{_KEPT if is_full else ''}") from error
         except KeyboardInterrupt:
             click.echo(f"\n{STOPPED}", err=True)
-            told.figures(error=STOPPED)
+            output.figures(error=STOPPED)
             ctx.exit(128 + _stopped_by)
         except OSError as error:
             # Without a file name it is a bug, unless the disk refused a write.
-            if told.current().verbose or (error.filename is None and error.errno not in _DISK):
+            if output.current().verbose or (error.filename is None and error.errno not in _DISK):
                 raise
             # When a copy fills the disk, the second name is the file that could not be written.
             name = error.filename2 if error.errno in _DISK and error.filename2 else error.filename
@@ -85,7 +85,7 @@ class Group(click.Group):
 @contextmanager
 def _first_sign(ctx: click.Context) -> Iterator[None]:
     """Say that a command is at work if it has shown nothing after some seconds."""
-    asked = told.current()
+    asked = output.current()
 
     def show() -> None:
         if not (asked.has_shown or asked.quiet):
@@ -101,8 +101,8 @@ def _first_sign(ctx: click.Context) -> Iterator[None]:
 
 
 def _print_json(ctx: click.Context) -> None:
-    if told.current().as_json:
-        click.echo(told.current().to_json(f"{ctx.command_path} {ctx.invoked_subcommand}"))
+    if output.current().as_json:
+        click.echo(output.current().to_json(f"{ctx.command_path} {ctx.invoked_subcommand}"))
 
 
 _stop_wanted = False

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spn_cli import console, options, told
+from spn_cli import console, options, output
 
 
 @click.command(name="import")
@@ -72,7 +72,7 @@ def import_(
     )
     with console.progress() as progress:
         done = import_cambridge(folder, target, wanted, progress, overwrite=overwrite)
-    told.figures(written=target, frames=done.counts, with_focal=done.with_focal)
+    output.figures(written=target, frames=done.counts, with_focal=done.with_focal)
     frames = ", ".join(f"{name} {count}" for name, count in done.counts.items())
     what = "images" if done.has_images else "poses without images"
     console.say(f"{target}: {what}: {frames}; {done.with_focal} with a known focal length.")

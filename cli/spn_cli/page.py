@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spn_cli import console, told
+from spn_cli import console, output
 from spn_data.area.area import Area
 from spn_data.area.names import FRAMES, REPORT
 from spn_data.errors import InUseError, SpnError
@@ -88,9 +88,9 @@ def show_verdict(verdict: AreaVerdict, area: Area, path: Path | None = None) -> 
     """Print the verdict, the page with its reasons if it was written, and the next step."""
     from spn_data.report.area_verdict import DATA
 
-    told.figures(verdict={name: _sentence(said, area) for name, said in verdict.parts()})
+    output.figures(verdict={name: _sentence(said, area) for name, said in verdict.parts()})
     if path is not None:
-        told.figures(report=path)
+        output.figures(report=path)
     for name, said in verdict.parts():
         text = _sentence(said, area)
         if path is not None and name == DATA:
@@ -110,7 +110,7 @@ def show_next(step: VerdictReason, area: Area) -> None:
     """Print the next step: one line that can be typed in the current folder."""
     command = _command(step.command, area)
     words = f"Next: {step.do}{': ' if step.do and command else ''}{command}"
-    told.figures(next={"do": step.do, "command": command})
+    output.figures(next={"do": step.do, "command": command})
     console.say(words, wrap=False)
 
 

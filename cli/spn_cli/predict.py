@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spn_cli import completion, console, options, told
+from spn_cli import completion, console, options, output
 
 if TYPE_CHECKING:
     from spn_model.prediction.predict import Predicted
@@ -176,7 +176,7 @@ def predict(
 def _show(found: Predicted) -> None:
     counts = found.counts
     total = sum(counts.values())
-    told.figures(
+    output.figures(
         written=found.folder,
         frames=counts,
         without_pose=dict(found.reasons),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-from spn_cli import console, show_labels, told
+from spn_cli import console, output, show_labels
 from spn_data.area.area import Area
 from spn_data.area.names import (
     CHECKPOINT,
@@ -201,7 +201,7 @@ def georegistration(record: StageRecord) -> None:
 
 def surveyed(points: Sequence[Mapping[str, Any]]) -> None:
     """Print the residuals of surveyed points, and their RMSE beside what is stated."""
-    told.figures(points=points)
+    output.figures(points=points)
     rows = []
     for point in points:
         role = f"{point['role']} (left out)" if point["is_outlier"] else point["role"]
@@ -219,7 +219,7 @@ def surveyed(points: Sequence[Mapping[str, Any]]) -> None:
 
 def _rmse(points: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the RMSE east, north and up of points, and the RMS of their stated sigmas."""
-    told = []
+    by_axis = []
     for k, axis in enumerate(("east", "north", "up")):
         pairs = [
             (p["residual_m"][k], p["sigma_m"][k]) for p in points if p["residual_m"][k] is not None
@@ -228,8 +228,8 @@ def _rmse(points: Sequence[Mapping[str, Any]]) -> list[str]:
             found, stated = (
                 math.sqrt(sum(v * v for v in col) / len(pairs)) for col in zip(*pairs, strict=True)
             )
-            told.append(f"{axis} RMSE {found:.3f} m (stated {stated:.3f} m)")
-    return told
+            by_axis.append(f"{axis} RMSE {found:.3f} m (stated {stated:.3f} m)")
+    return by_axis
 
 
 def _signed(value: float | None) -> str:
@@ -260,7 +260,7 @@ def status(area: Area) -> None:
             f"{area.root.resolve()} is not an area; create one with spn-data reconstruct VIDEO --area AREA"
         )
     rows = []
-    stages = told.current().figures.setdefault("stages", {})
+    stages = output.current().figures.setdefault("stages", {})
     for stage in (*STAGES, *(s for s in area.stages() if s not in STAGES)):
         if not area.has(stage):
             state = _UNFINISHED if area.partial(stage).exists() else "missing"
@@ -277,7 +277,7 @@ def status(area: Area) -> None:
         rows.append((stage, state, holds, record.finished))
         show_labels.add_stage(record, state=state)
     runs = [_run(area, name) for name in area.sequences(RUNS)]
-    told.figures(area=area.root.resolve(), runs={name: state for name, state, _, _ in runs})
+    output.figures(area=area.root.resolve(), runs={name: state for name, state, _, _ in runs})
     rows += runs
     console.table(f"Area {area.root.resolve()}", rows, ("stage", "state", "holds", "made (UTC)"))
     if area.has_unfinished_addition():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from spn_cli import console, told
+from spn_cli import console, output
 from spn_data.area.names import EVALUATION, SPLIT, TRACKED
 from spn_data.storage.stage_record import StageRecord
 
@@ -17,9 +17,9 @@ def evaluation(record: StageRecord, unit: str) -> None:
         [
             ("registered", f"{_share(c['registered'], c['frames'])} frames"),
             *((f"failed: {kind}", f"{n} frames") for kind, n in c["failed"].items()),
-            ("lens", f"{c['focal_px']:.1f} px, {c['fov_deg']:.1f} deg wide"),
             *(
                 [
+                    ("lens", f"{c['focal_px']:.1f} px, {c['fov_deg']:.1f} deg wide"),
                     ("map points per frame", f"{c['inliers']:.0f} (median)"),
                     ("residual", f"{c['error_px']:.2f} px (median of RMS)"),
                     (
@@ -63,7 +63,7 @@ def summary(record: StageRecord) -> str:
 
 def add_stage(record: StageRecord, **more: Any) -> None:
     """Add a stage to the object of `--json`."""
-    known = told.current().figures.setdefault("stages", {})
+    known = output.current().figures.setdefault("stages", {})
     known[record.stage] = {
         **more,
         "counts": record.counts,

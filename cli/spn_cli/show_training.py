@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from spn_cli import console, told
+from spn_cli import console, output
 
 if TYPE_CHECKING:
     from spn_model.training.recipe import Recipe
@@ -44,7 +44,7 @@ class TrainingDisplay:
         self._validated: list[tuple[str, ...]] = []
         self._status = "Preparing the training images."
         self._printed = -_PLAIN_EVERY_S
-        live = self._shows and console.err.is_terminal and not told.current().quiet
+        live = self._shows and console.err.is_terminal and not output.current().quiet
         self._live = Live(console=console.err, refresh_per_second=4) if live else None
 
     @contextmanager
@@ -63,7 +63,7 @@ class TrainingDisplay:
         if self._live is None:
             yield
             return
-        told.current().has_shown = True
+        output.current().has_shown = True
         self._live.start()
         self._live.update(self._table())
         try:
@@ -92,7 +92,7 @@ class TrainingDisplay:
     def say(self, text: str) -> None:
         """Print a line."""
         if self._shows:
-            console.tell(text)
+            console.step(text)
 
     def row(self, values: Mapping[str, Any]) -> None:
         """Show a row of the log, see `spn_model.training.training_record.Watch`."""
@@ -143,7 +143,7 @@ class TrainingDisplay:
 
 def errors_table(facts: Mapping[str, Any], unit: str) -> None:
     """Print errors of the kept checkpoint and of the last network, and the time of the training."""
-    told.figures(units=unit, training=facts)
+    output.figures(units=unit, training=facts)
     rows = []
     for title, found in (("kept", facts["kept"]), ("at the end", facts["latest"])):
         for event, name in _NAMES.items():

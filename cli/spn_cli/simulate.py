@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from spn_cli import console, told
+from spn_cli import console, output
 from spn_data.simulate.gnss import GnssOptions
 from spn_data.simulate.presets import MappingPaths
 from spn_data.simulate.presets import preset as named
@@ -42,7 +42,7 @@ def run(
     with console.progress() as progress:
         simulate(out, options, lambda done, total: progress("rendering", done, total))
     lens = options.mapping_lens.fov_deg
-    told.figures(written=out, fov_deg=lens)
+    output.figures(written=out, fov_deg=lens)
     console.say(f"{out}: videos in mapping/ and evaluation/, exact ground truth in truth/.")
     console.say(
         f"Next: spn-data reconstruct {out / 'mapping'} --area AREA --fov {lens:g}", wrap=False

@@ -28,7 +28,7 @@ def telemetry(file: Path, target: Path) -> None:
     """
     import numpy as np
 
-    from spn_cli import console, told
+    from spn_cli import console, output
     from spn_data.errors import InputError
     from spn_data.telemetry.read import read_telemetry
     from spn_data.telemetry.table import write_track
@@ -39,7 +39,7 @@ def telemetry(file: Path, target: Path) -> None:
         track = read_telemetry(file)
     write_track(target, track)
     angles = int(np.isfinite(track.gimbal_deg[:, 1:]).all(axis=1).sum())
-    told.figures(
+    output.figures(
         kind=track.kind,
         records=len(track),
         with_position=track.has_fix.sum(),

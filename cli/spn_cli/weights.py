@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from spn_cli import console, told
+from spn_cli import console, output
 
 
 @click.group(invoke_without_command=True)
@@ -24,7 +24,7 @@ def weights(context: click.Context) -> None:
     from spn_model.pretrained.weights import CATALOGUE, cache_folder, state
 
     rows = []
-    told.figures(
+    output.figures(
         weights=[{**asdict(entry), "state": state(entry)} for entry in CATALOGUE],
         folder=cache_folder(),
     )
@@ -52,5 +52,5 @@ def fetch(name: str) -> None:
     entry = by_name(name)
     with console.progress() as progress:
         path = download(entry, progress)
-    told.figures(written=path)
+    output.figures(written=path)
     console.say(f"{path}: {entry.holds}; {entry.licence}.")

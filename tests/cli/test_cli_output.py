@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner
-from spn_cli import console, group, told
+from spn_cli import console, group, output
 from spn_cli.data import main
 from spn_cli.group import Group
 from spn_cli.model import main as model_main
@@ -37,7 +37,7 @@ def work(fail: bool) -> None:
     console.table(
         "Found", [("first", LONG, "end"), ("second", "", "end")], ("name", "what", "last")
     )
-    told.figures(errors_m=np.array([1.5, math.nan]), worst_m=math.inf, frames=np.int64(3))
+    output.figures(errors_m=np.array([1.5, math.nan]), worst_m=math.inf, frames=np.int64(3))
     console.say(f"A sentence of {LONG}.")
     console.note("look here")
     if fail:

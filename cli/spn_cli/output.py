@@ -13,11 +13,11 @@ import numpy as np
 
 from spn_data.storage.json_files import finite
 
-_KEY = "spn_cli.told"
+_KEY = "spn_cli.output"
 
 
 @dataclass
-class Told:
+class Output:
     """What a command was asked to print, and its results so far."""
 
     verbose: bool = False
@@ -38,12 +38,12 @@ class Told:
         return json.dumps(finite(found), indent=1, allow_nan=False, default=_plain)
 
 
-def current() -> Told:
+def current() -> Output:
     """Return what the running command was asked to print."""
     context = click.get_current_context(silent=True)
     if context is None:
-        return Told()
-    found: Told = context.meta.setdefault(_KEY, Told())
+        return Output()
+    found: Output = context.meta.setdefault(_KEY, Output())
     return found
 
 
