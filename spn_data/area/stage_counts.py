@@ -20,6 +20,7 @@ COUNT, KNOWN, NUMBER, TEXT, FLAG = (
 )
 _MAX_COUNT = 10**15
 _COUNTS_BY_NAME = {"*": COUNT}
+_OF_REGISTERED = ("focal_px", "fov_deg", "inliers", "error_px", "sigma", "sigma_deg")
 
 _KINDS: dict[str, dict[str, Any]] = {
     FRAMES: dict.fromkeys(("chosen", "candidates", "sequences", "with_fix", "unreadable"), COUNT),
@@ -51,8 +52,7 @@ _KINDS: dict[str, dict[str, Any]] = {
     },
     EVALUATION: {
         **dict.fromkeys(("registered", "frames"), COUNT),
-        **dict.fromkeys(("focal_px", "fov_deg"), KNOWN),
-        **dict.fromkeys(("inliers", "error_px", "sigma", "sigma_deg"), NUMBER),
+        **dict.fromkeys(_OF_REGISTERED, NUMBER),
         "failed": _COUNTS_BY_NAME,
         "gnss": {
             "contradicts": FLAG,
@@ -74,7 +74,6 @@ _KINDS: dict[str, dict[str, Any]] = {
     },
 }
 _MAY_BE_NULL = ("gnss",)
-_OF_REGISTERED = ("inliers", "error_px", "sigma", "sigma_deg")
 
 
 def check_counts(stage: str, counts: Mapping[str, Any]) -> None:
