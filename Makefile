@@ -33,7 +33,7 @@ demo: $(VENV)/installed
 	$(BIN)/python benchmarks/labels.py $(DEMO)/area $(DEMO)/flights
 	$(BIN)/spn-model train --area $(DEMO)/area --minutes 2 --validations 2
 	$(BIN)/spn-model export --run default --area $(DEMO)/area
-	$(BIN)/spn-model evaluate --run default --area $(DEMO)/area
+	$(BIN)/spn-model evaluate --run default --no-attitude --area $(DEMO)/area
 	$(BIN)/spn-model benchmark --run default --area $(DEMO)/area
 	$(BIN)/spn-onboard fly $(DEMO)/area/runs/default/bundle $(DEMO)/flights/evaluation/medium.mp4 \
 		--camera $(DEMO)/area/4-eval/medium/camera.json --to $(DEMO)/fixes.jsonl
