@@ -20,6 +20,7 @@ from spn_data.telemetry.track import Telemetry
 _MIN_FIXES = 5
 _DOUBTFUL_FOCAL = 0.01  # relative error of the map's focal length, from which a witness is of use
 _FAR_FIX, _FAR_SCATTER = 5.0, 10.0  # standard deviations of a fix; median distances
+_FAR_RUN = 3  # frames in a row
 _CONTRADICTION = 3.0  # standard deviations of the offset, from GNSS and georegistration
 
 
@@ -42,7 +43,8 @@ class GnssCheck:
     max_h_m : float
         Largest horizontal distance.
     far : int
-        Number of frames farther than `far_limit_m` from the median offset, horizontally.
+        Number of frames farther than `far_limit_m` from the median offset, horizontally, without those that
+        are fewer than three in a row: such are the outliers of a receiver.
     far_limit_m : float
         Five standard deviations of a fix about the error that all fixes of a flight share, or ten of the
         distances found.
@@ -166,12 +168,19 @@ def check_gnss(
         if offset_u is None
         else round(float(np.median(np.abs(vertical - offset_u))), 4),
         max_h_m=round(float(horizontal.max()), 4),
-        far=int((horizontal > far_limit_m).sum()),
+        far=_count_in_runs(horizontal > far_limit_m),
         far_limit_m=round(far_limit_m, 4),
         sigma_h_m=round(sigma_h, 4),
         sigma_v_m=None if sigma_v is None else round(sigma_v, 4),
         contradicts=bool(too_far),
     )
+
+
+def _count_in_runs(mask: np.ndarray) -> int:
+    """Return the number of true elements (N,) that are at least three in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    lengths = edges[1::2] - edges[::2]
+    return int(lengths[lengths >= _FAR_RUN].sum())
 
 
 def focal_witness_notes(
