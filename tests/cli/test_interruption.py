@@ -145,6 +145,7 @@ def test_a_killed_mapper_is_told_in_one_line_and_the_next_run_finishes(
 ) -> None:
     """A killed mapping process is reported in one line, and the next run finishes."""
     run = start()
+    run.wait_for("mapping")
     os.kill(member(run, "spn_data.colmap.mapping"), signal.SIGKILL)
     assert run.process.wait(30) == 1
     errors = [line for line in run.output.splitlines() if line.startswith("Error")]
