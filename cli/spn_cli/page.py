@@ -61,12 +61,12 @@ def complete_cards(verdict: AreaVerdict | None, folders: Mapping[str, Path]) -> 
                 console.note(f"the model card of {run} was not completed: {error}")
 
 
-def open_in_browser(path: Path) -> None:
+def open_in_browser(address: str) -> None:
     """Open a page in the default browser; say so if none can be started."""
     import webbrowser
 
-    if not webbrowser.open(path.resolve().as_uri()):
-        console.note(f"no browser could be started; open {path.resolve()} in one")
+    if not webbrowser.open(address):
+        console.note(f"no browser could be started; open {address} in one")
 
 
 def show_judgement(area: Area) -> None:

@@ -55,7 +55,7 @@ def report(
 
     area = options.open_area(area_folder)
     if serve:
-        _serve(area, port)
+        _serve(area, port, open_it=open_it)
         return
     with area.locked(), console.working("Writing the page"):
         path, verdict = write_report(
@@ -63,15 +63,18 @@ def report(
         )
     page.show_verdict(verdict, area, path)
     if open_it:
-        page.open_in_browser(path)
+        page.open_in_browser(path.resolve().as_uri())
 
 
-def _serve(area: Area, port: int) -> None:
+def _serve(area: Area, port: int, *, open_it: bool) -> None:
     """Serve the state of the area until Ctrl-C."""
     from spn_cli.serve import LOOPBACK, AreaServer
 
     with AreaServer(area, port) as running:
-        console.say(f"http://{LOOPBACK}:{running.server_port}/ (Ctrl-C ends it)", wrap=False)
+        address = f"http://{LOOPBACK}:{running.server_port}/"
+        console.say(f"{address} (Ctrl-C ends it)", wrap=False)
+        if open_it:
+            page.open_in_browser(address)
         try:
             running.serve_forever()
         except KeyboardInterrupt:

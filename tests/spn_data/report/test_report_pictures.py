@@ -245,9 +245,9 @@ def test_the_page_is_opened_in_the_browser_of_the_user(tmp_path, monkeypatch, ca
     program.write_text(f'#!/bin/sh\necho "$1" > {seen}\n')
     program.chmod(0o755)
     monkeypatch.setenv("BROWSER", str(program))
-    page.open_in_browser(tmp_path / "a b.html")
+    page.open_in_browser((tmp_path / "a b.html").as_uri())
     assert seen.read_text().strip() == (tmp_path / "a b.html").as_uri()
     assert capfd.readouterr().out == ""
     monkeypatch.setattr(webbrowser, "open", lambda address: False)
-    page.open_in_browser(tmp_path / "a b.html")
+    page.open_in_browser((tmp_path / "a b.html").as_uri())
     assert "no browser could be started" in capfd.readouterr().out
