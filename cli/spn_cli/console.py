@@ -6,7 +6,6 @@ standard output, progress to standard error. Without a terminal nothing is wrapp
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -101,13 +100,8 @@ def working(what: str) -> Iterator[None]:
         with err.status(Text(f"{what} ...")):
             yield
     else:
-        timer = threading.Timer(_SIGN_AFTER_S, lambda: _print(err, f"{what} ..."))
-        timer.daemon = True
-        timer.start()
-        try:
+        with output.after(_SIGN_AFTER_S, lambda: _print(err, f"{what} ...")):
             yield
-        finally:
-            timer.cancel()
 
 
 @contextmanager

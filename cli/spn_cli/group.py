@@ -91,13 +91,8 @@ def _first_sign(ctx: click.Context) -> Iterator[None]:
         if not (asked.has_shown or asked.quiet):
             click.echo(f"{ctx.invoked_subcommand}: reading and checking its input ...", err=True)
 
-    timer = threading.Timer(_SIGN_AFTER_S, show)
-    timer.daemon = True
-    timer.start()
-    try:
+    with output.after(_SIGN_AFTER_S, show):
         yield
-    finally:
-        timer.cancel()
 
 
 def _print_json(ctx: click.Context) -> None:

@@ -93,8 +93,8 @@ def convert(drawing: str, formats: Iterable[str]) -> dict[str, bytes]:
     with matplotlib.rc_context({"pdf.fonttype": 42}):  # text stays text
         for name in formats:
             buffer = BytesIO()
-            told = {"CreationDate": None} if name == "pdf" else {}
-            figure.savefig(buffer, format=name, dpi=_DPI, metadata=told)
+            metadata = {"CreationDate": None} if name == "pdf" else {}
+            figure.savefig(buffer, format=name, dpi=_DPI, metadata=metadata)
             found[name] = buffer.getvalue()
     return found
 

@@ -1,4 +1,4 @@
-"""Operations on rows that belong to groups."""
+"""Operations on rows that belong to groups, and on runs of rows."""
 
 from __future__ import annotations
 
@@ -26,3 +26,19 @@ def rank_within_group(group: np.ndarray, count: int) -> np.ndarray:
     rank = np.empty(len(group), dtype=np.int64)
     rank[order] = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     return rank
+
+
+def runs_of(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the runs of true elements of a mask begin and end.
+
+    Parameters
+    ----------
+    mask : ndarray, shape (N,), bool
+
+    Returns
+    -------
+    starts, ends : ndarray, shape (R,)
+        Of each run: its first element, and the one behind its last.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]

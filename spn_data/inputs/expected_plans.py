@@ -10,7 +10,7 @@ from spn_data.area.names import BUNDLE, BUNDLE_FACTS, EXPECTED, RUNS
 from spn_data.errors import FormatError
 from spn_data.inputs.network_runs import bundle_facts
 from spn_data.report.expected import ExpectedPlan
-from spn_data.storage.json_files import read_json, reporting_damage
+from spn_data.storage.json_files import read_json, reporting_damage, text_of
 
 _MAX_RUNS, _MAX_ROWS, _MAX_TEXT, _MAX_COUNT = 50, 200, 300, 10**9
 
@@ -66,9 +66,7 @@ def _read(path: Path, run: str) -> ExpectedPlan:
 
 
 def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} instead of text")
-    return value[:_MAX_TEXT]
+    return text_of(value, _MAX_TEXT)
 
 
 def _count(value: Any) -> int:

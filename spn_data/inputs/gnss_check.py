@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spn_data.geometry.geodesy import GeoOrigin, HeightReference
+from spn_data.geometry.grouping import runs_of
 from spn_data.georegistration.georegister_options import (
     RELATIVE_HEIGHT_BIAS_M,
     default_bias_m,
@@ -178,8 +179,8 @@ def check_gnss(
 
 def _count_in_runs(mask: np.ndarray) -> int:
     """Return the number of true elements (N,) that are at least three in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    lengths = edges[1::2] - edges[::2]
+    starts, ends = runs_of(mask)
+    lengths = ends - starts
     return int(lengths[lengths >= _FAR_RUN].sum())
 
 

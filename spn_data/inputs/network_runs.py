@@ -26,7 +26,7 @@ from spn_data.report.fix_facts import BundleFixes, FixFigures
 from spn_data.report.network_state import NetworkState
 from spn_data.report.run_facts import Figure, MethodErrors, NetworkFacts, RunFacts
 from spn_data.storage.fingerprints import content_fingerprint
-from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json
+from spn_data.storage.json_files import DAMAGE, finite_or_none, load_json, text_of
 
 _VERSION = 1  # format of metrics.json
 _MAX_BYTES = 20_000_000
@@ -285,9 +285,7 @@ def _reading_order(path: Path) -> tuple[bool, str, int, str]:
 
 
 def _text(value: Any, most: int = _MAX_TEXT) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} instead of text")
-    return value[:most]
+    return text_of(value, most)
 
 
 def _number(value: Any) -> float | None:

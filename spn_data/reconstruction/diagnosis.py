@@ -8,6 +8,7 @@ import numpy as np
 
 from spn_data.colmap.database import MapDatabase
 from spn_data.colmap.model import MapObservations, Scene
+from spn_data.geometry.grouping import runs_of
 from spn_data.reconstruction.correspondences import FramesToMap
 
 
@@ -105,9 +106,8 @@ def missing_passages(
     for sequence in dict.fromkeys(sequences.tolist()):
         rows = np.flatnonzero(sequences == sequence)
         missing = np.array([not registrations[i].registered for i in rows])
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
-        for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-            run = rows[first : last + 1]
+        for start, end in zip(*runs_of(missing), strict=True):
+            run = rows[start:end]
             reasons = [registrations[i].reason for i in run]
             common = max(set(reasons), key=reasons.count)
             sentences.append(

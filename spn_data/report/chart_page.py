@@ -28,8 +28,8 @@ def chart(height: float, label: str, parts: Iterable[str], note: str = "") -> st
     drawn = svg.document(WIDTH, height, label, parts)
     for colour, of_theme in _THEME.items():
         drawn = drawn.replace(f'"{colour}"', f'"{of_theme}"')
-    told = f'<figcaption class="note">{escape(note)}</figcaption>' if note else ""
-    return f'<figure style="min-width:0;max-width:560px"><h3>{escape(label)}</h3>{drawn}{told}</figure>'
+    caption = f'<figcaption class="note">{escape(note)}</figcaption>' if note else ""
+    return f'<figure style="min-width:0;max-width:560px"><h3>{escape(label)}</h3>{drawn}{caption}</figure>'
 
 
 def side_by_side(charts: Iterable[str]) -> str:

@@ -38,8 +38,8 @@ def vertical_residuals(frames: FrameTable) -> str:
             parts.append(f'<g opacity="{opacity:g}">{drawn}</g>')
         rmse = float(np.sqrt(np.mean(frames.gnss_m[used, 2] ** 2))) if len(used) else np.nan
         left_out = f", {len(outliers)} outliers (pale)" if len(outliers) else ""
-        told = f", RMSE {rmse:.2f} m" if len(used) else ""
-        entries.append((f"{name}: {len(used)} fixes{told}{left_out}", colour))
+        rmse_text = f", RMSE {rmse:.2f} m" if len(used) else ""
+        entries.append((f"{name}: {len(used)} fixes{rmse_text}{left_out}", colour))
         markers.append(marker)
     return _with_legend("Vertical residuals of GNSS", parts, entries, markers)
 

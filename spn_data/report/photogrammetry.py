@@ -113,15 +113,15 @@ def _correlation(value: float) -> str:
 
 def _explained(lenses: Sequence[LensFacts]) -> str:
     """Return what the tables say, and which lenses have nothing stored."""
-    told = (
+    explanation = (
         "Standard deviations and correlations of the adjusted parameters, errors of the lens model included; "
         f"correlations of {_STRONG:g} or more are bold. The sigma of the principal point of a mapping camera "
         "comes from the residuals, and has no correlations."
     )
     without = ", ".join(one.key for one in lenses if one.calibration is None)
     if without:
-        told += (
+        explanation += (
             f" Nothing is stored for {without}: the lens was held, its frames have no covariance, or an "
             "earlier version made them; run spn-data reconstruct, or register, again to get it."
         )
-    return f'<p class="note">{escape(told)}</p>'
+    return f'<p class="note">{escape(explanation)}</p>'

@@ -114,6 +114,13 @@ def finite_or_none(value: float | np.floating[Any]) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def text_of(value: Any, most: int) -> str:
+    """Return the first characters of a text read from JSON; raise TypeError for anything else."""
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} instead of text")
+    return value[:most]
+
+
 def number_or(value: float | None, unknown: float = math.nan) -> float:
     """Return a number read from JSON as a float, or `unknown` for null; raise TypeError for anything else."""
     if value is None:

@@ -109,8 +109,8 @@ def histograms(
                 parts.append(svg.line(ends, INK, dash="4 3"))
             missing = one.summary.frames - one.summary.located
             of = unit if column == 0 else "deg"
-            told = f"median {median:.2f} {of}" if np.isfinite(median) else "no median"
-            caption = f"{len(one.frames)} frames: {told}"
+            middle = f"median {median:.2f} {of}" if np.isfinite(median) else "no median"
+            caption = f"{len(one.frames)} frames: {middle}"
             caption += f", {bars[-1]} beyond {edge:g}" if bars[-1] else ""
             caption += f", {missing} without a pose" if missing else ""
             parts.append(

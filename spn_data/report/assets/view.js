@@ -105,10 +105,10 @@ function makeView(onPick, onEstimates) {
     for (const layer of all()) if (on.has(layer.label)) layer.on = on.get(layer.label);
     pick(marked, false);
     legend();
-    told();
+    describeEstimates();
   }
 
-  function told() {
+  function describeEstimates() {
     if (!chosenEstimates) { document.getElementById("estimated").textContent = ""; return; }
     const n = chosenEstimates.row.length, none = n - guessed.shown - guessed.far;
     document.getElementById("estimated").textContent = `${chosenEstimates.label}: ${guessed.shown} estimates of ${n} frames are drawn`
@@ -207,7 +207,7 @@ function makeView(onPick, onEstimates) {
   reset();
   document.getElementById("legend").open = canvas.clientWidth > 500;  // it would hide the map on a phone
   legend();
-  told();
+  describeEstimates();
   draw();
   // Where a frame and its estimate are on the canvas, for tests.
   function placeOf(name) {
