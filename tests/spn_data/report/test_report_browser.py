@@ -35,11 +35,21 @@ HARMLESS = ("GL Driver Message",)
 # Runs in the page after its own script and writes its measurements into the document.
 PROBE = """<script>
 const found = {};
-const pixels = canvas => {
+const bytes = canvas => {
   const flat = document.createElement("canvas");
   flat.width = canvas.width; flat.height = canvas.height;
   flat.getContext("2d").drawImage(canvas, 0, 0);
-  const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+  return flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+};
+const countInView = isWanted => {
+  window.spnReport.view.draw();
+  const data = bytes(document.getElementById("view"));
+  let n = 0;
+  for (let k = 0; k < data.length; k += 4) n += isWanted(data[k], data[k + 1], data[k + 2]);
+  return n;
+};
+const pixels = canvas => {
+  const data = bytes(canvas);
   const colors = new Map();
   for (let k = 0; k < data.length; k += 4) {
     const color = data[k] << 16 | data[k + 1] << 8 | data[k + 2];
@@ -325,16 +335,7 @@ def test_estimates_are_drawn_joined_to_the_truth(tmp_path):
         found.choices = [...select.options].map(option => option.textContent);
         found.layers = [...document.querySelectorAll("#legend label")]
           .filter(l => l.querySelector("input").checked).map(l => l.textContent);
-        const red = () => {
-          window.spnReport.view.draw();
-          const view = document.getElementById("view"), flat = document.createElement("canvas");
-          flat.width = view.width; flat.height = view.height;
-          flat.getContext("2d").drawImage(view, 0, 0);
-          const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
-          let n = 0;
-          for (let k = 0; k < data.length; k += 4) n += data[k] === 0xd1 && data[k + 1] === 0x22;
-          return n;
-        };
+        const red = () => countInView((r, g) => r === 0xd1 && g === 0x22);
         const choose = value => { select.value = value; select.dispatchEvent(new Event("change")); };
         const off = () => column(heads().findIndex(h => h.textContent.startsWith("estimate off, m")));
         const search = document.querySelector("#table input");
@@ -381,16 +382,7 @@ def test_the_ground_is_drawn_below_the_map(tmp_path):
         tmp_path,
         render(data, pictures=replace(pictures(data), ground=ground)),
         """
-        const green = () => {
-          window.spnReport.view.draw();
-          const view = document.getElementById("view"), flat = document.createElement("canvas");
-          flat.width = view.width; flat.height = view.height;
-          flat.getContext("2d").drawImage(view, 0, 0);
-          const data = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
-          let n = 0;
-          for (let k = 0; k < data.length; k += 4) n += data[k] < 9 && data[k + 1] > 246 && data[k + 2] < 9;
-          return n;
-        };
+        const green = () => countInView((r, g, b) => r < 9 && g > 246 && b < 9);
         found.on = green();
         const label = [...document.querySelectorAll("#legend label")].find(l => l.textContent === "ground");
         label.querySelector("input").click();
