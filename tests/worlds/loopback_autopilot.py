@@ -25,6 +25,7 @@ class Autopilot:
         self.messages: list = []
         self.exchanges_us: list = []
         self.type = 3
+        self.peer: tuple[str, int] | None = None
 
     def clock_us(self):
         """Return its time since boot."""
@@ -38,6 +39,7 @@ class Autopilot:
                 data, peer = self.socket.recvfrom(4096)
             except TimeoutError:
                 continue
+            self.peer = peer
             self.answer(peer, self.link.timesync_encode(0, self.clock_us() * 1000))
             self.answer(peer, self.link.heartbeat_encode(2, self.type, 0, 0, 4))
             self.socket.sendto(b"\xfd\xff noise that is no message", peer)

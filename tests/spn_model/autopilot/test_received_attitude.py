@@ -102,6 +102,12 @@ def test_what_states_no_attitude_now_is_refused(of, message, offset, told):
     assert found.is_silent(NOW)
 
 
+def asked(autopilot) -> set[int]:
+    """Return the kinds of messages that an autopilot was asked to send regularly."""
+    commands = [m for m in autopilot.messages if m.get_type() == "COMMAND_LONG"]
+    return {int(m.param1) for m in commands if m.command == 511}
+
+
 def test_it_comes_over_a_link_at_the_times_of_images():
     """Over loopback: asked for, stamped by TIMESYNC although the clocks differ, ignored from others."""
     autopilot = Autopilot()
@@ -109,7 +115,7 @@ def test_it_comes_over_a_link_at_the_times_of_images():
     autopilot.clock_us = lambda: unix_us() - boot_us
     link = open_link("ardupilot", autopilot.url, mounting=Mounting(), datum=DATUM, attitude_of=BODY)
     autopilot.listen(10, until=lambda: link.report().offset_us is not None)
-    peer = autopilot.socket.recvfrom(4096)[1]
+    peer = autopilot.peer
     stranger = common.MAVLink(None, 9, 1)
     image_us, end = 0, time.monotonic() + 10
     while link.attitude.taken < 2 and time.monotonic() < end:
@@ -121,6 +127,7 @@ def test_it_comes_over_a_link_at_the_times_of_images():
         )
         image_us = boot_us + now_ms * 1000
         autopilot.listen(0.05)
+    autopilot.listen(10, until=lambda: asked(autopilot) == {30, 31})
     live = LiveAttitude(
         link.attitude, of=BODY, mounting=None, body_from_camera=np.eye(3), sigma_deg=1.0
     )
@@ -130,8 +137,7 @@ def test_it_comes_over_a_link_at_the_times_of_images():
     assert found.up == pytest.approx(UP, abs=1e-5)
     assert found.sigma_deg == pytest.approx(1.0, abs=0.1)
     assert "received for 1 of 2 images" in live.coverage(1, 2)
-    asked = [m for m in autopilot.messages if m.get_type() == "COMMAND_LONG" and m.command == 511]
-    assert {int(m.param1) for m in asked} == {30, 31}
+    assert asked(autopilot) == {30, 31}
 
 
 @pytest.mark.parametrize("of", ["gimbal", "camera", "body"])
