@@ -16,6 +16,9 @@ SHORT_IMAGES = 30_000
 LEAST_USABLE = 0.5  # share of usable fixes below which a flight is not to be flown on them
 MAX_MISLEADING = 0.05  # upper bound of their share above which too few images were compared
 _LONG_MINUTES = 30
+# What half an hour of the default recipe processes on two cores with bfloat16; others need longer for it.
+_LONG_IMAGES = 345_000
+_SCENE_COORDINATES = "scene-coordinates"
 _COARSE, _SEARCH, _TRACK = "coarse", "search", "track"
 _MEAN = "mean"  # first word of the baseline
 
@@ -157,12 +160,17 @@ def _longer(state: NetworkState, facts: RunFacts) -> tuple[str, str]:
     shown = f"it has seen {network.images:,} images in {network.minutes:.1f} min"
     if network.images >= SHORT_IMAGES:
         return f"Train longer or by another recipe ({shown}), and map what the flights see", ""
-    # Under another name: this one may have a bundle whose fixes are good.
     minutes = max(_LONG_MINUTES, round(4 * network.minutes))
+    budget = f"--minutes {minutes}"
+    if network.kind == _SCENE_COORDINATES and network.images:
+        hours = _LONG_IMAGES * network.minutes / network.images / 60
+        shown += f"; {_LONG_IMAGES:,} take about {hours:.1f} h at this rate"
+        budget = f"--images {_LONG_IMAGES}"
+    # Under another name: this one may have a bundle whose fixes are good.
     recipe = f" --recipe {shlex.quote(state.recipe)}" if state.recipe else ""
     return (
         f"Train longer ({shown})",
-        f"spn-model train --run {shlex.quote(f'{state.name}-longer')}{recipe} --minutes {minutes}",
+        f"spn-model train --run {shlex.quote(f'{state.name}-longer')}{recipe} {budget}",
     )
 
 
