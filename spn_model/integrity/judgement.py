@@ -90,6 +90,8 @@ class Witness:
         Landmarks that agree with the best pose elsewhere; 0 if there is none.
     focal_change : tuple of float
         Relative change of the focal length that the landmarks fit, and its standard deviation.
+    focal_bound : float
+        Bound of the relative error of the stated focal length by images before; infinite without any.
     """
 
     at: np.ndarray
@@ -104,6 +106,7 @@ class Witness:
     height_sigmas: float = 0.0
     rival_inliers: int = 0
     focal_change: tuple[float, float] = (0.0, 1.0)
+    focal_bound: float = np.inf
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,6 +124,9 @@ class Judgement:
     quality : int
         1 to 100: the share of landmarks that agree.
     inliers : int
+    focal_bound : float
+        Bound of the relative error of the stated focal length, by this image and those before; infinite
+        unless the image passed the limits before the protection levels.
     """
 
     reason: str
@@ -129,6 +135,7 @@ class Judgement:
     vertical_m: float
     quality: int
     inliers: int
+    focal_bound: float
 
 
 def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
@@ -143,6 +150,12 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
     -------
     Judgement
         With the first limit that is not kept as its reason.
+
+    Notes
+    -----
+    A view of one plane at one distance fits any focal length. The covariance trusts the stated one
+    (`focal_sigma`), but the protection levels do not: they include what the largest error that the images
+    cannot exclude does to the position.
     """
     inliers = witness.inliers
     count = int(inliers.sum())
@@ -153,7 +166,7 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
     covariance = (np.linalg.inv(information) * factor)[:6, :6]
     share = count / max(len(inliers), 1)
     cells = np.unique(np.floor((witness.at[inliers] + 1) / 2 * [_COLUMNS, _ROWS]), axis=0)
-    reason, horizontal, vertical = "", np.inf, np.inf
+    reason, horizontal, vertical, bound = "", np.inf, np.inf, np.inf
     sigma_deg = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
     if count < limits.min_inliers:
         reason = f"{count} landmarks agree, {limits.min_inliers} are needed"
@@ -199,7 +212,11 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
             factor=factor,
             sigmas=limits.protection_sigmas,
         )
-        horizontal, vertical = separation.horizontal_m, separation.vertical_m
+        known = np.hypot(focal_sigma, limits.focal_sigma)
+        bound = min(witness.focal_bound, abs(focal) + limits.protection_sigmas * known)
+        moved = np.abs(_moved_by_focal(witness)) * bound
+        horizontal = separation.horizontal_m + float(np.hypot(*moved[:2]))
+        vertical = separation.vertical_m + float(moved[2])
         if separation.contradiction > limits.max_contradiction:
             reason = (
                 "groups of landmarks contradict each other by "
@@ -217,7 +234,18 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         vertical_m=vertical,
         quality=int(np.clip(round(100 * share), 1, 100)),
         inliers=count,
+        focal_bound=bound,
     )
+
+
+def _moved_by_focal(witness: Witness) -> np.ndarray:
+    """Return how the position (3,) moves per relative change of the focal length."""
+    kept = witness.inliers
+    by_pose = np.einsum(
+        "n,nij,ni->j", witness.weights[kept], witness.jacobian[kept], witness.by_focal[kept]
+    )
+    moved: np.ndarray = np.linalg.solve(witness.information, by_pose)[:3]
+    return moved
 
 
 def _with_focal(witness: Witness, factor: float, sigma: float) -> tuple[np.ndarray, np.ndarray]:

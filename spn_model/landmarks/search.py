@@ -242,6 +242,7 @@ def witness_of(
     features: HasView,
     vertical: KnownVertical | None = None,
     height: KnownHeight | None = None,
+    focal_bound: float = np.inf,
 ) -> Witness:
     """Return what is known about the pose of a candidate, for its judgement."""
     best, tilt, off = found.best, 0.0, 0.0
@@ -262,4 +263,5 @@ def witness_of(
         height_sigmas=off,
         rival_inliers=found.rival_inliers,
         focal_change=fit_focal_length(best.seen, best.pose),
+        focal_bound=focal_bound,
     )

@@ -99,6 +99,8 @@ class Pilot:
     ----------
     steps_s : dict of str to float
         Time that each step of the last image took.
+    focal_bound : float
+        Bound of the relative error of the stated focal length, by the images of the sequence so far.
     height : HeightZero
         Zero of the known heights, as the usable fixes so far tell it.
     extract : callable
@@ -137,6 +139,7 @@ class Pilot:
         self.height = HeightZero(self.options.height)
         self._height: KnownHeight | None = None  # of the present image, without the offset
         self._focal = np.zeros(2)  # weight, and weighted sum of the changes that images ask for
+        self.focal_bound = np.inf
 
     def fix(
         self,
@@ -302,12 +305,13 @@ class Pilot:
         if found is None:
             return None
         with self._step("judgement"):
-            witness = witness_of(found, view, vertical, self._height)
+            witness = witness_of(found, view, vertical, self._height, self.focal_bound)
             verdict = judge(witness, self.options.limits)
         if not self.options.sequence:
             return verdict
         if not isinstance(view, LandmarkAnchor):  # which has the errors of an image before
             self._weigh_lens(witness)
+            self.focal_bound = min(self.focal_bound, verdict.focal_bound)
         return replace(verdict, reason=verdict.reason or self._lens_over_time())
 
     def _weigh_lens(self, witness: Witness) -> None:

@@ -17,6 +17,7 @@ from tests.worlds.landmark_world import CAMERA, OPTIONS, pose, room, seen_from
 
 ROOM = room()
 LIMITS = IntegrityLimits()
+PER_LANDMARK = ("xyz", "covariance", "descriptors", "directions", "sizes_m", "distances_m")
 
 
 def features(center, rotation, *, stated=CAMERA, landmarks=ROOM, **given) -> ImageFeatures:
@@ -84,6 +85,32 @@ def test_a_wrong_focal_length_is_refused():
         seen = features(*pose(40.0), stated=replace(CAMERA, params=params))
         reason = judge(witness_of(search(ROOM, seen), seen), LIMITS).reason
         assert f"fit a focal length that is {'+' if wrong < 1 else '-'}" in reason
+
+
+def test_protection_levels_cover_a_lens_that_one_wall_does_not_determine():
+    """Of a wall seen head-on with a focal length 2 % off, errors stay in their levels, which evidence narrows."""
+    on_wall = ROOM.xyz[:, 1] == 10
+    wall = replace(
+        ROOM,
+        **{name: getattr(ROOM, name)[on_wall] for name in PER_LANDMARK},
+        landmark=np.arange(int(on_wall.sum())),
+    )
+    center, rotation = pose(0.0, north=7.0)
+    for stated in (0.98, 1.0, 1.02):
+        params = CAMERA.params.copy()
+        params[0] *= stated
+        lens = replace(CAMERA, params=params)
+        seen = features(center, rotation, stated=lens, landmarks=wall)
+        found = search(wall, seen)
+        verdict = judge(witness_of(found, seen), LIMITS)
+        off = error(found.best.pose, center, rotation)
+        assert verdict.reason == ""
+        assert np.hypot(*off[:2]) < verdict.horizontal_m
+        assert abs(off[2]) < verdict.vertical_m
+        assert verdict.focal_bound > 0.02
+        known = judge(witness_of(found, seen, focal_bound=0.004), LIMITS)
+        assert known.focal_bound == 0.004
+        assert known.horizontal_m < 0.3 * verdict.horizontal_m
 
 
 def test_a_group_that_moved_is_refused_or_covered():

@@ -188,3 +188,17 @@ def test_a_followed_pose_on_which_few_landmarks_agree_is_searched_for_anew(
     assert sources[0.0].count(FixSource.TRACK) > 3
     assert len(sources[1.01]) > 3
     assert FixSource.TRACK not in sources[1.01]
+
+
+def test_images_so_far_bound_the_lens_of_the_next(flown_area, camera_file, flight1):
+    """In a flight, the bound of the focal length only shrinks; where each image stands alone, there is none."""
+    bundle = flown_area / "runs" / "default" / "bundle"
+    for sequence in (True, False):
+        pilot = Pilot(bundle, read_camera(camera_file), PilotOptions(sequence=sequence))
+        bounds = [pilot.focal_bound]
+        for _, time_s, image in islice(frames(flight1 / "flight1.mp4"), 8):
+            pilot.fix(image, 1_000_000 + round(1e6 * time_s))
+            bounds.append(pilot.focal_bound)
+        assert bounds[0] == np.inf
+        assert bounds == sorted(bounds, reverse=True)
+        assert (bounds[-1] < 0.05) == sequence
