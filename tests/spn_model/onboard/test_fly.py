@@ -191,7 +191,7 @@ def test_a_followed_pose_on_which_few_landmarks_agree_is_searched_for_anew(
 
 
 def test_images_so_far_bound_the_lens_of_the_next(flown_area, camera_file, flight1):
-    """In a flight, the bound of the focal length only shrinks; where each image stands alone, there is none."""
+    """In a flight, the bound of the focal length only shrinks; images that stand alone have none."""
     bundle = flown_area / "runs" / "default" / "bundle"
     for sequence in (True, False):
         pilot = Pilot(bundle, read_camera(camera_file), PilotOptions(sequence=sequence))
