@@ -118,7 +118,10 @@ def set_state(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> 
     own = network.state_dict()
     for name, target in own.items():
         if name not in tensors:
-            raise FormatError(f"{path}: belongs to another network: {name!r} is missing")
+            raise FormatError(
+                f"{path}: belongs to another network: {name!r} is missing; train a run of an earlier "
+                "version again"
+            )
         tensor = tensors[name]
         if tensor.shape != target.shape or tensor.dtype != target.dtype:
             raise FormatError(

@@ -21,10 +21,8 @@ from spn_model.models.pose_model import UNKNOWN_COUNT, Batch, PoseEstimates, Pos
 from spn_model.models.scene_examples import SceneExamples, SceneStageOptions
 from spn_model.networks.imagenet import MEAN, STD
 from spn_model.networks.option_parsing import from_mapping
-from spn_model.networks.scene_coordinates import (
-    SceneCoordinates,
-    laplace_loss,
-)
+from spn_model.networks.scene_coordinates import SceneCoordinates
+from spn_model.networks.scene_loss import mixture_loss
 from spn_model.onboard.decoding import DecodingOptions, PoseEstimate, decode
 from spn_model.pretrained.tensors import load_pretrained, read_tensors
 from spn_model.pretrained.weights import find
@@ -156,7 +154,7 @@ class SceneCoordinatesModel(PoseModel):
             return self._examples[1]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the Laplace negative log-likelihood plus the cross-entropy of the scene's parts.
+        """Return the negative log-likelihood of the mixtures plus the cross-entropy of the scene's parts.
 
         The metrics are the median distance of cells and the median scale, both in the scene's unit, and the
         cross-entropy. The loss is 0 if no cell of the batch has a target.
@@ -166,15 +164,18 @@ class SceneCoordinatesModel(PoseModel):
         with torch.autocast(
             images.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False
         ):
-            coordinates, log_scale, logits = self.network.cells(_normalised(images))
+            candidates, log_scale, logits = self.network.cells(_normalised(images))
         if not known.any():
-            return (coordinates.sum() + log_scale.sum()) * 0, {}
-        loss = laplace_loss(coordinates, log_scale, batch["targets"], known)
-        parts = self.network.part_of(batch["targets"].permute(0, 2, 3, 1)[known])
-        choice = functional.cross_entropy(logits.permute(0, 2, 3, 1)[known], parts)
+            return (candidates.sum() + log_scale.sum() + logits.sum()) * 0, {}
+        candidates = candidates.permute(0, 3, 4, 1, 2)[known]
+        logits = logits.permute(0, 2, 3, 1)[known]
+        log_scale, targets = log_scale[:, 0][known], batch["targets"].permute(0, 2, 3, 1)[known]
+        loss = mixture_loss(candidates, log_scale, logits, targets)
+        choice = functional.cross_entropy(logits, self.network.part_of(targets))
         with torch.no_grad():
-            distance = (coordinates - batch["targets"]).norm(dim=1)[known].median()
-            scale = log_scale[:, 0][known].median().exp()
+            chosen = candidates[torch.arange(len(logits)), logits.argmax(1)]
+            distance = (chosen - targets).norm(dim=1).median()
+            scale = log_scale.median().exp()
         figures = {"distance": distance, "scale": scale, "choice": choice.detach()}
         return loss + self._stage.choice_weight * choice, figures
 

@@ -113,16 +113,18 @@ class SceneCoordinates(nn.Module):
     stride 16 see all of an image of 480 x 270: facades repeat, and only their surroundings distinguish one
     window from another.
 
-    Each cell classifies itself into a part of the scene (`pick`) and then regresses an offset from the mean
-    of the part centres, weighted by the class probabilities. Classification separates repeated facades
-    sooner than regression (Li et al. 2020, "Hierarchical scene coordinate classification and regression for
-    visual localization").
+    Each cell is a mixture over parts of the scene (Bishop 1994, "Mixture density networks"): `pick` gives
+    the weights, and a component's mean is the centre of its part plus an offset, one that all components
+    share (`out`) and one of its own (`offset`). The coordinates of a cell are those of its likeliest part.
+    Classification separates repeated facades sooner than regression (Li et al. 2020, "Hierarchical scene
+    coordinate classification and regression for visual localization"), and a mean over parts would lie
+    between two look-alike places.
     """
 
     min_side_px: ClassVar[int] = 63
     weights_name: ClassVar[str] = "squeezenet1_1-features"
     added: ClassVar[tuple[str, ...]] = (
-        *("coarse", "context", "wide", "fine", "merge", "out", "pick", "place"),
+        *("coarse", "context", "wide", "fine", "merge", "out", "offset", "pick", "place"),
         *("center", "spread"),
         *("fine_mean", "fine_std", "coarse_mean", "coarse_std"),
         "covariance_scale",
@@ -161,6 +163,7 @@ class SceneCoordinates(nn.Module):
         self.fine = nn.Conv2d(256, 128, 1)
         self.merge = nn.Conv2d(128, 128, 3, padding=1)
         self.out = nn.Conv2d(128, 4, 1)
+        self.offset = nn.Conv2d(128, 3 * PARTS, 1)
         self.pick = nn.Conv2d(128, PARTS, 1)
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("spread", torch.ones(()))
@@ -175,6 +178,8 @@ class SceneCoordinates(nn.Module):
         for layer in (self.out, self.pick):
             nn.init.normal_(layer.weight, std=0.01)
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.offset.bias)  # type: ignore[arg-type]
 
     @torch.no_grad()
     def set_scene(self, xyz: Tensor) -> None:
@@ -219,15 +224,20 @@ class SceneCoordinates(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return coordinates (B, 3, h, w) and log scales (B, 1, h, w) of images (B, 3, H, W)."""
-        coordinates, log_scale, _ = self.cells(self.reduced(images))
-        return coordinates, log_scale
+        candidates, log_scale, logits = self.cells(self.reduced(images))
+        part = logits.argmax(dim=1)[:, None, None].expand(-1, -1, 3, -1, -1)
+        return candidates.gather(1, part)[:, 0], log_scale
 
     def reduced(self, images: Tensor) -> Tensor:
         """Return the input of `cells`: images averaged over blocks of shrink x shrink pixels."""
         return functional.avg_pool2d(images, self.shrink) if self.shrink > 1 else images
 
     def cells(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return coordinates, log scales and part logits (B, 48, h, w) of images already reduced."""
+        """Return the mixture of each cell, of images already reduced.
+
+        Returns the components' coordinates (B, 48, 3, h, w), their common log scale (B, 1, h, w) and their
+        logits (B, 48, h, w).
+        """
         fine = self.features[:8](images)
         coarse = self._normalised("coarse", self.features[8:](fine))
         coarse = functional.relu(self.coarse(coarse), inplace=True)
@@ -244,12 +254,11 @@ class SceneCoordinates(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             out, logits = self.out(x), self.pick(x) * _SHARPNESS
-            # A matrix product, not a convolution, so that the quantizer leaves it and its inputs in float.
-            chosen = self.place @ logits.softmax(dim=1).flatten(2)
-            coordinates = chosen.reshape(out[:, :3].shape) + out[:, :3] * _REACH
-            coordinates = coordinates * self.spread + self.center[:, None, None]
+            offsets = self.offset(x).unflatten(1, (PARTS, 3)) + out[:, None, :3]
+            candidates = self.place.T[:, :, None, None] + offsets * _REACH
+            candidates = candidates * self.spread + self.center[:, None, None]
             log_scale = out[:, 3:].clamp(*_LOG_SCALE) + self.spread.log()
-        return coordinates, log_scale, logits
+        return candidates, log_scale, logits
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters as "added" and "pretrained", as `Regressor.parameter_groups` does."""
@@ -270,34 +279,6 @@ class SceneCoordinates(nn.Module):
     def _normalised(self, name: str, x: Tensor) -> Tensor:
         mean, std = getattr(self, f"{name}_mean"), getattr(self, f"{name}_std")
         return (x - mean[:, None, None]) / std
-
-
-def laplace_loss(coordinates: Tensor, log_scale: Tensor, targets: Tensor, known: Tensor) -> Tensor:
-    """Return the mean negative log-likelihood of target points, without its constant.
-
-    Parameters
-    ----------
-    coordinates : Tensor, shape (B, 3, h, w)
-        Estimated scene coordinates.
-    log_scale : Tensor, shape (B, 1, h, w)
-        Log scales of the Laplace distributions.
-    targets : Tensor, shape (B, 3, h, w)
-        True scene coordinates.
-    known : Tensor of bool, shape (B, h, w)
-        Cells that have a target.
-
-    Returns
-    -------
-    Tensor, shape ()
-
-    Notes
-    -----
-    The density is proportional to exp(-distance / scale) in three dimensions, so that the negative
-    log-likelihood is distance / scale + 3 log scale.
-    """
-    distance = (coordinates - targets).square().sum(1).add(1e-12).sqrt()
-    log_scale = log_scale[:, 0]
-    return (distance * (-log_scale).exp() + 3 * log_scale)[known].mean()
 
 
 def _middles(points: Tensor, rounds: int = 15, most: int = 20_000) -> Tensor:

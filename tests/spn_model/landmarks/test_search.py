@@ -88,7 +88,7 @@ def test_a_wrong_focal_length_is_refused():
 
 
 def test_protection_levels_cover_a_lens_that_one_wall_does_not_determine():
-    """Of a wall seen head-on with a focal length 2 % off, errors stay in their levels; evidence narrows them."""
+    """Of a wall seen head-on by a lens 2 % off, errors stay in their levels; evidence narrows them."""
     on_wall = ROOM.xyz[:, 1] == 10
     wall = replace(
         ROOM,

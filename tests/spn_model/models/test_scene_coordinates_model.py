@@ -188,7 +188,7 @@ def test_frozen_layers_are_in_no_group(data):
     groups = {group["name"]: group for group in model.parameter_groups()}
     assert groups["pretrained"]["rate"] == 0.1
     assert len(groups["pretrained"]["params"]) == 36
-    assert len(groups["added"]["params"]) == 24
+    assert len(groups["added"]["params"]) == 26
 
 
 def test_published_weights_are_loaded(data):

@@ -1,4 +1,4 @@
-"""Tests of the scene-coordinate network: cell grid, loss, and training targets."""
+"""Tests of the scene-coordinate network: cell grid, mixture, loss, and training targets."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from spn_model.examples.point_targets import (
 )
 from spn_model.networks.scene_coordinates import (
     FIRST_CELL_PX,
+    PARTS,
     STRIDE_PX,
     SceneCoordinates,
     grid_size,
-    laplace_loss,
 )
+from spn_model.networks.scene_loss import mixture_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -132,29 +133,46 @@ def test_the_scene_is_measured_by_medians():
     assert 1 < float(net.spread) < 2
 
 
-def test_the_loss_is_least_at_the_true_scale():
-    """For errors drawn from the assumed distribution, the loss is lowest at the true scale."""
+def test_the_loss_is_least_at_the_true_scale_and_weights():
+    """For errors drawn from a mixture of two places, the loss is lowest at its true scale and weights."""
     rng = np.random.default_rng(0)
-    direction = rng.normal(size=(1, 3, 40, 50))
+    direction = rng.normal(size=(4000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    errors = torch.from_numpy(direction * rng.gamma(3.0, 0.7, (1, 1, 40, 50)))
-    known = torch.ones(1, 40, 50, dtype=torch.bool)
+    places = torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]], dtype=torch.float64)
+    targets = places[torch.from_numpy((rng.random(4000) < 0.25).astype(int))]
+    targets = targets + torch.from_numpy(direction * rng.gamma(3.0, 0.7, (4000, 1)))
 
-    def loss(scale: float) -> float:
-        log_scale = torch.full((1, 1, 40, 50), float(np.log(scale)))
-        return float(laplace_loss(errors, log_scale, torch.zeros_like(errors), known))
+    def loss(scale: float, second: float) -> float:
+        logits = torch.tensor([1 - second, second], dtype=torch.float64).log().expand(4000, 2)
+        log_scale = torch.full((4000,), float(np.log(scale)), dtype=torch.float64)
+        return float(mixture_loss(places.expand(4000, 2, 3), log_scale, logits, targets))
 
-    assert loss(0.7) < min(loss(0.63), loss(0.77))
+    assert loss(0.7, 0.25) < min(loss(0.63, 0.25), loss(0.77, 0.25))
+    assert loss(0.7, 0.25) < min(loss(0.7, 0.15), loss(0.7, 0.35))
 
 
-def test_cells_without_a_target_teach_nothing():
-    """Coordinates of cells without a target get no gradient, whatever values the target holds."""
-    coordinates = torch.randn(1, 3, 4, 5, requires_grad=True)
-    known = torch.zeros(1, 4, 5, dtype=torch.bool)
-    known[0, 1, 2] = True
-    laplace_loss(coordinates, torch.zeros(1, 1, 4, 5), torch.ones(1, 3, 4, 5), known).backward()
-    moved = coordinates.grad[0].abs().sum(0) > 0
-    assert torch.equal(moved, known[0])
+def test_only_the_place_that_explains_a_point_moves_toward_it():
+    """The component near a point gets its gradient; one 20 scales away does not move to the middle."""
+    candidates = torch.tensor([[[0.0, 0, 0], [20.0, 0, 0]]], requires_grad=True)
+    mixture_loss(
+        candidates, torch.zeros(1), torch.zeros(1, 2), torch.tensor([[1.0, 0.0, 0.0]])
+    ).backward()
+    assert candidates.grad[0, 0, 0] == pytest.approx(-1, abs=1e-3)
+    assert float(candidates.grad[0, 1].abs().max()) < 1e-6
+
+
+def test_coordinates_are_those_of_the_likeliest_part():
+    """Of two parts with nearly equal weights, a cell is at the likelier one, not between the two."""
+    net = SceneCoordinates()
+    net.place.copy_(torch.arange(3.0 * PARTS).reshape(3, PARTS))
+    for layer in (net.out, net.pick):
+        nn.init.zeros_(layer.weight)
+    with torch.no_grad():
+        net.pick.bias[[5, 40]] = torch.tensor([1.0, 1.01])
+        net.offset.bias[3 * 40 : 3 * 41] = torch.tensor([1.0, 2.0, 3.0])
+    coordinates, _ = net(torch.rand(1, 3, 64, 64))
+    expected = net.place[:, 40] + 0.3 * torch.tensor([1.0, 2.0, 3.0])
+    assert (coordinates - expected[:, None, None]).abs().max() < 1e-4
 
 
 def test_it_learns_one_image():
@@ -166,18 +184,19 @@ def test_it_learns_one_image():
     targets = torch.cat([targets, targets[:1] * 0.5]).reshape(1, 3, rows, columns) + 20
     net.set_scene(targets[0].reshape(3, -1).T)
     net.measure_features(image)
-    known = torch.ones(1, rows, columns, dtype=torch.bool)
     optimizer = torch.optim.AdamW(net.parameters(), lr=1e-3)
-    parts = net.part_of(targets.permute(0, 2, 3, 1)[known])
+    true = targets.permute(0, 2, 3, 1).reshape(-1, 3)
     distances, scales = [], []
     for _ in range(30):
-        coordinates, log_scale, logits = net.cells(image)
-        choice = functional.cross_entropy(logits.permute(0, 2, 3, 1)[known], parts)
-        loss = laplace_loss(coordinates, log_scale, targets, known) + choice
+        candidates, log_scale, logits = net.cells(image)
+        candidates = candidates.permute(0, 3, 4, 1, 2).reshape(-1, PARTS, 3)
+        logits = logits.permute(0, 2, 3, 1).reshape(-1, PARTS)
+        choice = functional.cross_entropy(logits, net.part_of(true))
+        loss = mixture_loss(candidates, log_scale.flatten(), logits, true) + choice
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        distances.append(float((coordinates - targets).norm(dim=1).mean().detach()))
+        distances.append(float((net(image)[0] - targets).norm(dim=1).mean().detach()))
         scales.append(float(log_scale.mean().detach()))
     assert distances[-1] < 0.5 * distances[0]
     assert scales[-1] < scales[0] - 0.3
