@@ -18,6 +18,7 @@ MAX_MISLEADING = 0.05  # upper bound of their share above which too few images w
 _LONG_MINUTES = 30
 # What half an hour of the default recipe processes on two cores with bfloat16; others need longer for it.
 _LONG_IMAGES = 345_000
+_LONG_DRAWS = 280_000  # for `--images`: batches of small images show more than they draw
 _SCENE_COORDINATES = "scene-coordinates"
 _COARSE, _SEARCH, _TRACK = "coarse", "search", "track"
 _MEAN = "mean"  # first word of the baseline
@@ -165,7 +166,7 @@ def _longer(state: NetworkState, facts: RunFacts) -> tuple[str, str]:
     if network.kind == _SCENE_COORDINATES and network.images:
         hours = _LONG_IMAGES * network.minutes / network.images / 60
         shown += f"; {_LONG_IMAGES:,} take about {hours:.1f} h at this rate"
-        budget = f"--images {_LONG_IMAGES}"
+        budget = f"--images {_LONG_DRAWS}"
     # Under another name: this one may have a bundle whose fixes are good.
     recipe = f" --recipe {shlex.quote(state.recipe)}" if state.recipe else ""
     return (

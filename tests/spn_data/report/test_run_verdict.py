@@ -132,7 +132,7 @@ def test_a_short_training_is_to_be_continued_and_a_long_one_not() -> None:
     scene = NetworkFacts("scene-coordinates", "c", 9, 9, 4_600, 2.0, 2.0, 9.0)
     found = judge_run(DONE, [replace(BAD, networks={"first": scene})], ()).network
     assert found.do.endswith("seen 4,600 images in 2.0 min; 345,000 take about 2.5 h at this rate)")
-    assert found.command == "spn-model train --run first-longer --recipe paper --images 345000"
+    assert found.command == "spn-model train --run first-longer --recipe paper --images 280000"
     long = NetworkFacts("kind", "c", 9, 9, 90_000, 40.0, 40.0, 9.0)
     assert judge_run(DONE, [replace(BAD, networks={"first": long})], ()).network.command == ""
 
