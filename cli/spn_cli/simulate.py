@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +45,13 @@ def run(
     lens = options.mapping_lens.fov_deg
     output.figures(written=out, fov_deg=lens)
     console.say(f"{out}: videos in mapping/ and evaluation/, exact ground truth in truth/.")
-    console.say(
-        f"Next: spn-data reconstruct {out / 'mapping'} --area AREA --fov {lens:g}", wrap=False
+    words = (
+        "spn-data",
+        "reconstruct",
+        out / "mapping",
+        "--area",
+        out.with_name(f"{out.name}-area"),
     )
+    command = shlex.join([*map(str, words), "--fov", f"{lens:g}"])
+    output.figures(next={"do": "Reconstruct the mapping flights", "command": command})
+    console.say(f"Next: Reconstruct the mapping flights: {command}", wrap=False)
