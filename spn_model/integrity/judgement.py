@@ -48,7 +48,7 @@ class IntegrityLimits:
 
     min_inliers: int = 40
     min_cells: int = 8
-    min_share: float = 0.5
+    min_share: float = 0.65
     max_rival: float = 0.33
     max_chi: float = 2.0
     max_contradiction: float = 6.0
