@@ -9,8 +9,8 @@ with the path so far, and the fix of the bundle in red.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -22,6 +22,8 @@ from spn_data.api import AreaReader
 from spn_data.area.area import Area
 from spn_data.geometry.pose import Poses
 from spn_data.inputs.frame_images import frame_images
+from spn_data.storage.files import read_csv
+from spn_model.evaluation.fix_files import FIX_COLUMNS
 
 SIDE = 270  # height of the image and of the map, pixels
 STRIP = 30  # for the text below both
@@ -59,9 +61,8 @@ class Plan:
 
 def rows_of(path: Path, flight: str) -> dict[str, dict[str, str]]:
     """Return the rows of fixes.csv of a flight with motion, by frame."""
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["flight"] == flight]
-    return {row["name"]: row for row in rows if row["method"] == "track"}
+    rows = (row for _, row in read_csv(path, FIX_COLUMNS))
+    return {row["name"]: row for row in rows if (row["flight"], row["method"]) == (flight, "track")}
 
 
 def said(row: dict[str, str]) -> str:
@@ -116,7 +117,7 @@ def main() -> None:
     given = parser.parse_args()
     shown = [
         Image.fromarray(picture[..., ::-1])
-        for picture in list(pictures(given.area, given.run, given.flight))[:: given.every]
+        for picture in islice(pictures(given.area, given.run, given.flight), 0, None, given.every)
     ]
     shown[0].save(
         given.to, save_all=True, append_images=shown[1:], duration=200, loop=0, quality=60, method=6

@@ -214,7 +214,8 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         )
         known = np.hypot(focal_sigma, limits.focal_sigma)
         bound = min(witness.focal_bound, abs(focal) + limits.protection_sigmas * known)
-        moved = np.abs(_moved_by_focal(witness)) * bound
+        moved_by_focal = np.linalg.solve(information[:6, :6], information[:6, 6])[:3]
+        moved = np.abs(moved_by_focal) * bound
         horizontal = separation.horizontal_m + float(np.hypot(*moved[:2]))
         vertical = separation.vertical_m + float(moved[2])
         if separation.contradiction > limits.max_contradiction:
@@ -236,16 +237,6 @@ def judge(witness: Witness, limits: IntegrityLimits) -> Judgement:
         inliers=count,
         focal_bound=bound,
     )
-
-
-def _moved_by_focal(witness: Witness) -> np.ndarray:
-    """Return how the position (3,) moves per relative change of the focal length."""
-    kept = witness.inliers
-    by_pose = np.einsum(
-        "n,nij,ni->j", witness.weights[kept], witness.jacobian[kept], witness.by_focal[kept]
-    )
-    moved: np.ndarray = np.linalg.solve(witness.information, by_pose)[:3]
-    return moved
 
 
 def _with_focal(witness: Witness, factor: float, sigma: float) -> tuple[np.ndarray, np.ndarray]:
